@@ -1,0 +1,347 @@
+"""Logs: what is written is read back, padding is marked, and every mistake is refused by line and column."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_rig import SYSTEMS
+
+from nnap_em.data import (
+    DataError,
+    Dataset,
+    DataWarning,
+    check_split,
+    fill_missing,
+    horizon,
+    pad,
+    read_csv,
+    read_logs,
+    write_csv,
+)
+from nnap_em.rig import Rig, read_rig
+
+ROWS = 201
+
+
+def _rig(**changes) -> Rig:
+    given = {"dt": 0.01, "clock": "sequence", "measured": ("theta1", "dtheta1")} | changes
+    return Rig("bench", "acrobot", {}, True, ("u",), (2,), noise_std={}, start={}, **given)
+
+
+def _swing(rows: int = ROWS, dt: float = 0.01) -> dict[str, np.ndarray]:
+    """Two rad to and fro, with its exact rate."""
+    t = dt * np.arange(rows)
+    return {"time": t, "u": 0.1 * np.sin(t), "theta1": 2.0 * np.sin(3.0 * t), "dtheta1": 6.0 * np.cos(3.0 * t)}
+
+
+def _text(columns) -> str:
+    rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
+    return "\n".join([",".join(columns), *rows]) + "\n"
+
+
+def _field(line: int, column: str, text: str):
+    """A change of one field of the file; `line` as an editor counts."""
+
+    def change(content: str) -> str:
+        lines = [row.split(",") for row in content.splitlines()]
+        lines[line - 1][lines[0].index(column)] = text
+        return "\n".join(map(",".join, lines)) + "\n"
+
+    return change
+
+
+def _column(name: str, change):
+    """A change of one column before it is written."""
+
+    def rewrite(_: str) -> str:
+        columns = _swing()
+        return _text(columns | {name: change(columns[name])})
+
+    return rewrite
+
+
+def _wrap(theta):
+    return (theta + 1.0) % (2.0 * np.pi)
+
+
+def _jitter(t):
+    return t + 0.0002 * (np.arange(t.size) == 7)
+
+
+MISTAKES = {  # name: (the change, then the message names the place, what was found and the mend)
+    "empty file": (lambda _: "", "line 1", "empty", "write a header"),
+    "blank file": (lambda _: "\n \n", "line 1", "empty", "write a header"),
+    "header only": (lambda s: s.splitlines()[0], "line 1", "found 0 rows", "2 rows or more"),
+    "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 rows", "2 rows or more"),
+    "no header": (lambda s: s.split("\n", 1)[1], "line 1, column 'time'", "missing", "possible here: 0, 0, 0, 6"),
+    "column missing": (lambda s: s.replace("dtheta1", "speed"), "column 'dtheta1'", "missing", "possible here: speed"),
+    "column misspelt": (lambda s: s.replace("dtheta1", "dteta1"), "'dtheta1'", "missing", "did you mean 'dteta1'?"),
+    "column in capitals": (lambda s: s.replace("u,", "U,"), "column 'u'", "missing", "did you mean 'U'?"),
+    "column twice": (lambda s: s.replace("dtheta1", "theta1"), "column 'theta1'", "2 times", "keep one"),
+    "semicolons": (lambda s: s.replace(",", ";").replace(".", ","), "line 1", "missing", "not ';'"),
+    "tabs": (lambda s: s.replace(",", "\t"), "line 1", "missing", "by ',' (not '\\t')"),
+    "decimal commas": (lambda s: s.replace(".", ","), "line 3", "found 8 fields under 4 names", "decimals with '.'"),
+    "text": (_field(12, "u", "n/a"), "line 12, column 'u'", "'n/a'", "write a number"),
+    "text in a reading": (
+        _field(9, "theta1", "0.1 rad"),
+        "line 9, column 'theta1'",
+        "'0.1 rad'",
+        "leave the field empty",
+    ),
+    "inf": (_field(9, "theta1", "inf"), "line 9, column 'theta1'", "'inf'", "leave the field empty"),
+    "minus infinity": (_field(9, "u", "-Infinity"), "line 9, column 'u'", "'-Infinity'", "write a number"),
+    "nan in an input": (_field(9, "u", "nan"), "line 9, column 'u'", "'nan'", "never empty"),
+    "minus nan in an input": (_field(9, "u", "-NaN"), "line 9, column 'u'", "'-NaN'", "never empty"),
+    "empty input": (_field(9, "u", ""), "line 9, column 'u'", "found ''", "never empty"),
+    "blank time": (_field(202, "time", " "), "line 202, column 'time'", "found ''", "never empty"),
+    "row too short": (lambda s: s.replace("\n0.03,", "\n"), "line 5", "3 fields under 4 names", "every column a field"),
+    "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
+    "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
+    "gap": (lambda s: s.replace(s.splitlines()[6] + "\n", ""), "line 7, column 'time'", "a gap: 0.04", "empty field"),
+    "row twice": (
+        lambda s: s.replace("\n0.04,", "\n0.03,"),
+        "line 6, column 'time'",
+        "does not run on",
+        "(dt = 0.01 s)",
+    ),
+    "jitter": (
+        _column("time", _jitter),
+        "line 9, column 'time'",
+        "jitter: 0.06 s, then 0.0702 s (2 places",
+        "resample",
+    ),
+    "another dt": (_column("time", lambda t: 2 * t), "column 'time'", "0.02 s apart", "correct [sampling] dt"),
+    "milliseconds": (_column("time", lambda t: 1000 * t), "column 'time'", "10 s apart", "one of the two is in ms"),
+    "time backwards": (_column("time", lambda t: -t), "column 'time'", "-0.01 s apart", "correct [sampling] dt"),
+    "late start": (_column("time", lambda t: t + 5), "line 2, column 'time'", "starts at 5 s", 'clock = "session"'),
+    "never measured": (_column("theta1", lambda x: x * np.nan), "column 'theta1'", "no sample", "[measurement]"),
+    "rate never measured": (_column("dtheta1", lambda x: x * np.nan), "column 'dtheta1'", "no sample", "[measurement]"),
+    "wrapped": (_column("theta1", _wrap), "line 125, column 'theta1'", "jumps by 6.2", "unwrap"),
+    "wrapped degrees": (_column("theta1", lambda x: np.degrees(_wrap(x))), "line 125", "jumps by 35", "degrees to rad"),
+    "angle in degrees": (_column("theta1", np.degrees), "column 'theta1'", "57.3 times", "write rad"),
+    "rate in degrees": (_column("dtheta1", np.degrees), "column 'dtheta1'", "0.0175 times", "write rad and rad/s"),
+}
+
+
+@pytest.mark.parametrize(("change", "place", "found", "mend"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_refused_with_file_place_finding_and_mend(tmp_path, change, place, found, mend):
+    write_csv(tmp_path / "00.csv", _swing())
+    (tmp_path / "01.csv").write_text(change(_text(_swing())))
+    with pytest.raises(DataError) as refused:
+        read_logs(tmp_path, _rig())
+    message = str(refused.value)
+    for part in (str(tmp_path / "01.csv"), place, found, mend):
+        assert part in message
+
+
+def test_a_folder_without_logs_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere: is no folder; put one CSV file per sequence there"):
+        read_logs(tmp_path / "nowhere", _rig())
+    (tmp_path / ".01.csv.7.part").touch()
+    (tmp_path / "._01.csv").touch()  # what a Mac leaves on a memory stick
+    with pytest.raises(DataError, match=r"holds no \*.csv"):
+        read_logs(tmp_path, _rig())
+
+
+def test_another_encoding_is_refused(tmp_path):
+    (tmp_path / "01.csv").write_bytes(_text(_swing()).encode("utf-16"))
+    with pytest.raises(DataError, match=r"01.csv: line 1: not UTF-8; save the file as plain UTF-8"):
+        read_logs(tmp_path, _rig())
+
+
+def test_an_unreadable_file_is_refused(tmp_path):
+    (tmp_path / "01.csv").mkdir()
+    with pytest.raises(DataError, match=r"01.csv: cannot be read"):
+        read_logs(tmp_path, _rig())
+
+
+READABLE = {
+    "byte order mark": lambda s: "\ufeff" + s,
+    "windows lines": lambda s: s.replace("\n", "\r\n"),
+    "old Mac lines": lambda s: s.replace("\n", "\r"),
+    "no line end": lambda s: s.rstrip("\n"),
+    "blank lines at the end": lambda s: s + "\n\n",
+    "blanks around fields": lambda s: s.replace(",", " , "),
+    "names in quotes": lambda s: s.replace("theta1,dtheta1", '"theta1","dtheta1"'),
+    "another column": lambda s: s.replace("\n", ",note\n"),
+    "other order": lambda s: "\n".join(",".join(reversed(row.split(","))) for row in s.splitlines()),
+}
+
+
+@pytest.mark.parametrize("change", READABLE.values(), ids=READABLE.keys())
+def test_harmless_differences_are_read_alike(tmp_path, change):
+    (tmp_path / "01.csv").write_bytes(change(_text(_swing())).encode("utf-8"))
+    logs = read_logs(tmp_path, _rig())
+    columns = _swing()
+    assert (logs.files, logs.columns) == (("01.csv",), ("u", "theta1", "dtheta1"))
+    np.testing.assert_allclose(logs.data.t[0], columns["time"], rtol=1e-8)
+    np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], rtol=1e-8)
+    np.testing.assert_allclose(logs.data.y[0].T, [columns["theta1"], columns["dtheta1"]], rtol=1e-8)
+
+
+@pytest.mark.parametrize("text", ["", "nan", "NaN", " "])
+def test_an_empty_field_is_a_missing_sample(tmp_path, text):
+    (tmp_path / "01.csv").write_text(_field(4, "theta1", text)(_text(_swing())))
+    y = read_logs(tmp_path, _rig()).data.y[0]
+    assert np.argwhere(np.isnan(y)).tolist() == [[2, 0]]
+
+
+def test_angles_read_every_other_row_pass_the_checks(tmp_path):
+    columns = _swing()
+    columns["theta1"][1::2] = np.nan
+    write_csv(tmp_path / "01.csv", columns)
+    assert np.isnan(read_logs(tmp_path, _rig()).data.y[0, 1::2, 0]).all()
+
+
+def test_a_session_clock_runs_on_over_files(tmp_path):
+    for i, start in enumerate((0.0, 3.21, 86400.0)):
+        columns = _swing()
+        write_csv(tmp_path / f"{i}.csv", columns | {"time": columns["time"] + start})
+    t = read_logs(tmp_path, _rig(clock="session")).data.t
+    np.testing.assert_allclose(t[:, 0], [0.0, 3.21, 86400.0])
+    np.testing.assert_allclose(np.diff(t), 0.01, atol=1e-9)
+
+
+def test_a_rig_without_input_has_inputs_of_width_zero(tmp_path):
+    write_csv(tmp_path / "01.csv", _swing())
+    rig = Rig("free", "acrobot", {}, True, (), (), 0.01, "sequence", ("theta1",), {}, {})
+    assert read_logs(tmp_path, rig).data.u.shape == (1, ROWS, 0)
+
+
+def test_noise_is_not_taken_for_degrees(tmp_path):
+    """At rest the differences of a noisy angle are many times a quiet rate: no units can be read from them."""
+    rng = np.random.default_rng(0)
+    rest = {"time": 0.001 * np.arange(500), "u": np.zeros(500)}
+    rest |= {"theta1": rng.normal(0.0, 5e-3, 500), "dtheta1": rng.normal(0.0, 1e-4, 500)}
+    write_csv(tmp_path / "01.csv", rest)
+    assert read_logs(tmp_path, _rig(dt=0.001)).files == ("01.csv",)
+
+
+def test_a_fast_joint_is_not_taken_for_a_wrapped_one(tmp_path):
+    t = 0.1 * np.arange(50)
+    write_csv(tmp_path / "01.csv", {"time": t, "u": t, "theta1": 60.0 * t, "dtheta1": 60.0 + 0.0 * t * t})
+    with pytest.warns(DataWarning):
+        read_logs(tmp_path, _rig(dt=0.1))
+
+
+def test_a_constant_signal_is_warned_of(tmp_path):
+    write_csv(tmp_path / "01.csv", _swing() | {"theta1": np.full(ROWS, 0.25)})
+    with pytest.warns(DataWarning, match=r"01.csv: column 'theta1': constant at 0.25; is the sensor alive\?"):
+        read_logs(tmp_path, _rig())
+
+
+def test_an_angle_alone_in_degrees_is_warned_of(tmp_path):
+    columns = _swing()
+    write_csv(tmp_path / "01.csv", columns | {"theta1": np.degrees(columns["theta1"])})
+    with pytest.warns(DataWarning, match=r"'theta1': turns at \d+ rad/s; is it in degrees\?"):
+        read_logs(tmp_path, _rig(measured=("theta1",)))
+
+
+def test_a_test_sequence_must_not_be_a_training_sequence(tmp_path):
+    for name, rows in (("train/01", 100), ("train/02", 90), ("test/01", 80), ("test/02", 90)):
+        write_csv(tmp_path / f"{name}.csv", _swing(rows))
+    train, test = (read_logs(tmp_path / name, _rig()) for name in ("train", "test"))
+    with pytest.raises(DataError, match=r"test file 02.csv: the same content as train file 02.csv; remove one"):
+        check_split(train, test)
+    (tmp_path / "test/02.csv").unlink()
+    check_split(train, read_logs(tmp_path / "test", _rig()))
+
+
+def test_padding_is_marked_and_neutral():
+    short, long = ((np.arange(n) * 0.1, np.ones((n, 2)), np.full((n, 1), float(n))) for n in (3, 5))
+    data = pad([short, long])
+    assert [x.shape for x in data] == [(2, 5), (2, 5, 2), (2, 5, 1), (2, 5)]
+    assert data.valid.tolist() == [[True] * 3 + [False] * 2, [True] * 5]
+    np.testing.assert_array_equal(np.diff(data.t[0])[2:], 0.0)
+    np.testing.assert_array_equal(data.u[0, 3:], 0.0)
+    assert np.isnan(data.y[0, 3:]).all()
+    for i, sequence in enumerate((short, long)):
+        for field, values in zip(data[:3], sequence, strict=True):
+            np.testing.assert_array_equal(field[i][data.valid[i]], values)
+
+
+def test_sequences_that_do_not_fit_are_refused_by_number():
+    t, u, y = np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 2))
+    with pytest.raises(DataError, match=r"pad: no sequence"):
+        pad([])
+    with pytest.raises(DataError, match=r"pad: sequence 1: shapes of t, u, y are \(\(3,\), \(3, 2\), \(3, 2\)\)"):
+        pad([(t, u, y), (t, y, y)])
+    with pytest.raises(DataError, match=r"pad: sequence 0: .* they must be"):
+        pad([(t, u[:2], y)])
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray], ids=["numpy", "jax"])
+def test_the_horizon_keeps_the_first_steps(kind):
+    data = Dataset(*map(kind, pad([(np.arange(n) * 0.1, np.ones((n, 1)), np.ones((n, 1))) for n in (3, 6)])))
+    short = horizon(data, 4)
+    assert short.valid.sum(axis=1).tolist() == [3, 5]
+    np.testing.assert_array_equal(short.t, data.t[:, :5])
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b, equal_nan=True), horizon(data, 99), data))
+    assert horizon(jax.tree.map(lambda x: x[1], data), 2).u.shape == (3, 1)
+    with pytest.raises(DataError, match=r"steps = 0; give 1 or more"):
+        horizon(data, 0)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray], ids=["numpy", "jax"])
+def test_missing_readings_become_zero_and_a_mask(kind):
+    y, observed = fill_missing(kind([[1.0, np.nan], [np.nan, -2.0]]))
+    assert y.tolist() == [[1.0, 0.0], [0.0, -2.0]]
+    assert observed.tolist() == [[True, False], [False, True]]
+
+
+def test_the_gradient_passes_missing_readings():
+    grad = jax.grad(lambda y: jnp.sum(fill_missing(y)[0] ** 2))(jnp.array([3.0, jnp.nan]))
+    assert grad.tolist() == [6.0, 0.0]
+
+
+_values = st.floats(allow_infinity=False, width=64)
+
+
+@settings(deadline=None)  # it writes files
+@given(rows=st.lists(st.tuples(_values, _values), min_size=2, max_size=30), start=st.integers(0, 10**6))
+def test_what_is_written_is_read_back(tmp_path_factory, rows, start):
+    path = tmp_path_factory.getbasetemp() / "written.csv"
+    t = start + 0.001 * np.arange(len(rows))
+    readings = np.array(rows).T
+    write_csv(path, {"time": t, "a": readings[0], "b": readings[1]})
+    table = read_csv(path, ("time",), ("b", "a"))
+    np.testing.assert_allclose(table[:, 0], t, rtol=0.0, atol=1e-6)  # a session's clock keeps its milliseconds
+    np.testing.assert_allclose(table[:, 1:].T, readings[::-1], rtol=1e-11, atol=1e-300)
+
+
+def test_written_files_are_plain(tmp_path):
+    write_csv(tmp_path / "out" / "a.csv", {"time": [0.0, 0.1, 0.3], "joint": np.arange(3), "y": [np.nan, 1 / 3, 2.5]})
+    assert (tmp_path / "out" / "a.csv").read_text() == "time,joint,y\n0,0,\n0.1,1,0.333333333333\n0.3,2,2.5\n"
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
+
+
+@pytest.mark.parametrize("columns", [{}, {"a": [1.0], "b": [1.0, 2.0]}, {"a": [np.inf]}])
+def test_what_cannot_be_read_back_is_not_written(tmp_path, columns):
+    with pytest.raises(DataError, match=r"a.csv: columns .*; write finite columns \(NaN = missing\) of one length"):
+        write_csv(tmp_path / "a.csv", columns)
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_shared_log_is_read_without_a_word(shared):
+    paths = sorted((shared / "data").glob("*/*/rig.toml"))
+    assert paths
+    for path in paths:
+        rig = read_rig(path, SYSTEMS)
+        train, test = (read_logs(path.parent / name, rig) for name in ("train", "test"))
+        check_split(train, test)
+        assert train.data.y.shape == (len(train.files), 501, len(rig.measured))
+        assert train.data.valid.all()
+        assert np.isfinite(test.data.y).all()
+
+
+def test_reading_is_fast(tmp_path):
+    """A file of 500 rows takes 2 ms on one core; the bound leaves room for a busy machine."""
+    for i in range(20):
+        write_csv(tmp_path / f"{i:02d}.csv", _swing(500))
+    start = time.process_time()
+    read_logs(tmp_path, _rig())
+    assert time.process_time() - start < 20 * 0.02

@@ -1,0 +1,59 @@
+"""The unknown term: one small network per joint from velocity to torque."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+class FrictionNetwork(eqx.Module):
+    """tau_f(v): joint velocities [rad/s] to joint torques [N m], a network for each joint.
+
+    Each joint has features v / speed and asinh(v / knee), scaled to +-1 at `speed`, so that both the Stribeck
+    region near rest and the viscous region are smooth in them.
+    """
+
+    mlp: eqx.nn.MLP
+    """Leaves carry a leading joint axis."""
+    speed: Float[Array, " dof"]
+    """Largest velocity of interest [rad/s]."""
+    knee: Float[Array, " dof"]
+    """Velocity below which the map is resolved linearly [rad/s]."""
+    scale: Float[Array, " dof"]
+    """Torque of a unit output [N m]."""
+
+    def __init__(
+        self,
+        speed: Float[Array, " dof"],
+        scale: Float[Array, " dof"],
+        *,
+        key: PRNGKeyArray,
+        width: int = 8,
+        depth: int = 2,
+        resolution: float = 100.0,
+    ):
+        def make(key):
+            return eqx.nn.MLP(2, "scalar", width, depth, jax.nn.tanh, dtype=speed.dtype, key=key)
+
+        self.mlp = eqx.filter_vmap(make)(jax.random.split(key, speed.shape[0]))
+        self.speed = speed
+        self.knee = speed / resolution
+        self.scale = scale
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        top = jnp.arcsinh(self.speed / self.knee)
+        features = jnp.stack([v / self.speed, jnp.arcsinh(v / self.knee) / top], axis=-1)
+        return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
+
+    def nodes(self, count: int) -> Float[Array, "dof count"]:
+        """Velocities [rad/s], dense near rest, at which the map is tabulated in the M-step."""
+        top = jnp.arcsinh(self.speed / self.knee)
+        line = jnp.linspace(-1.0, 1.0, count, dtype=self.speed.dtype)
+        return self.knee[:, None] * jnp.sinh(top[:, None] * line[None, :])
+
+
+class NoFriction(eqx.Module):
+    """A machine that is declared free of friction."""
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        return jnp.zeros_like(v)

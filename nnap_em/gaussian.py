@@ -1,0 +1,64 @@
+"""Small dense Gaussian algebra, unrolled so that it vectorises over sequences and particles."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Gaussian(NamedTuple):
+    """A normal distribution; both fields may carry leading batch axes."""
+
+    mean: Float[Array, "*batch dim"]
+    cov: Float[Array, "*batch dim dim"]
+
+
+def cholesky(a: Float[Array, "dim dim"]) -> list[list[Float[Array, ""]]]:
+    """Lower factor L of a = L L' as rows of scalars (`dim` is small and static)."""
+    n = a.shape[0]
+    rows: list[list[Float[Array, ""]]] = []
+    for i in range(n):
+        row = []
+        for j in range(i + 1):
+            s = a[i, j]
+            for m in range(j):
+                s = s - row[m] * (row if i == j else rows[j])[m]
+            row.append(jnp.sqrt(s) if i == j else s / rows[j][j])
+        rows.append(row)
+    return rows
+
+
+def lower(rows: list[list[Float[Array, ""]]]) -> Float[Array, "dim dim"]:
+    """The factor of `cholesky` as a matrix."""
+    n, zero = len(rows), jnp.zeros_like(rows[0][0])
+    return jnp.stack([jnp.stack(row + [zero] * (n - len(row))) for row in rows])
+
+
+def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
+    """Solution x of a x = b for a symmetric positive definite a."""
+    rows = cholesky(a)
+    n = len(rows)
+    z: list = []
+    for i in range(n):
+        s = b[i]
+        for m in range(i):
+            s = s - rows[i][m] * z[m]
+        z.append(s / rows[i][i])
+    x: list = [None] * n
+    for i in reversed(range(n)):
+        s = z[i]
+        for m in range(i + 1, n):
+            s = s - rows[m][i] * x[m]
+        x[i] = s / rows[i][i]
+    return jnp.stack(x)
+
+
+def symmetric(a: Float[Array, "*batch dim dim"]) -> Float[Array, "*batch dim dim"]:
+    """The symmetric part of a."""
+    return 0.5 * (a + jnp.swapaxes(a, -1, -2))
+
+
+def cubature(dim: int, dtype) -> Float[Array, "node dim"]:
+    """The 2 dim equal-weight points that match mean and covariance of N(0, I) [Arasaratnam & Haykin 2009, eq. 32]."""
+    eye = jnp.sqrt(jnp.asarray(dim, dtype)) * jnp.eye(dim, dtype=dtype)
+    return jnp.concatenate([eye, -eye])

@@ -1,0 +1,141 @@
+"""Extended Kalman filter and Rauch-Tung-Striebel smoother for one sequence.
+
+Measurement noise is diagonal, so readings are absorbed one at a time; a missing one is skipped by its mask.
+[Sarkka & Svensson 2023, "Bayesian Filtering and Smoothing", 2nd ed., chapters 7 and 13]
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .gaussian import Gaussian, spd_solve, symmetric
+
+
+class Affine(NamedTuple):
+    """x_{k+1} = matrix x_k + offset, for every step of a sequence."""
+
+    matrix: Float[Array, "*steps state state"]
+    offset: Float[Array, "*steps state"]
+
+
+class Filtered(NamedTuple):
+    """p(x_k | y_{0:k}), its one-step prediction and the innovations, whitened one reading at a time."""
+
+    state: Gaussian
+    predicted: Gaussian
+    innovation: Float[Array, "*time obs"]
+    """Innovation over its standard deviation; 0 where not measured."""
+    log_variance: Float[Array, "*time obs"]
+    """Log innovation variance; 0 where not measured."""
+    gain: Float[Array, "*time obs state"]
+    affine: Affine
+    loglik: Float[Array, ""]
+
+
+class Smoothed(NamedTuple):
+    """p(x_k | all y), with the backward gains cov(x_k, x_{k+1} | y) = gain_k cov_{k+1}."""
+
+    state: Gaussian
+    gain: Float[Array, "steps state state"]
+
+
+def linearise(model, x: Float[Array, " state"], u: Float[Array, " input"]) -> Affine:
+    """The transition about x, by `jax.jacfwd` [paper, eq. 14]."""
+
+    def both(x):
+        y = model.transition(x, u)
+        return y, y
+
+    matrix, value = jax.jacfwd(both, has_aux=True)(x)
+    return Affine(matrix, value - matrix @ x)
+
+
+def _condition(state: Gaussian, rows, r, y, observed):
+    """Absorb readings one at a time: y_i = rows_i x + noise of variance r_i."""
+    mean, cov = state
+    whitened, log_variance, gains = [], [], []
+    for i in range(y.shape[0]):
+        pc = cov @ rows[i]
+        s = rows[i] @ pc + r[i]
+        gain = jnp.where(observed[i], pc / s, 0.0)
+        e = y[i] - rows[i] @ mean
+        mean = mean + gain * e
+        cov = cov - gain[:, None] * pc[None, :]
+        whitened.append(jnp.where(observed[i], e / jnp.sqrt(s), 0.0))
+        log_variance.append(jnp.where(observed[i], jnp.log(s), 0.0))
+        gains.append(gain)
+    return Gaussian(mean, symmetric(cov)), jnp.stack(whitened), jnp.stack(log_variance), jnp.stack(gains)
+
+
+def _filter(model, start: Gaussian, y, observed, active, inputs, affine_at) -> Filtered:
+    """Kalman recursion; `affine_at(mean, input)` gives the transition that follows a filtered mean."""
+    q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
+    rows = jax.jacfwd(model.emission)(start.mean)
+    stay = jnp.eye(start.mean.shape[0], dtype=start.mean.dtype)
+
+    def step(predicted, slices):
+        y, observed, active, inputs = slices
+        state, whitened, log_variance, gain = _condition(predicted, rows, r, y, observed)
+        affine = affine_at(state.mean, inputs)
+        affine = Affine(jnp.where(active, affine.matrix, stay), jnp.where(active, affine.offset, 0.0))
+        following = Gaussian(
+            affine.matrix @ state.mean + affine.offset,
+            symmetric(affine.matrix @ state.cov @ affine.matrix.T) + jnp.where(active, q, 0.0),
+        )
+        return following, (state, predicted, whitened, log_variance, gain, affine)
+
+    _, (state, predicted, whitened, log_variance, gain, affine) = jax.lax.scan(
+        step, start, (y, observed, active, inputs)
+    )
+    count = jnp.sum(observed).astype(whitened.dtype)
+    loglik = -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi))
+    return Filtered(state, predicted, whitened, log_variance, gain, affine, loglik)
+
+
+def ekf(
+    model,
+    start: Gaussian,
+    u: Float[Array, "time input"],
+    y: Float[Array, "time obs"],
+    observed: Bool[Array, "time obs"],
+    active: Bool[Array, " time"],
+) -> Filtered:
+    """Extended Kalman filter, linearised at its own filtered means.
+
+    Entries of y that are not `observed` may hold anything finite.  The state rests over steps that are not `active`
+    (padding); the last affine map leads out of the data.
+    """
+    return _filter(model, start, y, observed, active, u, lambda mean, u: linearise(model, mean, u))
+
+
+def kalman_filter(
+    model,
+    start: Gaussian,
+    affine: Affine,
+    y: Float[Array, "time obs"],
+    observed: Bool[Array, "time obs"],
+    active: Bool[Array, " time"],
+) -> Filtered:
+    """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
+    return _filter(model, start, y, observed, active, affine, lambda mean, affine: affine)
+
+
+def rts(filtered: Filtered) -> Smoothed:
+    """Rauch-Tung-Striebel smoother behind either filter."""
+
+    def step(later: Gaussian, slices):
+        state, predicted, matrix = slices
+        gain = spd_solve(predicted.cov, matrix @ state.cov).T
+        mean = state.mean + gain @ (later.mean - predicted.mean)
+        cov = symmetric(state.cov + gain @ (later.cov - predicted.cov) @ gain.T)
+        return Gaussian(mean, cov), (Gaussian(mean, cov), gain)
+
+    last = jax.tree.map(lambda a: a[-1], filtered.state)
+    earlier = jax.tree.map(lambda a: a[:-1], filtered.state)
+    predicted = jax.tree.map(lambda a: a[1:], filtered.predicted)
+    _, (states, gain) = jax.lax.scan(step, last, (earlier, predicted, filtered.affine.matrix[:-1]), reverse=True)
+    mean, cov = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, last)
+    return Smoothed(Gaussian(mean, cov), gain)

@@ -1,0 +1,124 @@
+"""E-steps: p(x_{0:T} | y_{0:T}) of one sequence, in the one form that the M-step takes."""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .data import Dataset, fill_missing
+from .gaussian import Gaussian, cholesky, cubature, lower
+from .kalman import Filtered, Smoothed, ekf, kalman_filter, linearise, rts
+
+
+class Posterior(NamedTuple):
+    """The smoothing distribution: its marginals, and equal-weight nodes of p(x_k, x_{k+1} | y) for every step."""
+
+    state: Gaussian
+    prev: Float[Array, "*seq steps node state"]
+    next: Float[Array, "*seq steps node state"]
+    kick: Float[Array, "*seq steps node state"]
+    """The process noise x_{k+1} - f(x_k) of a node, as the smoother's own transition has it."""
+    loglik: Float[Array, "*seq"]
+
+
+class AbstractSmoother(eqx.Module):
+    """An E-step for one sequence."""
+
+    @abstractmethod
+    def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray) -> Posterior:
+        """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
+
+
+def active_steps(valid: Bool[Array, " time"]) -> Bool[Array, " time"]:
+    """True at k where the step from k to k + 1 lies inside the data."""
+    return jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
+
+
+class StartBank(eqx.Module):
+    """Hypotheses of the start: the prior cut into narrow Gaussians on a grid of its wide directions.
+
+    A hidden angle known to half a radian makes the posterior of the first second curved or split; an extended
+    filter from each hypothesis finds the branch, and the likelihood picks it.
+    """
+
+    offsets: Float[Array, "hypothesis state"]
+    """Centres, in standard deviations of the prior."""
+    shrink: Float[Array, " state"]
+    """Standard deviation of a hypothesis over that of the prior."""
+
+    def __init__(self, counts: tuple[int, ...], dtype=float, reach: float = 2.5):
+        """`counts` hypotheses along each state (1: as it is)."""
+        lines = [jnp.linspace(-reach, reach, n, dtype=dtype) if n > 1 else jnp.zeros(1, dtype) for n in counts]
+        self.offsets = jnp.stack([a.ravel() for a in jnp.meshgrid(*lines, indexing="ij")], axis=-1)
+        self.shrink = jnp.asarray([1.2 * reach / (n - 1) if n > 1 else 1.0 for n in counts], dtype)
+
+    def hypotheses(self, start: Gaussian) -> tuple[Gaussian, Float[Array, " hypothesis"]]:
+        """The hypotheses and their log weights, unnormalised."""
+        spread = jnp.sqrt(jnp.diag(start.cov))
+        means = start.mean[None] + self.offsets * spread[None]
+        cov = start.cov * jnp.outer(self.shrink, self.shrink)
+        return Gaussian(means, jnp.tile(cov[None], (means.shape[0], 1, 1))), -0.5 * jnp.sum(self.offsets**2, axis=-1)
+
+
+def _smooth(model, start: Gaussian, seq: Dataset, y, observed) -> tuple[Filtered, Smoothed]:
+    filtered = ekf(model, start, seq.u, y, observed, active_steps(seq.valid))
+    return filtered, rts(filtered)
+
+
+def relinearise(model, path: Float[Array, "time state"], seq: Dataset) -> tuple[Filtered, Smoothed]:
+    """One pass of the iterated extended Kalman smoother: all steps linearised about `path` at once [Bell 1994]."""
+    y, observed = fill_missing(seq.y)
+    affine = jax.vmap(lambda x, u: linearise(model, x, u))(path, seq.u)
+    filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active_steps(seq.valid))
+    return filtered, rts(filtered)
+
+
+class ExtendedKalmanSmoother(AbstractSmoother):
+    """Extended Kalman filter and RTS smoother, from the likeliest of a bank of starts, relinearised about itself."""
+
+    bank: StartBank
+    window: int = eqx.field(static=True, default=60)
+    """Samples over which the hypotheses compete."""
+    iterations: int = eqx.field(static=True, default=2)
+
+    def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
+        y, observed = fill_missing(seq.y)
+        observed = observed & seq.valid[:, None]
+        starts, log_weight = self.bank.hypotheses(model.start)
+        head = jax.tree.map(lambda a: a[: self.window], seq)
+
+        def score(start):
+            return _smooth(model, start, head, y[: self.window], observed[: self.window])[0].loglik
+
+        score = jax.vmap(score)(starts) + log_weight
+        best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
+        filtered, smoothed = _smooth(model, jax.tree.map(lambda a: a[best], starts), seq, y, observed)
+        for _ in range(self.iterations):
+            filtered, smoothed = relinearise(model, smoothed.state.mean, seq)
+        return filtered, smoothed
+
+    def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
+        filtered, smoothed = self.path(model, seq)
+        prev, following = pair_nodes(smoothed)
+        affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
+        kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
+        return Posterior(smoothed.state, prev, following, kick, filtered.loglik)
+
+
+def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:
+    """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) of every step."""
+
+    def one(mean, cov, gain, mean_next, cov_next):
+        n = mean.shape[0]
+        unit = cubature(2 * n, mean.dtype)
+        later = lower(cholesky(cov_next))
+        rest = lower(cholesky(cov - gain @ cov_next @ gain.T + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
+        spread_next = unit[:, :n] @ later.T
+        following = mean_next[None] + spread_next
+        return mean[None] + spread_next @ gain.T + unit[:, n:] @ rest.T, following
+
+    mean, cov = smoothed.state
+    return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -1,0 +1,57 @@
+"""The double pendulum in a vertical plane, the arm of the acrobot and of the pendubot."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .base import AbstractSystem
+
+Scalar = Float[Array, ""]
+
+
+class TwoLinkArm(AbstractSystem):
+    """Two rigid links; theta1 counts from hanging down, theta2 is relative to link 1 [rad].
+
+    [Spong 1995, "The swing up control problem for the acrobot", eq. 1; the rotor terms as in INTERFACE.md]
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("theta1", "theta2")
+    rates: ClassVar[tuple[str, ...]] = ("dtheta1", "dtheta2")
+    angles: ClassVar[tuple[bool, ...]] = (True, True)
+    optional: ClassVar[dict[str, float]] = {"Ir": 0.0, "gr": 1.0}
+
+    m1: Scalar
+    """Mass of link 1 [kg]."""
+    m2: Scalar
+    l1: Scalar
+    """Length of link 1 [m]."""
+    l2: Scalar
+    lc1: Scalar
+    """Distance of the centre of mass of link 1 from its joint [m]."""
+    lc2: Scalar
+    I1: Scalar
+    """Inertia of link 1 about its centre of mass [kg m^2]."""
+    I2: Scalar
+    g: Scalar
+    """Gravity [m/s^2]."""
+    Ir: Scalar
+    """Rotor inertia of both drives [kg m^2]."""
+    gr: Scalar
+    """Gear ratio of both drives [-]."""
+    joints: tuple[int, ...] = eqx.field(static=True)
+
+    def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
+        rotor = self.gr**2 * self.Ir
+        m22 = self.I2 + self.m2 * self.lc2**2
+        coupling = self.m2 * self.l1 * self.lc2 * jnp.cos(q[1])
+        m11 = self.I1 + self.m1 * self.lc1**2 + m22 + self.m2 * self.l1**2 + 2 * coupling + rotor + self.Ir
+        m12 = m22 + coupling - self.gr * self.Ir
+        return jnp.stack([jnp.stack([m11, m12]), jnp.stack([m12, m22 + rotor])])
+
+    def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        h = self.m2 * self.l1 * self.lc2 * jnp.sin(q[1])
+        gravity2 = self.m2 * self.lc2 * self.g * jnp.sin(q[0] + q[1])
+        gravity1 = (self.m1 * self.lc1 + self.m2 * self.l1) * self.g * jnp.sin(q[0]) + gravity2
+        return jnp.stack([gravity1 - h * v[1] * (2 * v[0] + v[1]), gravity2 + h * v[0] ** 2])

@@ -1,0 +1,39 @@
+"""What a machine must give to become a model: names, mass matrix and bias force."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class AbstractSystem(eqx.Module):
+    """Known rigid-body physics M(q) q'' + c(q, q') = B u + tau, in SI units.
+
+    Fields hold the physical parameters as scalars, under the names used in `rig.toml`.
+    `coordinates` names q, `rates` names q'; `angles` says which coordinates are angles [rad].
+    """
+
+    coordinates: ClassVar[tuple[str, ...]]
+    rates: ClassVar[tuple[str, ...]]
+    angles: ClassVar[tuple[bool, ...]]
+    optional: ClassVar[dict[str, float]] = {}
+
+    joints: eqx.AbstractVar[tuple[int, ...]]
+    """The joint (counted from 1) that each input drives."""
+
+    @abstractmethod
+    def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
+        """Mass matrix M(q) [kg m^2, or kg on a slide]."""
+
+    @abstractmethod
+    def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Coriolis, centrifugal and gravity force c(q, q') [N m, or N]."""
+
+    def drive(self, u: Float[Array, " input"]) -> Float[Array, " dof"]:
+        """Generalised force B u of the inputs [N m, or N]."""
+        force = [jnp.zeros((), u.dtype)] * len(self.coordinates)
+        for i, joint in enumerate(self.joints):
+            force[joint - 1] = force[joint - 1] + u[i]
+        return jnp.stack(force)

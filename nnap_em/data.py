@@ -88,12 +88,10 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     )
 
 
-def horizon(data: Dataset, steps: int) -> Dataset:
-    """The first `steps` transitions (`steps` + 1 samples) of every sequence; all of it where it is shorter."""
-    if steps < 1:
-        raise DataError(f"horizon: found steps = {steps}; give 1 or more")
-    t, u, y, valid = data
-    return Dataset(t[..., : steps + 1], u[..., : steps + 1, :], y[..., : steps + 1, :], valid[..., : steps + 1])
+def horizon(data: Dataset, samples: int) -> Dataset:
+    """The first `samples` samples of every sequence; the rest stays in place as padding, so that shapes do not change."""
+    seen = np.arange(data.t.shape[-1]) < samples
+    return data._replace(valid=data.valid & np.broadcast_to(seen, data.valid.shape))
 
 
 def fill_missing(y: Float[Array, "*batch obs"]) -> tuple[Float[jax.Array, "*batch obs"], Bool[jax.Array, "*batch obs"]]:

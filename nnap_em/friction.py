@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 
@@ -51,9 +52,29 @@ class FrictionNetwork(eqx.Module):
         line = jnp.linspace(-1.0, 1.0, count, dtype=self.speed.dtype)
         return self.knee[:, None] * jnp.sinh(top[:, None] * line[None, :])
 
+    def weights(self) -> Float[Array, " weight"]:
+        """All network weights as one vector."""
+        return ravel_pytree(eqx.filter(self.mlp, eqx.is_inexact_array))[0]
+
+    def with_weights(self, flat: Float[Array, " weight"]) -> "FrictionNetwork":
+        """This map with the weights replaced."""
+        arrays, static = eqx.partition(self.mlp, eqx.is_inexact_array)
+        return eqx.tree_at(lambda f: f.mlp, self, eqx.combine(ravel_pytree(arrays)[1](flat), static))
+
 
 class NoFriction(eqx.Module):
-    """A machine that is declared free of friction."""
+    """A machine that is declared free of friction: the same interface, nothing to learn."""
+
+    dof: int = eqx.field(static=True)
 
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         return jnp.zeros_like(v)
+
+    def nodes(self, count: int) -> Float[Array, "dof 2"]:
+        return jnp.asarray([[-1.0, 1.0]] * self.dof)
+
+    def weights(self) -> Float[Array, " 0"]:
+        return jnp.zeros(0)
+
+    def with_weights(self, flat: Float[Array, " 0"]) -> "NoFriction":
+        return self

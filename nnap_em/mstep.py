@@ -10,6 +10,8 @@ vector phi in which the likelihood is quadratic; the network is then fitted to t
 Levenberg-Marquardt.
 """
 
+import math
+from abc import abstractmethod
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,25 +20,30 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
-from .friction import FrictionNetwork
 from .gaussian import Gaussian
 from .kalman import Affine, kalman_filter
+from .model import StateSpaceModel
 from .smoother import Posterior, active_steps
 
 
 class ParameterPrior(eqx.Module):
-    """Physical parameters to be estimated, with the owner's belief."""
+    """Physical parameters to be estimated, with the owner's belief; estimated in its standard deviations."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     mean: Float[Array, " param"]
     std: Float[Array, " param"]
 
     def read(self, system) -> Float[Array, " param"]:
-        return jnp.stack([getattr(system, n) for n in self.names]) if self.names else self.mean
+        """The system's values as (value - mean) / std."""
+        if not self.names:
+            return self.mean
+        return (jnp.stack([getattr(system, n) for n in self.names]) - self.mean) / self.std
 
-    def write(self, model, values: Float[Array, " param"]):
+    def write(self, model, z: Float[Array, " param"]):
+        """The model with values mean + std z."""
         if not self.names:
             return model
+        values = self.mean + self.std * z
         return eqx.tree_at(lambda m: [getattr(m.system, n) for n in self.names], model, list(values))
 
 
@@ -131,42 +138,151 @@ def expand(model, prior: ParameterPrior, nodes: Float[Array, "dof count"], poste
     return Quadratic(score, jac.T @ jac, jnp.concatenate([score_q, score_r]), noise_information)
 
 
-def fit_quadratic(
-    model, prior: ParameterPrior, nodes: Float[Array, "dof count"], total: Quadratic, ridge: float, iterations: int = 40
-):
-    """Network weights and parameters that maximise the quadratic log-likelihood with their priors."""
-    arrays, static = eqx.partition(model.unknown.mlp, eqx.is_inexact_array)
-    flat, unravel = jax.flatten_util.ravel_pytree(arrays)
-    w0 = jnp.concatenate([flat, prior.read(model.system)])
-    n = flat.shape[0]
-    centre = jnp.concatenate([jnp.zeros_like(flat), prior.mean])
-    precision = jnp.concatenate([jnp.full_like(flat, ridge), prior.std**-2])
+class Weights(eqx.Module):
+    """All that the M-step fits as one vector: network weights, then parameters in units of their prior."""
 
-    def phi(w):
-        unknown = eqx.tree_at(lambda f: f.mlp, model.unknown, eqx.combine(unravel(w[:n]), static))
-        return jnp.concatenate([jax.vmap(unknown)(nodes.T).T.ravel(), w[n:]])
+    prior: ParameterPrior
+    nodes: Float[Array, "dof count"]
+    ridge: float
+    """Precision of the weights' prior; the network's output is scaled so that 1 is natural."""
 
-    phi0 = phi(w0)
+    def read(self, model) -> Float[Array, " weight"]:
+        return jnp.concatenate([model.unknown.weights(), self.prior.read(model.system)])
 
-    def loss(w):
-        d = phi(w) - phi0
-        return -total.score @ d + 0.5 * d @ total.information @ d + 0.5 * jnp.sum(precision * (w - centre) ** 2)
+    def write(self, model, w: Float[Array, " weight"]):
+        cut = w.shape[0] - len(self.prior.names)
+        unknown = model.unknown.with_weights(w[:cut])
+        return self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
 
-    def body(_, carry):
-        w, value, damping = carry
-        jac = jax.jacfwd(phi)(w)
-        gradient = jac.T @ (total.information @ (phi(w) - phi0) - total.score) + precision * (w - centre)
-        hessian = jac.T @ total.information @ jac + jnp.diag(precision)
-        hessian = hessian + damping * jnp.diag(jnp.diag(hessian))
-        trial = w - jnp.linalg.solve(hessian, gradient)
-        new = loss(trial)
-        better = new < value
-        return (
-            jnp.where(better, trial, w),
-            jnp.where(better, new, value),
-            jnp.where(better, damping * 0.2, damping * 4.0),
-        )
+    def phi(self, model, w: Float[Array, " weight"]) -> Float[Array, " phi"]:
+        """The vector in which the likelihood is quadratic."""
+        cut = w.shape[0] - len(self.prior.names)
+        return jnp.concatenate([jax.vmap(model.unknown.with_weights(w[:cut]))(self.nodes.T).T.ravel(), w[cut:]])
 
-    w, _, _ = jax.lax.fori_loop(0, iterations, body, (w0, loss(w0), jnp.asarray(1e-3, w0.dtype)))
-    fitted = eqx.tree_at(lambda m: m.unknown.mlp, model, eqx.combine(unravel(w[:n]), static))
-    return prior.write(fitted, w[n:])
+    def precision(self, w: Float[Array, " weight"]) -> Float[Array, " weight"]:
+        cut = w.shape[0] - len(self.prior.names)
+        return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
+
+    def hessian(self, model, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
+        """Posterior precision of the weights, and the sensitivity of phi to them."""
+        jac = jax.jacfwd(lambda w: self.phi(model, w))(w)
+        return jac.T @ information @ jac + jnp.diag(self.precision(w)), jac
+
+    def fit(self, model, score: Float[Array, " phi"], information: Float[Array, "phi phi"], iterations: int):
+        """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3]."""
+        w0 = self.read(model)
+        phi0 = self.phi(model, w0)
+        precision = self.precision(w0)
+
+        def loss(w):
+            d = self.phi(model, w) - phi0
+            return -score @ d + 0.5 * d @ information @ d + 0.5 * jnp.sum(precision * w**2)
+
+        def going(carry):
+            _, _, damping, count, gain = carry
+            return (count < iterations) & (damping < 1e6) & (gain > 1e-3)
+
+        def body(carry):
+            w, value, damping, count, gain = carry
+            hessian, jac = self.hessian(model, w, information)
+            gradient = jac.T @ (information @ (self.phi(model, w) - phi0) - score) + precision * w
+            factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.diag(jnp.diag(hessian)))
+            trial = w - jax.scipy.linalg.cho_solve(factor, gradient)
+            new = loss(trial)
+            better = new < value
+            gain = jnp.where(better, 0.7 * gain + 0.3 * (value - new), gain)
+            keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
+            return keep(trial, w), keep(new, value), damping * keep(0.2, 4.0), count + 1, gain
+
+        one = jnp.ones((), w0.dtype)
+        w, *_ = jax.lax.while_loop(going, body, (w0, loss(w0), 1e-3 * one, jnp.zeros((), int), one))
+        return w
+
+
+class MStepInfo(NamedTuple):
+    """What an M-step lets one see and reuse."""
+
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of the weights (zero for M-steps that know none)."""
+    used: Bool[Array, " seq"]
+    """Sequences that took part."""
+
+
+class AbstractMStep(eqx.Module):
+    """A rule for the next model, given the posterior of every sequence."""
+
+    @abstractmethod
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
+        """The next model."""
+
+    @abstractmethod
+    def no_hessian(self, model) -> Float[Array, "weight weight"]:
+        """`MStepInfo.hessian` before the first epoch."""
+
+
+def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
+    """Sequences whose track is not lost: log-likelihood per reading not far below the median of all."""
+    _, observed = fill_missing(data.y)
+    count = jnp.sum(observed & data.valid[..., None], axis=(1, 2)).astype(posterior.loglik.dtype)
+    mean = posterior.loglik / jnp.maximum(count, 1.0)
+    finite = jnp.isfinite(mean)
+    middle = jnp.nanmedian(jnp.where(finite, mean, jnp.nan))
+    spread = 1.48 * jnp.nanmedian(jnp.where(finite, jnp.abs(mean - middle), jnp.nan))
+    return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
+
+
+class ScoringMStep(AbstractMStep):
+    """Fisher scoring of the marginal likelihood for the hybrid model: weights, parameters, noise and start."""
+
+    prior: ParameterPrior
+    learn_start: tuple[bool, ...] = eqx.field(static=True)
+    learn_r: tuple[bool, ...] = eqx.field(static=True)
+    nodes: int = eqx.field(static=True, default=41)
+    ridge: float = 1.0
+    iterations: int = eqx.field(static=True, default=200)
+    stride: float = 1.5
+    """Largest change of a log variance in one step."""
+
+    def weights(self, model) -> Weights:
+        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge)
+
+    def no_hessian(self, model) -> Float[Array, "weight weight"]:
+        w = self.weights(model).read(model)
+        return jnp.zeros((w.shape[0], w.shape[0]), w.dtype)
+
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
+        weights = self.weights(model)
+        each = jax.vmap(lambda p, s: expand(model, self.prior, weights.nodes, p, s))(posterior, data)
+        used = kept(posterior, data) & jnp.all(jnp.isfinite(each.score), axis=1)
+        used = used & jnp.all(jnp.isfinite(each.information), axis=(1, 2)) & jnp.all(jnp.isfinite(each.noise_score), 1)
+        pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
+        total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
+        w = weights.fit(model, total.score, total.information, self.iterations)
+        hessian, _ = weights.hessian(model, w, total.information)
+        fitted = weights.write(model, w)
+        log_q, log_r = self._noise(model, total)
+        start = self._start(model.start, jax.tree.map(lambda a: pick(a[:, 0]), posterior.state), used)
+        fitted = eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, (log_q, log_r, start))
+        return fitted, MStepInfo(hessian, used)
+
+    def _noise(self, model, total: Quadratic):
+        info = total.noise_information
+        learn = jnp.asarray([True] * model.log_q.shape[0] + list(self.learn_r))
+        info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
+        info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
+        step = jnp.linalg.solve(info, jnp.where(learn, total.noise_score, 0.0))
+        step = jnp.clip(step, -self.stride, self.stride)
+        n = model.log_q.shape[0]
+        log_q = model.log_q + step[:n]
+        rates = log_q[n // 2 :]
+        floor = rates + 2 * math.log(0.1 * model.dt)
+        return jnp.concatenate([jnp.maximum(log_q[: n // 2], floor), rates]), model.log_r + step[n:]
+
+    def _start(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
+        """EM's own update of the entries that nobody declared [paper, eq. 11]."""
+        learn = jnp.asarray(self.learn_start)
+        count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)
+        mean = jnp.where(learn, jnp.sum(first.mean, axis=0) / count, start.mean)
+        square = jnp.where(used[:, None], (first.mean - mean[None]) ** 2, 0.0)
+        variance = (jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)) / (count + 1)
+        return Gaussian(mean, jnp.diag(jnp.where(learn, variance, jnp.diag(start.cov))))

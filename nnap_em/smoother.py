@@ -96,9 +96,9 @@ class ExtendedKalmanSmoother(AbstractSmoother):
         score = jax.vmap(score)(starts) + log_weight
         best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
         filtered, smoothed = _smooth(model, jax.tree.map(lambda a: a[best], starts), seq, y, observed)
-        for _ in range(self.iterations):
-            filtered, smoothed = relinearise(model, smoothed.state.mean, seq)
-        return filtered, smoothed
+        return jax.lax.fori_loop(
+            0, self.iterations, lambda _, now: relinearise(model, now[1].state.mean, seq), (filtered, smoothed)
+        )
 
     def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
         filtered, smoothed = self.path(model, seq)

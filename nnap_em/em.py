@@ -1,0 +1,118 @@
+"""Expectation-Maximisation: E-step and M-step in turn, over a growing horizon, until nothing changes.
+
+A wrong model loses a hidden chaotic joint within a second or two and a fit to a lost track is worthless; so the first
+epochs see the head of every sequence only, and the horizon grows as the model improves.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .data import Dataset, horizon
+from .model import StateSpaceModel
+from .mstep import AbstractMStep, MStepInfo
+from .smoother import AbstractSmoother, Posterior
+
+
+class EMState(NamedTuple):
+    """Everything that is needed to go on: resuming from it gives the same numbers."""
+
+    epoch: int
+    model: StateSpaceModel
+    hessian: Float[Array, "weight weight"]
+    key: PRNGKeyArray
+    loglik: Float[np.ndarray, " epoch"]
+    """Mean log-likelihood per sequence of the epochs so far."""
+
+
+class FitError(RuntimeError):
+    """EM cannot go on: every sequence is lost."""
+
+
+class Schedule(eqx.Module):
+    """How many samples of each sequence an epoch sees."""
+
+    first: int = eqx.field(static=True, default=60)
+    growth: float = eqx.field(static=True, default=1.6)
+    hold: int = eqx.field(static=True, default=2)
+    """Epochs at a horizon before it grows; the first horizon lasts one more."""
+
+    def horizon(self, epoch: int, longest: int) -> int:
+        """Samples seen in `epoch`, counted from 0."""
+        return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
+
+
+def e_step(model: StateSpaceModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+    """Smooth every sequence of `data`."""
+    keys = jax.random.split(key, data.t.shape[0])
+    return jax.vmap(lambda seq, key: smoother(model, seq, key=key))(data, keys)
+
+
+@eqx.filter_jit
+def em_step(
+    model: StateSpaceModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
+) -> tuple[StateSpaceModel, MStepInfo, Float[Array, " seq"]]:
+    """One E-step and one M-step."""
+    posterior = e_step(model, data, smoother, key=key)
+    model, info = m_step(model, posterior, data)
+    return model, info, posterior.loglik
+
+
+def start_state(model: StateSpaceModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
+    """The state before the first epoch."""
+    return EMState(0, model, m_step.no_hessian(model), key, np.zeros(0))
+
+
+def fit(
+    state: EMState,
+    data: Dataset,
+    smoother: AbstractSmoother,
+    m_step: AbstractMStep,
+    *,
+    epochs: int = 20,
+    schedule: Schedule = Schedule(),
+    tolerance: float = 0.05,
+    watch: Callable[[EMState, int, Bool[np.ndarray, " seq"]], None] = lambda state, seen, used: None,
+) -> EMState:
+    """EM from `state` until `epochs` are done or the likelihood rests.
+
+    It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
+    nats twice running.  `watch(state, samples seen, sequences used)` is called after every epoch.
+    Raises FitError when no sequence can be followed.
+    """
+    longest = data.t.shape[1]
+    if state.epoch == 0:
+        state = state._replace(model=_settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key))
+    while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
+        seen = schedule.horizon(state.epoch, longest)
+        key = jax.random.fold_in(state.key, state.epoch)
+        model, info, loglik = em_step(state.model, horizon(data, seen), smoother, m_step, key)
+        used = np.asarray(info.used)
+        if not used.any():
+            raise FitError(
+                f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; check units, "
+                "signs and the start prior, or declare a wider one"
+            )
+        mean = float(np.mean(np.asarray(loglik)[used]))
+        state = EMState(state.epoch + 1, model, info.hessian, state.key, np.append(state.loglik, mean))
+        watch(state, seen, used)
+    return state
+
+
+def _settle_noise(model, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
+    """`model` with its process noise scaled by the likeliest of `scales`: how far its first motion is off is unknown."""
+    trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
+    logliks = [float(jnp.nansum(em_step(trial, data, smoother, m_step, key)[2])) for trial in trials]
+    return trials[int(np.argmax(logliks))]
+
+
+def _rests(state: EMState, schedule: Schedule, longest: int, tolerance: float) -> bool:
+    if state.epoch < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
+        return False
+    return bool(np.all(np.abs(np.diff(state.loglik[-3:])) < tolerance))

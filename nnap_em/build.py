@@ -125,7 +125,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
     noise = [
         d if d is not None else max(2 * reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i, d in enumerate(declared)
     ]
-    unknown = NoFriction(len(system.coordinates))
+    unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
     if rig.friction:
         unknown = FrictionNetwork(
             jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque), key=key, width=width, resolution=300.0
@@ -146,7 +146,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
         jnp.asarray([rig.parameters[n].mean for n in free]),
         jnp.asarray([rig.parameters[n].std for n in free]),
     )
-    mstep = ScoringMStep(prior, open_, tuple(d is None for d in declared), nodes)
+    mstep = ScoringMStep(prior, open_, tuple(d is None for d in declared), nodes, shape=model.log_q)
     return Problem(model, mstep, start_bank(model, states, rig, system))
 
 

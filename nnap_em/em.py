@@ -92,7 +92,8 @@ def fit(
     while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
         seen = schedule.horizon(state.epoch, longest)
         key = jax.random.fold_in(state.key, state.epoch)
-        model, info, loglik = em_step(state.model, horizon(data, seen), smoother, m_step, key)
+        rule = m_step.early() if seen < longest else m_step
+        model, info, loglik = em_step(state.model, horizon(data, seen), smoother, rule, key)
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
@@ -108,7 +109,7 @@ def fit(
 def _settle_noise(model, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
     """`model` with its process noise scaled by the likeliest of `scales`: how far its first motion is off is unknown."""
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
-    logliks = [float(jnp.nansum(em_step(trial, data, smoother, m_step, key)[2])) for trial in trials]
+    logliks = [float(jnp.nansum(em_step(trial, data, smoother, m_step.early(), key)[2])) for trial in trials]
     return trials[int(np.argmax(logliks))]
 
 

@@ -65,13 +65,13 @@ class FrictionNetwork(eqx.Module):
 class NoFriction(eqx.Module):
     """A machine that is declared free of friction: the same interface, nothing to learn."""
 
-    dof: int = eqx.field(static=True)
+    scale: Float[Array, " dof"]
 
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         return jnp.zeros_like(v)
 
     def nodes(self, count: int) -> Float[Array, "dof 2"]:
-        return jnp.asarray([[-1.0, 1.0]] * self.dof)
+        return jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
 
     def weights(self) -> Float[Array, " 0"]:
         return jnp.zeros(0)

@@ -145,6 +145,8 @@ class Weights(eqx.Module):
     nodes: Float[Array, "dof count"]
     ridge: float
     """Precision of the weights' prior; the network's output is scaled so that 1 is natural."""
+    asymmetry: Float[Array, " dof"]
+    """Prior standard deviation [N m] of the even part of a friction map, its mean over the nodes."""
 
     def read(self, model) -> Float[Array, " weight"]:
         return jnp.concatenate([model.unknown.weights(), self.prior.read(model.system)])
@@ -160,12 +162,24 @@ class Weights(eqx.Module):
         return jnp.concatenate([jax.vmap(model.unknown.with_weights(w[:cut]))(self.nodes.T).T.ravel(), w[cut:]])
 
     def precision(self, w: Float[Array, " weight"]) -> Float[Array, " weight"]:
+        """Prior precision of the weights."""
         cut = w.shape[0] - len(self.prior.names)
         return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
 
+    def symmetry(self) -> Float[Array, "phi phi"]:
+        """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
+        dof, count = self.nodes.shape
+        even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1]) / math.sqrt(count)
+        blocks = [even.T @ even / self.asymmetry[j] ** 2 for j in range(dof)]
+        return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((len(self.prior.names),) * 2))
+
+    def jacobian(self, model, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
+        """Sensitivity of phi to the weights."""
+        return jax.jacfwd(lambda w: self.phi(model, w))(w)
+
     def hessian(self, model, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
         """Posterior precision of the weights, and the sensitivity of phi to them."""
-        jac = jax.jacfwd(lambda w: self.phi(model, w))(w)
+        jac = self.jacobian(model, w)
         return jac.T @ information @ jac + jnp.diag(self.precision(w)), jac
 
     def fit(self, model, score: Float[Array, " phi"], information: Float[Array, "phi phi"], iterations: int):
@@ -173,6 +187,9 @@ class Weights(eqx.Module):
         w0 = self.read(model)
         phi0 = self.phi(model, w0)
         precision = self.precision(w0)
+        symmetry = self.symmetry()
+        score = score - symmetry @ phi0
+        information = information + symmetry
 
         def loss(w):
             d = self.phi(model, w) - phi0
@@ -216,6 +233,10 @@ class AbstractMStep(eqx.Module):
         """The next model."""
 
     @abstractmethod
+    def early(self) -> "AbstractMStep":
+        """The rule while the horizon still grows."""
+
+    @abstractmethod
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
         """`MStepInfo.hessian` before the first epoch."""
 
@@ -242,9 +263,19 @@ class ScoringMStep(AbstractMStep):
     iterations: int = eqx.field(static=True, default=200)
     stride: float = 1.5
     """Largest change of a log variance in one step."""
+    tie: Float[Array, ""] = eqx.field(default=0.1, converter=jnp.asarray)
+    """Precision with which the ratios of the process noises are held to those of the first model.
+
+    A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.
+    """
+    shape: Float[Array, " state"] | None = None
+    """Log variances of the process noise of the first model."""
 
     def weights(self, model) -> Weights:
-        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge)
+        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge, 0.1 * model.unknown.scale)
+
+    def early(self) -> "ScoringMStep":
+        return eqx.tree_at(lambda m: m.tie, self, jnp.asarray(1e4))
 
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
         w = self.weights(model).read(model)
@@ -258,7 +289,7 @@ class ScoringMStep(AbstractMStep):
         pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
         total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
         w = weights.fit(model, total.score, total.information, self.iterations)
-        hessian, _ = weights.hessian(model, w, total.information)
+        hessian, _ = weights.hessian(model, w, total.information + weights.symmetry())
         fitted = weights.write(model, w)
         log_q, log_r = self._noise(model, total)
         start = self._start(model.start, jax.tree.map(lambda a: pick(a[:, 0]), posterior.state), used)
@@ -270,9 +301,11 @@ class ScoringMStep(AbstractMStep):
         learn = jnp.asarray([True] * model.log_q.shape[0] + list(self.learn_r))
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
-        step = jnp.linalg.solve(info, jnp.where(learn, total.noise_score, 0.0))
-        step = jnp.clip(step, -self.stride, self.stride)
         n = model.log_q.shape[0]
+        hold = jnp.zeros_like(info).at[:n, :n].set(self.tie * (jnp.eye(n) - 1 / n))
+        off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
+        step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
+        step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
         log_q = model.log_q + step[:n]
         rates = log_q[n // 2 :]
         floor = rates + 2 * math.log(0.1 * model.dt)

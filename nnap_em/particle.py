@@ -112,7 +112,7 @@ class Lookahead(AbstractProposal):
     On a linear system at temper = 1 every weight is equal.
     """
 
-    temper: float = eqx.field(static=True, default=1.0)
+    temper: float = eqx.field(static=True, default=0.98)
     """Below 1 the potentials are wider than the linearised ones, for heavier tails of the proposal."""
 
     def __call__(self, model, seq: Dataset, filtered: Filtered, smoothed: Smoothed) -> Potentials:
@@ -307,11 +307,12 @@ class ExactBackward(AbstractBackward):
 
     def __call__(self, x_next, f, log_w, log_ahead, parent, *, key):
         spare = -log_w.shape[0] % self.block
-        log_w = jnp.pad(log_w, (0, spare), constant_values=-jnp.inf)
+        centre = jnp.mean(f, axis=1, keepdims=True)  # or the squares below would cancel
+        x_next, f = x_next - centre, f - centre
+        logits = jnp.pad(log_w - 0.5 * jnp.sum(f**2, axis=0), (0, spare), constant_values=-jnp.inf)[None, :]
         f = jnp.pad(f, ((0, 0), (0, spare)))
-        logits = log_w[None, :]
         for i in range(f.shape[0]):
-            logits = logits - 0.5 * (x_next[i][:, None] - f[i][None, :]) ** 2
+            logits = logits + x_next[i][:, None] * f[i][None, :]
         paths = x_next.shape[1]
         w = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True)).reshape(paths, -1, self.block)
         reach = jnp.cumsum(jnp.sum(w, axis=2), axis=1)

@@ -1,0 +1,115 @@
+"""From a declared rig and its logs to a fitted model: the main job in one call."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .build import Problem, build
+from .data import Dataset
+from .em import EMState, Schedule, fit, start_state
+from .model import StateSpaceModel
+from .mstep import ScoringMStep
+from .rig import Rig
+from .smoother import AbstractSmoother, ExtendedKalmanSmoother, StartBank
+
+Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
+
+
+class Identified(NamedTuple):
+    """A fitted model with what is needed to use it, to judge it and to go on fitting."""
+
+    rig: Rig
+    state: EMState
+    m_step: ScoringMStep
+    bank: StartBank
+
+    @property
+    def model(self) -> StateSpaceModel:
+        """The model at the posterior mode."""
+        return self.state.model
+
+
+class FrictionTable(NamedTuple):
+    """The learned map with its uncertainty, over the visited velocities."""
+
+    velocity: Float[Array, "dof node"]
+    """[rad/s]"""
+    torque: Float[Array, "dof node"]
+    """[N m]"""
+    cov: Float[Array, "dof node node"]
+    """Covariance of the torque over the nodes of a joint [N^2 m^2]."""
+
+    @property
+    def std(self) -> Float[Array, "dof node"]:
+        """Standard deviation of the torque [N m]."""
+        return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
+
+
+def begin(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Identified:
+    """The problem before the first epoch."""
+    key_build, key_fit = jax.random.split(key)
+    problem: Problem = build(rig, data, key=key_build)
+    return Identified(rig, start_state(problem.model, problem.mstep, key=key_fit), problem.mstep, problem.bank)
+
+
+def identify(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    smoother: Callable[[StartBank], AbstractSmoother] = ExtendedKalmanSmoother,
+    epochs: int = 20,
+    schedule: Schedule = Schedule(),
+    start: Identified | None = None,
+    watch: Watch = lambda state, seen, used: None,
+) -> Identified:
+    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start` if given.
+
+    Raises FitError when no sequence can be followed.
+    """
+    now = begin(rig, data, key=key) if start is None else start
+    state = fit(now.state, data, smoother(now.bank), now.m_step, epochs=epochs, schedule=schedule, watch=watch)
+    return now._replace(state=state)
+
+
+def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    """Deviations of node torques [N m] and parameters from the mode, drawn from the Laplace posterior.
+
+    Linearised in the network's weights, which are hardly determined one by one while the torque is
+    [Immer, Korzepa & Bauer 2021, AISTATS].
+    """
+    weights = fitted.m_step.weights(fitted.model)
+    jac = weights.jacobian(fitted.model, weights.read(fitted.model))
+    unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
+    factor = jnp.linalg.cholesky(fitted.state.hessian)
+    return (jac @ jax.scipy.linalg.solve_triangular(factor.T, unit, lower=False)).T
+
+
+def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
+    """The learned map at `velocity` [rad/s], its covariance linearised in the weights (Laplace)."""
+    weights = fitted.m_step.weights(fitted.model)
+    w = weights.read(fitted.model)
+
+    def torque(w):
+        return jax.vmap(weights.write(fitted.model, w).unknown)(velocity.T).T
+
+    jac = jax.jacfwd(torque)(w)
+    half = jax.scipy.linalg.solve_triangular(
+        jnp.linalg.cholesky(fitted.state.hessian), jac.reshape(-1, w.shape[0]).T, lower=True
+    ).T.reshape(jac.shape)
+    return FrictionTable(velocity, torque(w), jnp.einsum("jaw,jbw->jab", half, half))
+
+
+def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
+    """Estimated physical parameters: value and standard deviation in the unit of `rig.toml`."""
+    prior = fitted.m_step.prior
+    if not prior.names:
+        return {}
+    cov = jnp.linalg.inv(fitted.state.hessian)[-len(prior.names) :, -len(prior.names) :]
+    std = prior.std * jnp.sqrt(jnp.diag(cov))
+    value = prior.mean + prior.std * prior.read(fitted.model.system)
+    return {n: (float(v), float(s)) for n, v, s in zip(prior.names, value, std, strict=True)}

@@ -1,0 +1,115 @@
+"""Open-loop prediction: the distribution of the state after the last measurement that may be used."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .data import Dataset, fill_missing
+from .gaussian import Gaussian, cholesky, lower
+from .identify import Identified, phi_samples
+from .mstep import hats
+from .smoother import ExtendedKalmanSmoother, Posterior
+
+HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+"""Horizons [s] of the reported errors."""
+
+
+class Prediction(NamedTuple):
+    """Mean and standard deviation of the noise-free state, for every row of the data."""
+
+    mean: Float[Array, "seq time state"]
+    std: Float[Array, "seq time state"]
+    ahead: Bool[Array, "seq time"]
+    """Rows later than the given time; the others are smoothed."""
+
+
+def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
+    """Rows with time <= first time + given [s], to a thousandth of a sample."""
+    t = np.asarray(data.t, np.float64)
+    step = np.median(np.diff(t, axis=1)) if t.shape[1] > 1 else 0.0
+    return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-3 * step)
+
+
+@eqx.filter_jit
+def _smooth(model, data: Dataset, smoother: ExtendedKalmanSmoother) -> Posterior:
+    return jax.vmap(lambda seq: smoother(model, seq))(data)
+
+
+def smooth(fitted: Identified, data: Dataset) -> Posterior:
+    """p(x_k | all y) of every sequence by the extended smoother, from the likeliest start."""
+    return _smooth(fitted.model, data, ExtendedKalmanSmoother(fitted.bank, iterations=4))
+
+
+@eqx.filter_jit
+def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key: PRNGKeyArray):
+    """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
+    prior, nodes = m_step.prior, m_step.weights(model).nodes
+    dof, count = nodes.shape
+    tables = deviations[:, : dof * count].reshape(-1, dof, count)
+    parameters = prior.read(model.system)[None] + deviations[:, dof * count :]
+
+    def advance(x, u, table, parameters):
+        force = jnp.sum(jax.vmap(hats)(nodes, x[dof:]) * table, axis=-1)
+        return prior.write(model, parameters).transition(x, u, force)
+
+    def one(mean, cov, u, known, key):
+        last = jnp.sum(known) - 1
+        key_start, key_noise = jax.random.split(key)
+        shape = (tables.shape[0], mean.shape[-1])
+        spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
+        start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
+        kick = jax.random.normal(key_noise, (u.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
+
+        def step(x, slices):
+            k, u, kick = slices
+            following = jax.vmap(advance, in_axes=(0, None, 0, 0))(x, u, tables, parameters) + kick
+            x = jnp.where(k >= last, following, x)
+            return x, (jnp.mean(x, axis=0), jnp.std(x, axis=0))
+
+        _, (m, s) = jax.lax.scan(step, start, (jnp.arange(u.shape[0]), u, kick))
+        ahead = (jnp.arange(u.shape[0]) > last)[:, None]
+        m, s = (jnp.concatenate([a[:1], a[:-1]]) for a in (m, s))
+        return jnp.where(ahead, m, mean), jnp.where(ahead, s, jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2)))
+
+    keys = jax.random.split(key, known.shape[0])
+    return jax.vmap(one)(state.mean, state.cov, data.u, known, keys)
+
+
+def predict(
+    fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100
+) -> Prediction:
+    """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
+
+    Uncertainty of the present state, of the friction and parameters, and process noise are in it; measurement noise is not.
+    """
+    known = given_samples(data, given)
+    posterior = smooth(fitted, data._replace(valid=known))
+    key_draw, key_roll = jax.random.split(key)
+    deviations = phi_samples(fitted, samples, key=key_draw)
+    mean, std = _roll(fitted.model, fitted.m_step, deviations, posterior.state, data, known, key_roll)
+    return Prediction(mean, std, jnp.asarray(np.asarray(data.valid) & ~known))
+
+
+def horizon_errors(
+    prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = HORIZONS
+) -> dict[str, list[float]]:
+    """Root mean square of prediction minus reading over (given, given + horizon], per measured column; NaN where no data."""
+    y, observed = (np.asarray(a) for a in fill_missing(jnp.asarray(data.y)))
+    since = np.asarray(data.t) - np.asarray(data.t)[:, :1] - given
+    system = fitted.model.system
+    out = {}
+    for i, (name, state) in enumerate(zip(fitted.rig.measured, fitted.model.measured, strict=True)):
+        error = np.asarray(prediction.mean)[..., state] - y[..., i]
+        if state < len(system.angles) and system.angles[state]:
+            error = (error + np.pi) % (2 * np.pi) - np.pi
+        inside = observed[..., i] & np.asarray(prediction.ahead)
+        rms = []
+        for horizon in horizons:
+            e = error[inside & (since <= horizon + 1e-3 * fitted.rig.dt)]
+            rms.append(float(np.sqrt(np.mean(e**2))) if e.size else float("nan"))
+        out[name] = rms
+    return out

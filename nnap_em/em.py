@@ -25,7 +25,17 @@ class EMState(NamedTuple):
 
     epoch: int
     model: StateSpaceModel
+    """The model that the next epoch tries."""
+    best: StateSpaceModel
+    """The likeliest model so far at the present horizon."""
+    proposal: StateSpaceModel
+    """Where the M-step would go from `best`."""
     hessian: Float[Array, "weight weight"]
+    """Posterior precision of the M-step's weights at `best`."""
+    top: float
+    """Mean log-likelihood of `best`."""
+    stride: float
+    """Share of the way to `proposal` that is tried."""
     key: PRNGKeyArray
     loglik: Float[np.ndarray, " epoch"]
     """Mean log-likelihood per sequence of the epochs so far."""
@@ -66,7 +76,7 @@ def em_step(
 
 def start_state(model: StateSpaceModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
-    return EMState(0, model, m_step.no_hessian(model), key, np.zeros(0))
+    return EMState(0, model, model, model, m_step.no_hessian(model), -math.inf, 1.0, key, np.zeros(0))
 
 
 def fit(
@@ -88,22 +98,37 @@ def fit(
     """
     longest = data.t.shape[1]
     if state.epoch == 0:
-        state = state._replace(model=_settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key))
+        model = _settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key)
+        state = state._replace(model=model, best=model)
     while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
         seen = schedule.horizon(state.epoch, longest)
         key = jax.random.fold_in(state.key, state.epoch)
         rule = m_step.early() if seen < longest else m_step
-        model, info, loglik = em_step(state.model, horizon(data, seen), smoother, rule, key)
+        proposal, info, loglik = em_step(state.model, horizon(data, seen), smoother, rule, key)
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
                 f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; check units, "
                 "signs and the start prior, or declare a wider one"
             )
-        mean = float(np.mean(np.asarray(loglik)[used]))
-        state = EMState(state.epoch + 1, model, info.hessian, state.key, np.append(state.loglik, mean))
+        if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
+            state = state._replace(top=-math.inf, stride=1.0)
+        state = _judge(state, proposal, info.hessian, np.asarray(loglik))
         watch(state, seen, used)
     return state
+
+
+def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik: Float[np.ndarray, " seq"]) -> EMState:
+    """Accept the model that was tried, or go back to the best one and try a shorter way from there."""
+    mean = float(np.mean(np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)))
+    if mean >= state.top - 0.5:
+        stride = min(1.0, 2 * state.stride)
+        state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=mean, stride=stride)
+    else:
+        state = state._replace(stride=state.stride / 3)
+    way = lambda a, b: a + state.stride * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
+    model = jax.tree.map(way, state.best, state.proposal)
+    return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
 
 
 def _settle_noise(model, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):

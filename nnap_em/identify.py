@@ -14,7 +14,7 @@ from .em import EMState, Schedule, fit, start_state
 from .model import StateSpaceModel
 from .mstep import ScoringMStep
 from .rig import Rig
-from .smoother import AbstractSmoother, ExtendedKalmanSmoother, StartBank
+from .smoother import AbstractSmoother, CubatureSmoother, StartBank
 
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
 
@@ -29,8 +29,8 @@ class Identified(NamedTuple):
 
     @property
     def model(self) -> StateSpaceModel:
-        """The model at the posterior mode."""
-        return self.state.model
+        """The likeliest model."""
+        return self.state.best
 
 
 class FrictionTable(NamedTuple):
@@ -61,7 +61,7 @@ def identify(
     data: Dataset,
     *,
     key: PRNGKeyArray,
-    smoother: Callable[[StartBank], AbstractSmoother] = ExtendedKalmanSmoother,
+    smoother: Callable[[StartBank], AbstractSmoother] = CubatureSmoother,
     epochs: int = 20,
     schedule: Schedule = Schedule(),
     start: Identified | None = None,

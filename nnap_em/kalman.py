@@ -5,20 +5,24 @@ Measurement noise is diagonal, so readings are absorbed one at a time; a missing
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .gaussian import Gaussian, spd_solve, symmetric
+from .gaussian import Gaussian, cholesky, cubature, lower, spd_solve, symmetric
 
 
 class Affine(NamedTuple):
-    """x_{k+1} = matrix x_k + offset, for every step of a sequence."""
+    """x_{k+1} = matrix x_k + offset + noise beyond the process noise, for every step of a sequence."""
 
     matrix: Float[Array, "*steps state state"]
     offset: Float[Array, "*steps state"]
+    noise: Float[Array, "*steps state state"]
+    """Covariance of what the affine map leaves out of the transition; 0 for a tangent."""
 
 
 class Filtered(NamedTuple):
@@ -42,15 +46,35 @@ class Smoothed(NamedTuple):
     gain: Float[Array, "steps state state"]
 
 
-def linearise(model, x: Float[Array, " state"], u: Float[Array, " input"]) -> Affine:
-    """The transition about x, by `jax.jacfwd` [paper, eq. 14]."""
+class Tangent(eqx.Module):
+    """The transition linearised at the mean, by `jax.jacfwd` [paper, eq. 14]."""
 
-    def both(x):
-        y = model.transition(x, u)
-        return y, y
+    def __call__(self, model, about: Gaussian, u: Float[Array, " input"]) -> Affine:
+        def both(x):
+            y = model.transition(x, u)
+            return y, y
 
-    matrix, value = jax.jacfwd(both, has_aux=True)(x)
-    return Affine(matrix, value - matrix @ x)
+        matrix, value = jax.jacfwd(both, has_aux=True)(about.mean)
+        return Affine(matrix, value - matrix @ about.mean, jnp.zeros_like(matrix))
+
+
+class Cubature(eqx.Module):
+    """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square.
+
+    It sees a friction kink as wide as the state is uncertain, and owns up to what an affine map cannot follow.
+    [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017, "Iterated posterior linearization smoother"]
+    """
+
+    def __call__(self, model, about: Gaussian, u: Float[Array, " input"]) -> Affine:
+        n = about.mean.shape[0]
+        factor = lower(cholesky(about.cov))
+        unit = cubature(n, about.mean.dtype)
+        y = jax.vmap(lambda x: model.transition(x, u))(about.mean[None] + unit @ factor.T)
+        mean = jnp.mean(y, axis=0)
+        slope = (y - mean[None]).T @ unit / (2 * n)  # matrix @ factor
+        matrix = jax.scipy.linalg.solve_triangular(factor, slope.T, lower=True, trans=1).T
+        noise = symmetric((y - mean[None]).T @ (y - mean[None]) / (2 * n) - slope @ slope.T)
+        return Affine(matrix, mean - matrix @ about.mean, noise)
 
 
 def _condition(state: Gaussian, rows, r, y, observed):
@@ -71,19 +95,20 @@ def _condition(state: Gaussian, rows, r, y, observed):
 
 
 def _filter(model, start: Gaussian, y, observed, active, inputs, affine_at) -> Filtered:
-    """Kalman recursion; `affine_at(mean, input)` gives the transition that follows a filtered mean."""
+    """Kalman recursion; `affine_at(state, input)` gives the transition that follows a filtered state."""
     q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
     rows = jax.jacfwd(model.emission)(start.mean)
     stay = jnp.eye(start.mean.shape[0], dtype=start.mean.dtype)
+    rest = Affine(stay, jnp.zeros_like(start.mean), jnp.zeros_like(stay))
 
     def step(predicted, slices):
         y, observed, active, inputs = slices
         state, whitened, log_variance, gain = _condition(predicted, rows, r, y, observed)
-        affine = affine_at(state.mean, inputs)
-        affine = Affine(jnp.where(active, affine.matrix, stay), jnp.where(active, affine.offset, 0.0))
+        affine = affine_at(state, inputs)
+        affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
         following = Gaussian(
             affine.matrix @ state.mean + affine.offset,
-            symmetric(affine.matrix @ state.cov @ affine.matrix.T) + jnp.where(active, q, 0.0),
+            symmetric(affine.matrix @ state.cov @ affine.matrix.T) + affine.noise + jnp.where(active, q, 0.0),
         )
         return following, (state, predicted, whitened, log_variance, gain, affine)
 
@@ -102,13 +127,14 @@ def ekf(
     y: Float[Array, "time obs"],
     observed: Bool[Array, "time obs"],
     active: Bool[Array, " time"],
+    linearise: Callable = Tangent(),
 ) -> Filtered:
-    """Extended Kalman filter, linearised at its own filtered means.
+    """Extended Kalman filter: linearised about its own filtered states, by tangents or by cubature.
 
     Entries of y that are not `observed` may hold anything finite.  The state rests over steps that are not `active`
     (padding); the last affine map leads out of the data.
     """
-    return _filter(model, start, y, observed, active, u, lambda mean, u: linearise(model, mean, u))
+    return _filter(model, start, y, observed, active, u, lambda state, u: linearise(model, state, u))
 
 
 def kalman_filter(
@@ -120,7 +146,7 @@ def kalman_filter(
     active: Bool[Array, " time"],
 ) -> Filtered:
     """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
-    return _filter(model, start, y, observed, active, affine, lambda mean, affine: affine)
+    return _filter(model, start, y, observed, active, affine, lambda state, affine: affine)
 
 
 def rts(filtered: Filtered) -> Smoothed:

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
-from .gaussian import Gaussian
-from .kalman import Affine, kalman_filter
+from .gaussian import Gaussian, spd_solve
+from .kalman import Cubature, Tangent, kalman_filter
 from .model import StateSpaceModel
 from .smoother import Posterior, active_steps
 
@@ -66,7 +66,9 @@ def hats(nodes: Float[Array, " count"], v: Float[Array, ""]) -> Float[Array, " c
     return rise - fall
 
 
-def expand(model, prior: ParameterPrior, nodes: Float[Array, "dof count"], posterior: Posterior, seq: Dataset) -> Quadratic:
+def expand(
+    model, prior: ParameterPrior, nodes: Float[Array, "dof count"], posterior: Posterior, seq: Dataset, linearise=Tangent()
+) -> Quadratic:
     """The log-likelihood of one sequence to second order."""
     y, observed = fill_missing(seq.y)
     observed = observed & seq.valid[:, None]
@@ -78,30 +80,30 @@ def expand(model, prior: ParameterPrior, nodes: Float[Array, "dof count"], poste
 
     def tangents(x, u):
         zero = jnp.zeros(dof, x.dtype)
-        fx, ff, fp = jax.jacfwd(
-            lambda x, force, p: prior.write(model, p).transition(x, u, force), argnums=(0, 1, 2)
-        )(x, zero, value)
-        f = model.transition(x, u)
-        return Affine(fx, f - fx @ x), ff, fp
+        return jax.jacfwd(lambda force, p: prior.write(model, p).transition(x, u, force), argnums=(0, 1))(zero, value)
 
-    affine, by_force, by_parameter = jax.vmap(tangents)(path, seq.u)
+    affine = jax.vmap(lambda state, u: linearise(model, state, u))(posterior.state, seq.u)
+    by_force, by_parameter = jax.vmap(tangents)(path, seq.u)
 
-    def columns(prev, following, kick, by_force, by_parameter):
+    def columns(prev, following, kick, excess, by_force, by_parameter):
         """Mean sensitivity of x_{k+1} to phi, and expected score, over the nodes of one step."""
         speed = 0.5 * (prev + following)[:, dof:]
         weights = jax.vmap(jax.vmap(hats), in_axes=(None, 0))(nodes, speed)  # node dof count
-        pull = (kick / q[None]) @ by_force  # node dof
+        push = spd_solve(jnp.diag(q) + excess, kick.T).T
+        pull = push @ by_force  # node dof
         score = jnp.mean(pull[:, :, None] * weights, axis=0).ravel()
-        score = jnp.concatenate([score, jnp.mean(kick / q[None], axis=0) @ by_parameter])
+        score = jnp.concatenate([score, jnp.mean(push, axis=0) @ by_parameter])
+        expected = jnp.diag(spd_solve(jnp.diag(q) + excess, jnp.eye(q.shape[0], dtype=q.dtype)))
+        square = 0.5 * q * (jnp.mean(push**2, axis=0) - expected)
         sensitivity = (by_force[:, :, None] * jnp.mean(weights, axis=0)[None]).reshape(kick.shape[1], -1)
-        return jnp.concatenate([sensitivity, by_parameter], axis=1), score, jnp.mean(kick**2, axis=0)
+        return jnp.concatenate([sensitivity, by_parameter], axis=1), score, square
 
     sensitivity, score, square = jax.vmap(columns)(
-        posterior.prev, posterior.next, posterior.kick, by_force[:-1], by_parameter[:-1]
+        posterior.prev, posterior.next, posterior.kick, posterior.excess, by_force[:-1], by_parameter[:-1]
     )
     inside = active[:-1]
     score = jnp.sum(jnp.where(inside[:, None], score, 0.0), axis=0)
-    score_q = 0.5 * jnp.sum(jnp.where(inside[:, None], square / q[None] - 1.0, 0.0), axis=0)
+    score_q = jnp.sum(jnp.where(inside[:, None], square, 0.0), axis=0)
     read = jax.vmap(model.emission)
     nodes_now = jnp.concatenate([posterior.prev, posterior.next[-1:]])
     misfit = jnp.mean((y[:, None] - jax.vmap(read)(nodes_now)) ** 2, axis=1)
@@ -263,11 +265,12 @@ class ScoringMStep(AbstractMStep):
     iterations: int = eqx.field(static=True, default=200)
     stride: float = 1.5
     """Largest change of a log variance in one step."""
-    tie: Float[Array, ""] = eqx.field(default=0.1, converter=jnp.asarray)
-    """Precision with which the ratios of the process noises are held to those of the first model.
+    tie: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
+    """Precision with which the ratios of the joints' process noises are held to those of the first model.
 
     A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.
     """
+    linearise: Tangent | Cubature = Cubature()
     shape: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
 
@@ -283,7 +286,7 @@ class ScoringMStep(AbstractMStep):
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         weights = self.weights(model)
-        each = jax.vmap(lambda p, s: expand(model, self.prior, weights.nodes, p, s))(posterior, data)
+        each = jax.vmap(lambda p, s: expand(model, self.prior, weights.nodes, p, s, self.linearise))(posterior, data)
         used = kept(posterior, data) & jnp.all(jnp.isfinite(each.score), axis=1)
         used = used & jnp.all(jnp.isfinite(each.information), axis=(1, 2)) & jnp.all(jnp.isfinite(each.noise_score), 1)
         pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
@@ -302,14 +305,19 @@ class ScoringMStep(AbstractMStep):
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
         n = model.log_q.shape[0]
-        hold = jnp.zeros_like(info).at[:n, :n].set(self.tie * (jnp.eye(n) - 1 / n))
+        hold = jnp.zeros_like(info).at[:n, :n].set(self._hold(n))
         off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
         step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
         step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
-        log_q = model.log_q + step[:n]
-        rates = log_q[n // 2 :]
-        floor = rates + 2 * math.log(0.1 * model.dt)
-        return jnp.concatenate([jnp.maximum(log_q[: n // 2], floor), rates]), model.log_r + step[n:]
+        return model.log_q + step[:n], model.log_r + step[n:]
+
+    def _hold(self, n: int) -> Float[Array, "state state"]:
+        """Prior precision of the log process noises: kicks act on rates, and reach angles over one step."""
+        dof = n // 2
+        rate = jnp.eye(dof)
+        angle = jnp.concatenate([rate, -rate], axis=1)
+        ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)
+        return 1e4 * angle.T @ angle + self.tie * ratio.T @ ratio
 
     def _start(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
         """EM's own update of the entries that nobody declared [paper, eq. 11]."""

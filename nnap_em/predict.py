@@ -12,7 +12,7 @@ from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower
 from .identify import Identified, phi_samples
 from .mstep import hats
-from .smoother import ExtendedKalmanSmoother, Posterior
+from .smoother import AbstractSmoother, CubatureSmoother, Posterior
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
@@ -35,13 +35,13 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
 
 
 @eqx.filter_jit
-def _smooth(model, data: Dataset, smoother: ExtendedKalmanSmoother) -> Posterior:
+def _smooth(model, data: Dataset, smoother: AbstractSmoother) -> Posterior:
     return jax.vmap(lambda seq: smoother(model, seq))(data)
 
 
 def smooth(fitted: Identified, data: Dataset) -> Posterior:
-    """p(x_k | all y) of every sequence by the extended smoother, from the likeliest start."""
-    return _smooth(fitted.model, data, ExtendedKalmanSmoother(fitted.bank, iterations=4))
+    """p(x_k | all y) of every sequence by the cubature smoother, from the likeliest start."""
+    return _smooth(fitted.model, data, CubatureSmoother(fitted.bank))
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, cubature, lower
-from .kalman import Filtered, Smoothed, ekf, kalman_filter, linearise, rts
+from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, rts
 
 
 class Posterior(NamedTuple):
@@ -21,6 +21,8 @@ class Posterior(NamedTuple):
     next: Float[Array, "*seq steps node state"]
     kick: Float[Array, "*seq steps node state"]
     """The process noise x_{k+1} - f(x_k) of a node, as the smoother's own transition has it."""
+    excess: Float[Array, "*seq steps state state"]
+    """Covariance of a kick beyond the process noise, where the smoother's transition is an approximation."""
     loglik: Float[Array, "*seq"]
 
 
@@ -63,49 +65,59 @@ class StartBank(eqx.Module):
         return Gaussian(means, jnp.tile(cov[None], (means.shape[0], 1, 1))), -0.5 * jnp.sum(self.offsets**2, axis=-1)
 
 
-def _smooth(model, start: Gaussian, seq: Dataset, y, observed) -> tuple[Filtered, Smoothed]:
-    filtered = ekf(model, start, seq.u, y, observed, active_steps(seq.valid))
-    return filtered, rts(filtered)
-
-
-def relinearise(model, path: Float[Array, "time state"], seq: Dataset) -> tuple[Filtered, Smoothed]:
-    """One pass of the iterated extended Kalman smoother: all steps linearised about `path` at once [Bell 1994]."""
-    y, observed = fill_missing(seq.y)
-    affine = jax.vmap(lambda x, u: linearise(model, x, u))(path, seq.u)
-    filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active_steps(seq.valid))
-    return filtered, rts(filtered)
-
-
-class ExtendedKalmanSmoother(AbstractSmoother):
-    """Extended Kalman filter and RTS smoother, from the likeliest of a bank of starts, relinearised about itself."""
+class GaussianSmoother(AbstractSmoother):
+    """Gaussian filter and RTS smoother, from the likeliest of a bank of starts, relinearised about itself."""
 
     bank: StartBank
+    linearise: Tangent | Cubature
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses compete."""
-    iterations: int = eqx.field(static=True, default=2)
+    iterations: int = eqx.field(static=True, default=1)
 
     def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
+        """Filtered and smoothed states of the last iteration."""
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
+        active = active_steps(seq.valid)
         starts, log_weight = self.bank.hypotheses(model.start)
-        head = jax.tree.map(lambda a: a[: self.window], seq)
+        head = self.window
 
         def score(start):
-            return _smooth(model, start, head, y[: self.window], observed[: self.window])[0].loglik
+            return ekf(model, start, seq.u[:head], y[:head], observed[:head], active[:head], self.linearise).loglik
 
         score = jax.vmap(score)(starts) + log_weight
         best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
-        filtered, smoothed = _smooth(model, jax.tree.map(lambda a: a[best], starts), seq, y, observed)
-        return jax.lax.fori_loop(
-            0, self.iterations, lambda _, now: relinearise(model, now[1].state.mean, seq), (filtered, smoothed)
-        )
+        start = jax.tree.map(lambda a: a[best], starts)
+        filtered = ekf(model, start, seq.u, y, observed, active, self.linearise)
+
+        def again(_, now):
+            return self.relinearise(model, now[1].state, seq)
+
+        return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+
+    def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
+        """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""
+        y, observed = fill_missing(seq.y)
+        affine = jax.vmap(lambda state, u: self.linearise(model, state, u))(path, seq.u)
+        filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active_steps(seq.valid))
+        return filtered, rts(filtered)
 
     def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
         filtered, smoothed = self.path(model, seq)
         prev, following = pair_nodes(smoothed)
         affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
         kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
-        return Posterior(smoothed.state, prev, following, kick, filtered.loglik)
+        return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik)
+
+
+def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:  # noqa: N802  (names a smoother)
+    """The extended Kalman (tangent) filter with RTS smoother."""
+    return GaussianSmoother(bank, Tangent(), **options)
+
+
+def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:  # noqa: N802
+    """The cubature (sigma-point) filter with RTS smoother."""
+    return GaussianSmoother(bank, Cubature(), **options)
 
 
 def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:

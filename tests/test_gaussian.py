@@ -1,0 +1,69 @@
+"""The unrolled small-matrix algebra against numpy and against exact moments."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.gaussian import cholesky, cubature, lower, spd_solve, symmetric
+
+EPS = np.finfo(float).eps
+
+
+def _spd(dim: int, seed: int, condition: float = 1e3) -> np.ndarray:
+    """A random symmetric positive definite matrix of known condition number."""
+    rng = np.random.default_rng(seed)
+    basis, _ = np.linalg.qr(rng.normal(size=(dim, dim)))
+    return (basis * np.geomspace(1.0, condition, dim)) @ basis.T
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+def test_cholesky_is_numpys(dim):
+    a = _spd(dim, dim)
+    factor = np.asarray(lower(cholesky(jnp.asarray(a))))
+    # backward error of Cholesky: (dim + 1) eps |a|, and its forward error that times the condition number [Higham, thm 10.3]
+    np.testing.assert_allclose(factor @ factor.T, a, atol=(dim + 1) * EPS * np.linalg.norm(a))
+    np.testing.assert_allclose(factor, np.linalg.cholesky(a), atol=(dim + 1) * EPS * 1e3 * np.linalg.norm(a) ** 0.5)
+    assert np.all(np.triu(factor, 1) == 0)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+def test_spd_solve_is_numpys(dim):
+    a = _spd(dim, dim)
+    b = np.random.default_rng(9).normal(size=(dim, 3))
+    tolerance = {
+        "rtol": 0.0,
+        "atol": 10 * dim * EPS * 1e3 * np.abs(np.linalg.solve(a, b)).max(),
+    }  # condition number 1e3
+    np.testing.assert_allclose(spd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), **tolerance)
+    np.testing.assert_allclose(
+        spd_solve(jnp.asarray(a), jnp.asarray(b[:, 0])), np.linalg.solve(a, b[:, 0]), **tolerance
+    )
+
+
+def test_spd_solve_has_the_derivative_of_the_inverse():
+    a, da, b = _spd(3, 0), symmetric(jnp.asarray(_spd(3, 1))), np.ones(3)
+    _, tangent = jax.jvp(lambda a: spd_solve(a, jnp.asarray(b)), (jnp.asarray(a),), (da,))
+    x = np.linalg.solve(a, b)
+    np.testing.assert_allclose(
+        tangent, -np.linalg.solve(a, np.asarray(da) @ x), rtol=1e-9
+    )  # condition 1e3, squared, eps
+
+
+def test_symmetric_keeps_the_quadratic_form():
+    a = np.random.default_rng(0).normal(size=(2, 3, 3))
+    s = np.asarray(symmetric(jnp.asarray(a)))
+    x = np.random.default_rng(1).normal(size=3)
+    assert np.all(s == np.swapaxes(s, 1, 2))
+    np.testing.assert_allclose(np.einsum("i,bij,j->b", x, s, x), np.einsum("i,bij,j->b", x, a, x), rtol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+def test_cubature_has_the_moments_of_a_normal(dim):
+    x = np.asarray(cubature(dim, float))
+    assert x.shape == (2 * dim, dim)
+    np.testing.assert_allclose(x.mean(0), 0.0, atol=4 * EPS)
+    np.testing.assert_allclose(x.T @ x / len(x), np.eye(dim), atol=4 * dim * EPS)
+    np.testing.assert_allclose(
+        np.einsum("ni,nj,nk->ijk", x, x, x), 0.0, atol=4 * dim**1.5 * EPS
+    )  # exact to third order

@@ -1,0 +1,69 @@
+"""One sample interval: the order of the method, a reference integrator, and derivatives both ways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from nnap_em.ode import integrate
+
+X0 = jnp.asarray([1.2, -0.7])
+
+
+def _swing(x):
+    """A pendulum with quadratic drag: nonlinear, smooth."""
+    q, v = x
+    return jnp.stack([v, -9.81 * jnp.sin(q) - 0.3 * v * jnp.sqrt(1 + v**2)])
+
+
+def _after(substeps: int, dt: float = 0.4):
+    return np.asarray(integrate(_swing, X0, dt, substeps))
+
+
+def _reference(dt: float = 0.4):
+    rate = lambda t, x: np.asarray(jax.jit(_swing)(jnp.asarray(x)))  # noqa: E731
+    return solve_ivp(rate, (0.0, dt), np.asarray(X0), method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+
+
+def test_order_is_four():
+    truth = _reference()
+    errors = [np.linalg.norm(_after(n) - truth) for n in (8, 16, 32)]
+    # halving the step: 2^4 = 16, up to the next term of the error's series, of relative size h
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.2)
+    assert errors[1] / errors[2] == pytest.approx(16, rel=0.1)
+
+
+def test_agrees_with_scipy():
+    # errors above go as (dt / n)^4: with 400 steps below the reference's own tolerance of 1e-12 per step
+    np.testing.assert_allclose(_after(400), _reference(), rtol=0, atol=1e-10)
+
+
+def test_linear_system_is_the_taylor_series_to_fourth_order():
+    a = jnp.asarray([[0.0, 1.0], [-4.0, -0.5]])
+    h = 0.1
+    step, term = np.eye(2), np.eye(2)
+    for k in range(1, 5):
+        term = term @ np.asarray(a) * h / k
+        step = step + term
+    np.testing.assert_allclose(integrate(lambda x: a @ x, X0, h, 1), step @ np.asarray(X0), rtol=1e-14)
+
+
+def test_no_time_no_change():
+    assert np.all(np.asarray(integrate(_swing, X0, 0.0, 2)) == np.asarray(X0))
+
+
+def test_derivatives_agree():
+    f = jax.jit(lambda x: integrate(_swing, x, 0.05, 2))
+    forward, backward = jax.jacfwd(f)(X0), jax.jacrev(f)(X0)
+    np.testing.assert_allclose(forward, backward, rtol=1e-13, atol=1e-15)
+    h = 1e-5
+    columns = [(f(X0 + h * e) - f(X0 - h * e)) / (2 * h) for e in jnp.eye(2)]
+    # central difference: h^2 f''' / 6 and eps / h, both 1e-11
+    np.testing.assert_allclose(forward, jnp.stack(columns, 1), atol=1e-9)
+    grad = jax.grad(lambda x: jnp.sum(jax.jacfwd(f)(x) ** 2))  # the M-step differentiates the filter's linearisation
+    number = [
+        (jnp.sum(jax.jacfwd(f)(X0 + h * e) ** 2) - jnp.sum(jax.jacfwd(f)(X0 - h * e) ** 2)) / (2 * h)
+        for e in jnp.eye(2)
+    ]
+    np.testing.assert_allclose(grad(X0), jnp.stack(number), atol=1e-8)

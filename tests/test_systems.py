@@ -1,0 +1,148 @@
+"""Shipped machines against mechanics: Lagrange's equations of an independently written Lagrangian, energy, power."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.gaussian import Gaussian
+from nnap_em.model import StateSpaceModel
+from nnap_em.systems import specs, systems
+from nnap_em.systems.acrobot import table_i
+
+PARAMETERS = {
+    "acrobot": {**table_i, "Ir": 6e-5, "gr": 6.0, "lc1": 0.12, "I2": 2e-3},  # not the uniform rods: every term counts
+    "pendubot": {**table_i, "Ir": 6e-5, "gr": 6.0},
+    "pendulum": {"m": 0.3, "lc": 0.2, "I": 4e-3, "g": 9.81},
+    "slide": {"m": 1.7},
+}
+INPUTS = {"acrobot": (2,), "pendubot": (1,), "pendulum": (1,), "slide": (1,)}
+names = pytest.mark.parametrize("name", sorted(PARAMETERS))
+
+
+def _system(name: str):
+    return systems[name](**{k: jnp.asarray(v) for k, v in PARAMETERS[name].items()}, joints=INPUTS[name])
+
+
+def _arm(p, q):
+    """Heights and positions of the bodies [m], and angles of all that turns, with the inertias [kg m^2]."""
+    first, second = q[0], q[0] + q[1]
+    down = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])  # noqa: E731
+    centres = [p["lc1"] * down(first), p["l1"] * down(first) + p["lc2"] * down(second)]
+    # INTERFACE.md: the rotor of joint 1 sits in the ground and turns gr times as fast as link 1; that of joint 2 rides
+    # on link 1 and turns the other way
+    turning = [(p["I1"], first), (p["I2"], second), (p["Ir"], p["gr"] * q[0]), (p["Ir"], q[0] - p["gr"] * q[1])]
+    return list(zip((p["m1"], p["m2"]), centres, strict=True)), turning
+
+
+def _swing(p, q):
+    return [(p["m"], p["lc"] * jnp.stack([jnp.sin(q[0]), -jnp.cos(q[0])]))], [(p["I"], q[0])]
+
+
+def _slide(p, q):
+    return [(p["m"], jnp.stack([q[0], jnp.zeros(())]))], []
+
+
+BODIES = {"acrobot": _arm, "pendubot": _arm, "pendulum": _swing, "slide": _slide}
+
+
+def _energies(name: str, q, v):
+    """Kinetic and potential energy [J] from the positions of the bodies."""
+    p = PARAMETERS[name]
+    bodies = lambda q: [position for _, position in BODIES[name](p, q)[0]]  # noqa: E731
+    angles = lambda q: [angle for _, angle in BODIES[name](p, q)[1]]  # noqa: E731
+    masses, turning = BODIES[name](p, q)
+    _, velocities = jax.jvp(bodies, (q,), (v,))
+    _, rates = jax.jvp(angles, (q,), (v,))
+    kinetic = sum(0.5 * m * jnp.sum(w**2) for (m, _), w in zip(masses, velocities, strict=True))
+    kinetic = kinetic + sum(0.5 * i * w**2 for (i, _), w in zip(turning, rates, strict=True))
+    return kinetic, sum(m * p.get("g", 0.0) * position[1] for m, position in masses)
+
+
+def _energy(name: str, x):
+    return sum(_energies(name, *jnp.split(x, 2)))
+
+
+def _states(name: str, count: int = 20):
+    dof = len(systems[name].coordinates)
+    rng = np.random.default_rng(0)
+    return jnp.asarray(rng.normal(size=(count, dof)) * 2), jnp.asarray(rng.normal(size=(count, dof)) * 5)
+
+
+def _model(name: str, unknown=jnp.zeros_like, dt: float = 0.01, substeps: int = 2):
+    n = len(specs[name].states)
+    start = Gaussian(jnp.zeros(n), jnp.eye(n))
+    return StateSpaceModel(_system(name), unknown, start, jnp.zeros(n), jnp.zeros(1), (0,), dt, substeps)
+
+
+def test_every_shipped_system_is_tested():
+    assert set(PARAMETERS) == set(systems)
+
+
+@names
+def test_mass_is_symmetric_and_positive_definite(name):
+    mass = np.asarray(jax.vmap(_system(name).mass)(_states(name)[0]))
+    assert np.all(mass == np.swapaxes(mass, 1, 2))
+    assert np.all(np.linalg.eigvalsh(mass) > 0)
+
+
+@names
+def test_mass_and_bias_are_lagranges_equations(name):
+    """d/dt dL/dv - dL/dq = M a + c, for any a."""
+    system = _system(name)
+    lagrangian = lambda q, v: _energies(name, q, v)[0] - _energies(name, q, v)[1]  # noqa: E731
+
+    def force(q, v, a):
+        momentum = lambda q, v: jax.jacfwd(lagrangian, argnums=1)(q, v)  # noqa: E731
+        _, change = jax.jvp(momentum, (q, v), (v, a))
+        return change - jax.jacfwd(lagrangian)(q, v)
+
+    q, v = _states(name)
+    a = 3 * q - v
+    expected = jax.jit(jax.vmap(force))(q, v, a)
+    found = jax.vmap(lambda q, v, a: system.mass(q) @ a + system.bias(q, v))(q, v, a)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+@names
+def test_energy_is_kept_without_friction_and_input(name):
+    q, v = _states(name, 5)
+    x0 = jnp.concatenate([q, v], axis=1)
+    energy = jax.vmap(lambda x: _energy(name, x))
+    drift = []
+    for substeps in (2, 4):
+        model = _model(name, substeps=substeps)
+        zero = jnp.zeros(1)
+        step = lambda x, _, model=model: (model.transition(x, zero), None)  # noqa: E731
+        x = jax.jit(jax.vmap(lambda x, step=step: jax.lax.scan(step, x, None, length=100)[0]))(x0)
+        drift.append(np.max(np.abs(energy(x) - energy(x0)) / (1e-3 + np.abs(energy(x0)))))
+    # RK4's energy error falls with h^4 at least (h^5 for oscillators): 16 at half the step, until rounding is left
+    assert drift[1] < max(drift[0] / 12, 1e-12)
+    assert drift[1] < 1e-3
+
+
+@names
+def test_energy_changes_by_the_work_of_the_input(name):
+    """Power balance dE/dt = v . B u, and friction only takes."""
+    u = jnp.asarray([0.3])
+    for unknown, friction in ((jnp.zeros_like, 0.0), (lambda v: -0.05 * v, 0.05)):
+        model = _model(name, unknown)
+        rate = lambda x, model=model: model.rate(x, u, jnp.zeros(x.shape[0] // 2))  # noqa: E731
+        for q, v in zip(*_states(name, 4), strict=True):
+            x = jnp.concatenate([q, v])
+            _, power = jax.jvp(lambda x: _energy(name, x), (x,), (rate(x),))
+            expected = v[INPUTS[name][0] - 1] * u[0] - friction * jnp.sum(v**2)
+            np.testing.assert_allclose(power, expected, rtol=0, atol=1e-11)  # cancellation of terms of some 10 W
+
+
+@pytest.mark.parametrize(("name", "still"), [("acrobot", [0.0, 0.0]), ("pendulum", [0.0]), ("acrobot", [np.pi, 0.0])])
+def test_hanging_and_upright_are_at_rest(name, still):
+    bias = _system(name).bias(jnp.asarray(still), jnp.zeros(len(still)))
+    np.testing.assert_allclose(bias, 0.0, atol=1e-15)
+
+
+def test_inputs_drive_their_joints():
+    arm = systems["acrobot"](**{k: jnp.asarray(v) for k, v in PARAMETERS["acrobot"].items()}, joints=(2, 1))
+    np.testing.assert_array_equal(arm.drive(jnp.asarray([3.0, 5.0])), [5.0, 3.0])
+    np.testing.assert_array_equal(_system("acrobot").drive(jnp.asarray([3.0])), [0.0, 3.0])
+    np.testing.assert_array_equal(_system("pendubot").drive(jnp.asarray([3.0])), [3.0, 0.0])

@@ -1,8 +1,9 @@
 """Simulated experiments with known truth, as in the paper's section IV."""
 
 import dataclasses
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
-
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,11 @@ from .data import Dataset
 from .gaussian import Gaussian
 from .law import StribeckLaw
 from .model import StateSpaceModel
+from .systems import pendubot
 from .systems.acrobot import Acrobot, drives, table_i
+from .systems.base import AbstractSystem
+from .systems.pendulum import Pendulum
+from .systems.slide import Slide
 
 
 class Experiment(NamedTuple):
@@ -34,7 +39,10 @@ def simulate(
     truth = dataclasses.replace(model, substeps=substeps)
     key_process, key_reading = jax.random.split(key)
     w = jax.random.normal(key_process, (*u.shape[:2], x0.shape[1]), x0.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
-    v = jax.random.normal(key_reading, (*u.shape[:2], len(model.measured)), x0.dtype) * jnp.exp(0.5 * model.log_r)[None, None]
+    v = (
+        jax.random.normal(key_reading, (*u.shape[:2], len(model.measured)), x0.dtype)
+        * jnp.exp(0.5 * model.log_r)[None, None]
+    )
 
     def one(x0, u, w, v):
         def step(x, inputs):
@@ -75,18 +83,93 @@ def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.
     )
 
 
-def paper_experiment(
-    model: StateSpaceModel, sequences: int = 20, steps: int = 500, *, key: PRNGKeyArray
-) -> Experiment:
+class Sweep(NamedTuple):
+    """Ranges from which each sequence draws its sinusoid and its start."""
+
+    amplitude: tuple[float, float]
+    """[N m, or N on a slide]"""
+    period: tuple[float, float]
+    """[s]"""
+    first: tuple[float, float]
+    """Of the first coordinate in the first row [rad or m]; the other states follow the model's prior."""
+
+
+paper_sweep = Sweep((0.05, 0.3), (0.5, 3.0), (math.pi / 2, 3 * math.pi / 2))
+
+
+def paper_experiment(model: StateSpaceModel, sequences: int = 20, steps: int = 500, *, key: PRNGKeyArray) -> Experiment:
     """Sinusoidal torques of another amplitude and period in each sequence, starts in the upper half plane."""
+    return sweep_experiment(model, paper_sweep, sequences, steps, key=key)
+
+
+def sweep_experiment(
+    model: StateSpaceModel, sweep: Sweep, sequences: int, steps: int, *, key: PRNGKeyArray
+) -> Experiment:
+    """Logs of `steps` intervals; the sinusoid drives the first input."""
     key_start, key_angle, key_phase, key_amplitude, key_period, key_noise = jax.random.split(key, 6)
     dtype = model.log_q.dtype
     draw = lambda key, low, high: jax.random.uniform(key, (sequences,), dtype, low, high)  # noqa: E731
     spread = jnp.sqrt(jnp.diag(model.start.cov))
     x0 = model.start.mean[None] + spread[None] * jax.random.normal(key_start, (sequences, spread.shape[0]), dtype)
-    x0 = x0.at[:, 0].set(draw(key_angle, jnp.pi / 2, 3 * jnp.pi / 2))
-    amplitude, period = draw(key_amplitude, 0.05, 0.3), draw(key_period, 0.5, 3.0)
+    x0 = x0.at[:, 0].set(draw(key_angle, *sweep.first))
+    amplitude, period = draw(key_amplitude, *sweep.amplitude), draw(key_period, *sweep.period)
     phase = draw(key_phase, 0.0, 2 * jnp.pi)
     t = model.dt * jnp.arange(steps + 1, dtype=dtype)
     u = amplitude[:, None] * jnp.sin(2 * jnp.pi * t[None, :] / period[:, None] + phase[:, None])
     return simulate(model, x0, u[..., None], key=key_noise)
+
+
+class Example(NamedTuple):
+    """A machine with known truth and the experiment that is made on it."""
+
+    model: StateSpaceModel
+    sweep: Sweep
+
+
+def _acrobot() -> Example:
+    return Example(paper_model(), paper_sweep)
+
+
+def _pendubot() -> Example:
+    model = paper_model()
+    system = dataclasses.replace(model.system, joints=pendubot.drives)
+    return Example(dataclasses.replace(model, system=system), paper_sweep._replace(amplitude=(0.2, 1.0)))
+
+
+def _one_joint(
+    system: AbstractSystem, friction: StribeckLaw, spread: Sequence[float], q_std: Sequence[float], r_std: float
+) -> StateSpaceModel:
+    """A machine with one joint, at rest on average, whose position is read."""
+    return StateSpaceModel(
+        system,
+        friction,
+        Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2)),
+        2 * jnp.log(jnp.asarray(q_std)),
+        2 * jnp.log(jnp.asarray([r_std])),
+        measured=(0,),
+        dt=0.01,
+    )
+
+
+def _pendulum() -> Example:
+    parameters = {"m": 0.5, "lc": 0.2, "I": 0.002, "g": 9.81}
+    system = Pendulum(**{name: jnp.asarray(value) for name, value in parameters.items()}, joints=(1,))
+    friction = StribeckLaw(*(jnp.asarray([value]) for value in (0.03, 0.05, 0.4, 0.01, 0.1)))
+    model = _one_joint(system, friction, (1.0, 1.0), (1e-4, 1e-2), 0.01)
+    return Example(model, Sweep((0.1, 0.8), (0.5, 3.0), (-math.pi / 2, math.pi / 2)))
+
+
+def _slide() -> Example:
+    system = Slide(m=jnp.asarray(1.0), joints=(1,))
+    friction = StribeckLaw(*(jnp.asarray([value]) for value in (1.0, 1.5, 0.05, 2.0, 0.02)))
+    model = _one_joint(system, friction, (0.1, 0.1), (1e-5, 2e-3), 1e-3)
+    return Example(model, Sweep((2.0, 8.0), (0.5, 2.0), (-0.1, 0.1)))
+
+
+examples: dict[str, Callable[[], Example]] = {
+    "acrobot": _acrobot,
+    "pendubot": _pendubot,
+    "pendulum": _pendulum,
+    "slide": _slide,
+}
+"""The machines that can be simulated as they stand, by the name of the system; the acrobot is the paper's."""

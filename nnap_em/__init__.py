@@ -1,0 +1,105 @@
+"""Identify unknown friction of machines from logs.
+
+The names below are loaded at their first use, so that `import nnap_em` costs nothing and sets nothing up.
+"""
+
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .data import DataError, Dataset, Logs, pad, read_logs
+    from .em import EMState, FitError, Schedule
+    from .friction import FrictionNetwork
+    from .identify import Identified, friction_table, identify, parameter_table
+    from .model import StateSpaceModel
+    from .particle import ParticleSmoother
+    from .predict import Prediction, horizon_errors, predict, smooth
+    from .rig import Rig, RigError, read_rig, write_rig
+    from .simulate import Experiment, examples, paper_experiment, paper_model, simulate
+    from .smoother import ExtendedKalmanSmoother, Posterior
+    from .store import StoreError, load, save
+    from .systems import AbstractSystem, specs
+
+__all__ = [
+    "AbstractSystem",
+    "DataError",
+    "Dataset",
+    "EMState",
+    "Experiment",
+    "ExtendedKalmanSmoother",
+    "FitError",
+    "FrictionNetwork",
+    "Identified",
+    "Logs",
+    "ParticleSmoother",
+    "Posterior",
+    "Prediction",
+    "Rig",
+    "RigError",
+    "Schedule",
+    "StateSpaceModel",
+    "StoreError",
+    "__version__",
+    "examples",
+    "friction_table",
+    "horizon_errors",
+    "identify",
+    "load",
+    "pad",
+    "paper_experiment",
+    "paper_model",
+    "parameter_table",
+    "predict",
+    "read_logs",
+    "read_rig",
+    "save",
+    "simulate",
+    "smooth",
+    "specs",
+    "write_rig",
+]
+_homes = {
+    "data": ("DataError", "Dataset", "Logs", "pad", "read_logs"),
+    "em": ("EMState", "FitError", "Schedule"),
+    "friction": ("FrictionNetwork",),
+    "identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "model": ("StateSpaceModel",),
+    "particle": ("ParticleSmoother",),
+    "predict": ("Prediction", "horizon_errors", "predict", "smooth"),
+    "rig": ("Rig", "RigError", "read_rig", "write_rig"),
+    "simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
+    "smoother": ("ExtendedKalmanSmoother", "Posterior"),
+    "store": ("StoreError", "load", "save"),
+    "systems": ("AbstractSystem", "specs"),
+}
+_home = {name: home for home, names in _homes.items() for name in names}
+
+
+class _Package(ModuleType):
+    """A package in which `identify`, `predict` and `simulate` mean the functions, not the modules that they are in.
+
+    Importing a submodule binds it in its package; which would hide the function.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in _home or not isinstance(value, ModuleType):
+            ModuleType.__setattr__(self, name, value)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _home:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_home[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Package

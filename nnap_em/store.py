@@ -1,0 +1,280 @@
+"""A fitted model as one file, which is also the checkpoint: loading gives the same numbers to the last bit.
+
+The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the rig, the
+settings and the plain numbers.  No code is stored; loading builds the model anew from the rig and puts the numbers in.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import __version__
+from .data import Dataset
+from .identify import Identified, begin
+from .rig import Declared, Rig
+from .systems import systems
+
+KIND = "nnap_em fitted model"
+FORMAT = 1
+_HEADER, _CHECKSUM = "header", "sha256"
+
+
+class StoreError(ValueError):
+    """A file that is no usable model: the message names the file, what is wrong with it and the mend."""
+
+
+class Stored(NamedTuple):
+    """What a file holds."""
+
+    fitted: Identified
+    fingerprint: str
+    """Of the training data; empty if it was not given."""
+    notes: dict[str, Any]
+    """Whatever the writer wished to keep, as JSON."""
+
+
+def fingerprint(data: Dataset) -> str:
+    """SHA-256 of the content of `data`, to tell later whether it is the same."""
+    digest = hashlib.sha256()
+    for part in data:
+        array = np.ascontiguousarray(part)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mapping[str, Any] | None = None) -> None:
+    """Write `fitted` to one file, whole or not at all.
+
+    Raises StoreError if it could not be loaded again: if it is of another structure than `identify` makes.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    leaves: dict[str, dict[str, Any]] = {}
+    settings: dict[str, Any] = {}
+
+    def leaf(place: str, value: Any) -> Any:
+        leaves[place], array = _describe(path, place, value)
+        if array is not None:
+            arrays[place] = array
+        return value
+
+    def setting(place: str, value: Any) -> Any:
+        if _plain(value):
+            settings[place] = value
+        return value
+
+    _rebuild(_tree(fitted), "", leaf, setting)
+    header = {
+        "kind": KIND,
+        "format": FORMAT,
+        "version": __version__,
+        "rig": dataclasses.asdict(fitted.rig),
+        "leaves": leaves,
+        "settings": settings,
+        "fingerprint": fingerprint,
+        "notes": dict(notes or {}),
+    }
+    _assemble(path, header, arrays)
+    text = json.dumps(header).encode()
+    content = io.BytesIO()
+    np.savez(
+        content,
+        allow_pickle=False,
+        **{_HEADER: np.frombuffer(text, np.uint8), _CHECKSUM: _checksum(text, arrays)},
+        **arrays,
+    )
+    replace_bytes(path, content.getvalue())
+
+
+def load(path: Path) -> Identified:
+    """The fitted model in `path`, with the numbers that were saved.
+
+    Raises StoreError if the file is damaged, foreign, or of another version.
+    """
+    return read(path).fitted
+
+
+def read(path: Path) -> Stored:
+    """All that `path` holds.
+
+    Raises StoreError if the file is damaged, foreign, or of another version.
+    """
+    header, arrays = _open(path)
+    try:
+        return Stored(_assemble(path, header, arrays), header["fingerprint"], header["notes"])
+    except (KeyError, TypeError, AttributeError) as error:
+        _refuse(path, f"its header lacks something ({error!r})", "identify again with this version")
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all (through a temporary file in its folder, which is made if need be)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _tree(fitted: Identified) -> dict[str, Any]:
+    return {name: value for name, value in fitted._asdict().items() if name != "rig"}
+
+
+def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Callable[[str, Any], Any]) -> Any:
+    """`node` anew, with `leaf` applied to what is data in it and `setting` to what is static."""
+    if isinstance(node, eqx.Module):
+        made = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
+        for field in dataclasses.fields(node):
+            here, value = f"{place}/{field.name}", getattr(node, field.name)
+            static = field.metadata.get("static", False)
+            object.__setattr__(
+                made, field.name, setting(here, value) if static else _rebuild(value, here, leaf, setting)
+            )
+        return made
+    if isinstance(node, Mapping):
+        return {name: _rebuild(value, f"{place}/{name}", leaf, setting) for name, value in node.items()}
+    if isinstance(node, tuple) and hasattr(node, "_fields"):
+        named = zip(node._fields, node, strict=True)
+        return type(node)(*(_rebuild(value, f"{place}/{name}", leaf, setting) for name, value in named))
+    if isinstance(node, tuple | list):
+        return type(node)(_rebuild(value, f"{place}/{i}", leaf, setting) for i, value in enumerate(node))
+    return leaf(place, node)
+
+
+def _describe(path: Path, place: str, value: Any) -> tuple[dict[str, Any], np.ndarray | None]:
+    """How a leaf is told in the header, and its array if it is one."""
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        return {"is": "key", "of": str(jax.random.key_impl(value))}, np.asarray(jax.random.key_data(value))
+    if isinstance(value, jax.Array):
+        return {"is": "weak" if value.weak_type and value.ndim == 0 else "jax"}, np.asarray(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return {"is": "numpy"}, np.asarray(value)
+    if _plain(value):
+        return {"is": "plain", "of": value}, None
+    if callable(value):
+        return {"is": "code", "of": getattr(value, "__name__", type(value).__name__)}, None
+    _refuse(path, f"{place} is a {type(value).__name__}", "arrays, numbers and named functions can be stored")
+
+
+def _plain(value: Any) -> bool:
+    """What JSON gives back unchanged; tuples come back as tuples."""
+    if isinstance(value, tuple):
+        return all(map(_plain, value))
+    return value is None or type(value) in (bool, int, float, str)
+
+
+def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Identified:
+    """The model that `header` and `arrays` describe, on the skeleton that its rig gives."""
+    rig = _rig(header["rig"])
+    if rig.system not in systems:
+        _refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
+    leaves, settings = header["leaves"], header["settings"]
+    wide = any(array.dtype == np.float64 for array in arrays.values())
+    if wide and not jax.config.read("jax_enable_x64"):
+        _refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
+    seen = set()
+
+    def differs(place: str, found: str) -> None:
+        made = f"it was written by nnap_em {header['version']}, this is {__version__}"
+        _refuse(path, f"another structure at {place.strip('/')}: {found} ({made})", "identify again with this version")
+
+    def leaf(place: str, value: Any) -> Any:
+        if place not in leaves:
+            differs(place, "missing in the file")
+        seen.add(place)
+        kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
+        if kind == "code":
+            if getattr(value, "__name__", type(value).__name__) != of:
+                differs(place, f"{of!r} in the file")
+            return value
+        if kind == "plain":
+            return _tuples(of)
+        if array is None or callable(value) or (value is not None and kind != "key" and np.ndim(value) != array.ndim):
+            differs(place, "of another shape" if array is not None else "no array in the file")
+        if kind == "key":
+            return jax.random.wrap_key_data(jnp.asarray(array), impl=of)
+        return {"jax": jnp.asarray, "weak": lambda a: jnp.asarray(a.item()), "numpy": np.asarray}[kind](array)
+
+    def setting(place: str, value: Any) -> Any:
+        seen.add(place)
+        if _plain(value) != (place in settings):
+            differs(place, "a setting that only one of the two has")
+        return _tuples(settings[place]) if place in settings else value
+
+    blank = begin(rig, _blank(rig), key=jax.random.key(0))
+    tree = _rebuild(_tree(blank), "", leaf, setting)
+    for place in (*leaves, *settings):
+        if place not in seen:
+            differs(place, "unknown here")
+    return Identified(rig=rig, **tree)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def _rig(told: Mapping[str, Any]) -> Rig:
+    def declared(table: Mapping[str, Any]) -> dict[str, Declared]:
+        return {name: Declared(**pair) for name, pair in table.items()}
+
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
+    return Rig(**(values | {"parameters": declared(told["parameters"]), "start": declared(told["start"])}))
+
+
+def _blank(rig: Rig, rows: int = 32) -> Dataset:
+    """Logs of the right shape, of which nothing is left when the numbers are in."""
+    t = rig.dt * np.arange(rows)
+    swing = np.sin(t / t[-1])[None, :, None]
+    u, y = (np.repeat(swing, n, axis=2) for n in (len(rig.input_columns), len(rig.measured)))
+    return Dataset(t[None], u, y, np.ones((1, rows), bool))
+
+
+def _checksum(header: bytes, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    digest = hashlib.sha256(header)
+    for name in sorted(arrays):
+        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
+
+
+def _open(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file of this format whose checksum holds."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        _refuse(path, f"cannot be read ({error.strerror})", "give the model.npz that `nnap-em identify` wrote")
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        text = arrays.pop(_HEADER).tobytes()
+        header = json.loads(text)
+    except Exception:  # what the parsers raise on damaged bytes is open-ended
+        mend = "give the model.npz that `nnap-em identify` wrote, from a copy that is whole"
+        _refuse(path, f"no model, or damaged or cut short ({len(content)} bytes)", mend)
+    if not isinstance(header, dict) or header.get("kind") != KIND:
+        _refuse(path, "an npz of another program", "give the model.npz that `nnap-em identify` wrote")
+    if header.get("format") != FORMAT:
+        by = f"format {header.get('format')} (nnap_em {header.get('version')}), this version reads format {FORMAT}"
+        _refuse(path, by, "identify again, or use the version that wrote it")
+    if not np.array_equal(arrays.pop(_CHECKSUM, np.zeros(0)), _checksum(text, arrays)):
+        _refuse(path, "damaged: its checksum does not hold", "use another copy, or identify again")
+    return header, arrays
+
+
+def _refuse(path: Path, found: str, mend: str) -> Any:
+    raise StoreError(f"{path}: {found}; {mend}")

@@ -21,7 +21,7 @@ def _spd(dim: int, seed: int, condition: float = 1e3) -> np.ndarray:
 def test_cholesky_is_numpys(dim):
     a = _spd(dim, dim)
     factor = np.asarray(lower(cholesky(jnp.asarray(a))))
-    # backward error of Cholesky: (dim + 1) eps |a|, and its forward error that times the condition number [Higham, thm 10.3]
+    # backward error (dim + 1) eps |a|, forward error that times the condition number [Higham 2002, thm 10.3]
     np.testing.assert_allclose(factor @ factor.T, a, atol=(dim + 1) * EPS * np.linalg.norm(a))
     np.testing.assert_allclose(factor, np.linalg.cholesky(a), atol=(dim + 1) * EPS * 1e3 * np.linalg.norm(a) ** 0.5)
     assert np.all(np.triu(factor, 1) == 0)

@@ -112,8 +112,7 @@ def test_energy_is_kept_without_friction_and_input(name):
     drift = []
     for substeps in (2, 4):
         model = _model(name, substeps=substeps)
-        zero = jnp.zeros(1)
-        step = lambda x, _, model=model: (model.transition(x, zero), None)  # noqa: E731
+        step = lambda x, _, model=model: (model.transition(x, jnp.zeros(1)), None)  # noqa: E731
         x = jax.jit(jax.vmap(lambda x, step=step: jax.lax.scan(step, x, None, length=100)[0]))(x0)
         drift.append(np.max(np.abs(energy(x) - energy(x0)) / (1e-3 + np.abs(energy(x0)))))
     # RK4's energy error falls with h^4 at least (h^5 for oscillators): 16 at half the step, until rounding is left

@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
@@ -147,8 +147,9 @@ def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Ca
         return made
     if isinstance(node, Mapping):
         return {name: _rebuild(value, f"{place}/{name}", leaf, setting) for name, value in node.items()}
-    if isinstance(node, tuple) and hasattr(node, "_fields"):
-        named = zip(node._fields, node, strict=True)
+    names = getattr(node, "_fields", None)
+    if isinstance(node, tuple) and names is not None:
+        named = zip(names, node, strict=True)
         return type(node)(*(_rebuild(value, f"{place}/{name}", leaf, setting) for name, value in named))
     if isinstance(node, tuple | list):
         return type(node)(_rebuild(value, f"{place}/{i}", leaf, setting) for i, value in enumerate(node))
@@ -184,7 +185,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         _refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
     leaves, settings = header["leaves"], header["settings"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
-    if wide and not jax.config.read("jax_enable_x64"):
+    if wide and jnp.zeros(()).dtype != np.float64:
         _refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
     seen = set()
 
@@ -231,8 +232,9 @@ def _rig(told: Mapping[str, Any]) -> Rig:
     def declared(table: Mapping[str, Any]) -> dict[str, Declared]:
         return {name: Declared(**pair) for name, pair in table.items()}
 
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
-    return Rig(**(values | {"parameters": declared(told["parameters"]), "start": declared(told["start"])}))
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
+    values["parameters"], values["start"] = declared(told["parameters"]), declared(told["start"])
+    return Rig(**values)
 
 
 def _blank(rig: Rig, rows: int = 32) -> Dataset:
@@ -276,5 +278,5 @@ def _open(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, arrays
 
 
-def _refuse(path: Path, found: str, mend: str) -> Any:
+def _refuse(path: Path, found: str, mend: str) -> NoReturn:
     raise StoreError(f"{path}: {found}; {mend}")

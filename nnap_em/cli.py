@@ -1,0 +1,186 @@
+"""The command line: arguments in, exit status out; the work is in `commands`, and JAX is loaded only for it."""
+
+import argparse
+import math
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from . import __version__
+
+_MAIN = """\
+examples:
+  nnap-em simulate bench                            the paper's acrobot: a data set with known truth
+  nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
+  nnap-em predict fit bench/test --given 1 --out prediction
+  nnap-em smooth fit bench/test --out smoothed
+
+A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
+"""
+_SIMULATE = """\
+examples:
+  nnap-em simulate bench
+  nnap-em simulate bench --system slide --sequences 8 --test 4 --steps 300 --seed 7
+  nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
+
+OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
+_IDENTIFY = """\
+examples:
+  nnap-em identify bench --out fit
+  nnap-em identify bench --out fit --smoother particle --particles 1000 --epochs 30
+  nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
+
+OUT gets model.npz, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
+test/ serves for the reported prediction error only, never for the fit.
+"""
+_PREDICT = """\
+examples:
+  nnap-em predict fit bench/test --given 1.0 --out prediction
+  nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
+
+Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
+time, all states, and their standard deviations without measurement noise.
+"""
+_SMOOTH = """\
+example:
+  nnap-em smooth fit bench/test --out smoothed
+
+DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+"""
+SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
+SMOOTHERS = ("cubature", "ekf", "particle")
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    top = _new(argparse.ArgumentParser, "Identify unknown friction of machines from logs.", _MAIN, prog="nnap-em")
+    top.add_argument("--version", action="version", version=f"nnap-em {__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, summary: str, examples: str) -> argparse.ArgumentParser:
+        return _new(commands.add_parser, f"{summary[0].upper()}{summary[1:]}.", examples, name=name, help=summary)
+
+    simulate = command("simulate", "write a data set with known truth", _SIMULATE)
+    simulate.add_argument("out", metavar="OUT", type=Path, help="the new folder")
+    simulate.add_argument("--system", choices=SYSTEMS, default="acrobot", help="the machine (default: acrobot)")
+    simulate.add_argument("--sequences", type=_count, default=20, metavar="N", help="training sequences (20)")
+    simulate.add_argument("--test", type=_natural, default=5, metavar="N", help="test sequences (5)")
+    simulate.add_argument("--steps", type=_count, default=500, metavar="N", help="sample intervals of each (500)")
+    simulate.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    simulate.add_argument("--measured", nargs="+", metavar="STATE", help="which states are read")
+    for kind, what in (("process", "kick per step"), ("measurement", "readings")):
+        simulate.add_argument(
+            f"--{kind}-noise",
+            nargs=2,
+            type=_positive,
+            metavar=("POSITION", "RATE"),
+            help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
+        )
+
+    identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
+    identify.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+    identify.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    identify.add_argument(
+        "--smoother", choices=SMOOTHERS, default=SMOOTHERS[0], help=f"the E-step (default: {SMOOTHERS[0]})"
+    )
+    identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
+    identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
+    identify.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    identify.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.npz")
+    identify.add_argument("--quiet", action="store_true", help="no lines of progress")
+
+    predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
+    smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)
+    for use in (predict, smooth):
+        use.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
+        use.add_argument("folder", metavar="FOLDER", type=Path, help="the logs, such as bench/test")
+        use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
+    predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
+    predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; 0 is done, 2 is refused with one line on stderr, 130 is stopped by Ctrl-C."""
+    arguments = parser()
+    args = arguments.parse_args(argv)
+    if args.command == "identify" and args.particles and args.smoother != "particle":
+        arguments.error("--particles goes with --smoother particle")
+    try:
+        from . import commands  # loads JAX
+
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            warnings.simplefilter("default", commands.DataWarning)
+            commands.set_up()
+            say = _silent if getattr(args, "quiet", False) else _say
+            commands.commands[args.command](args, say)
+    except KeyboardInterrupt as stopped:
+        _say(str(stopped) or "stopped")
+        return 130
+    except Exception as error:
+        line = _line(error)
+        if line is None:
+            raise
+        _say(f"error: {line}")
+        return 2
+    return 0
+
+
+def _line(error: Exception) -> str | None:
+    """The one line for a mistake of the caller or of the machine; None for one of ours."""
+    from . import commands
+
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error)
+    return " ".join(str(error).split()) if isinstance(error, commands.MISTAKES) else None
+
+
+def _warn(message: Warning | str, category: type[Warning], *_) -> None:
+    if "persistent compilation cache" not in str(message):
+        _say(f"warning: {message}")
+
+
+def _say(text: str) -> None:
+    print(f"nnap-em: {text}", file=sys.stderr, flush=True)
+
+
+def _silent(text: str) -> None:
+    """Say nothing."""
+
+
+def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):
+    form = argparse.RawDescriptionHelpFormatter
+    return make(description=summary, epilog=examples, formatter_class=form, allow_abbrev=False, **options)
+
+
+def _number(text: str, kind: Callable[[str], float], low: float, wanted: str) -> float:
+    try:
+        value = kind(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text!r}; give {wanted}")
+    return value
+
+
+def _count(text: str) -> float:
+    return _number(text, int, 1, "a whole number of 1 or more")
+
+
+def _natural(text: str) -> float:
+    return _number(text, int, 0, "a whole number of 0 or more")
+
+
+def _time(text: str) -> float:
+    return _number(text, float, 0.0, "seconds, 0 or more")
+
+
+def _positive(text: str) -> float:
+    return _number(text, float, 5e-324, "a number above 0")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

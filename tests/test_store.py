@@ -1,0 +1,264 @@
+"""A stored model: the same numbers to the last bit, or refused with the reason."""
+
+import errno
+import hashlib
+import json
+import os
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em import store
+from nnap_em.data import Dataset
+from nnap_em.identify import Identified, begin
+from nnap_em.law import StribeckLaw
+from nnap_em.rig import Declared, Rig
+from nnap_em.store import StoreError, fingerprint, load, read, save
+
+ARM = {
+    name: Declared(value, 0.1 * value)
+    for name, value in {"m1": 0.2, "m2": 0.3, "l1": 0.3, "l2": 0.3, "lc1": 0.15, "lc2": 0.1, "I1": 0.01}.items()
+} | {"I2": Declared(0.01, 0.0), "g": Declared(9.81, 0.0)}
+RIGS = {
+    "arm": Rig(
+        "ärm", "acrobot", ARM, True, ("u",), (2,), 0.01, "session", ("theta1",), {}, {"theta2": Declared(0.1, 0.5)}
+    ),
+    "slide": Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("f",), (1,), 0.02, "sequence", ("x",), {}, {}),
+    "free": Rig(
+        "free", "slide", {"m": Declared(1.0, 0.2)}, False, ("f",), (1,), 0.02, "sequence", ("dx", "x"), {"x": 0.1}, {}
+    ),
+}
+
+
+def _data(rig: Rig, rows: int = 40) -> Dataset:
+    t = rig.dt * np.arange(rows)
+    y = np.sin(3 * t)[None, :, None] + np.arange(len(rig.measured))
+    return Dataset(t[None], 0.1 * np.cos(t)[None, :, None], y, np.ones((1, rows), bool))
+
+
+def _fitted(name: str = "arm") -> Identified:
+    """A model with other numbers than any that `begin` makes, some of them awkward."""
+    rig, rng = RIGS[name], np.random.default_rng(0)
+    fitted = begin(rig, _data(rig), key=jax.random.key(5))
+
+    def stir(leaf):
+        return leaf * rng.uniform(0.5, 1.5, leaf.shape) if eqx.is_inexact_array(leaf) else leaf
+
+    model = jax.tree.map(stir, fitted.state.model)
+    model = eqx.tree_at(lambda m: m.log_r, model, model.log_r.at[0].set(5e-324))
+    state = fitted.state._replace(
+        epoch=7, model=model, key=jax.random.key(2**40), loglik=np.array([-np.inf, np.nan, 0.1])
+    )
+    return fitted._replace(state=state)
+
+
+def _bits(fitted: Identified) -> list:
+    def one(leaf):
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        if isinstance(leaf, jax.Array | np.ndarray):
+            return type(leaf), str(leaf.dtype), leaf.shape, np.asarray(leaf).tobytes()
+        return repr(leaf)
+
+    return [one(leaf) for leaf in jax.tree.leaves(tuple(fitted)[1:])]
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    path = tmp_path / "model.npz"
+    save(path, _fitted())
+    return path
+
+
+def _rewrite(path: Path, change) -> None:
+    """Change header and arrays of a file, with a checksum that holds."""
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files}
+    header = json.loads(arrays.pop("header").tobytes())
+    arrays.pop("sha256")
+    change(header, arrays)
+    text = json.dumps(header).encode()
+    digest = hashlib.sha256(text)
+    for name in sorted(arrays):
+        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes())
+    checksum = np.frombuffer(digest.digest(), np.uint8)
+    np.savez(path, header=np.frombuffer(text, np.uint8), sha256=checksum, **arrays)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
+    fitted = _fitted(name)
+    notes = {"epochs": [{"seconds": 1.5, "left_out": [3]}]}
+    save(tmp_path / "new" / "model.npz", fitted, fingerprint="abc", notes=notes)
+    stored = read(tmp_path / "new" / "model.npz")
+    assert _bits(stored.fitted) == _bits(fitted)
+    assert jax.tree.structure(tuple(stored.fitted)[1:]) == jax.tree.structure(tuple(fitted)[1:])
+    assert stored.fitted.rig == fitted.rig
+    assert (stored.fingerprint, stored.notes) == ("abc", notes)
+    v = jnp.linspace(-3.0, 3.0, len(fitted.model.log_q) // 2)
+    np.testing.assert_array_equal(stored.fitted.model.unknown(v), fitted.model.unknown(v))
+
+
+def test_settings_of_the_fit_are_kept(tmp_path):
+    fitted = _fitted("slide")
+    rule = eqx.tree_at(lambda m: m.ridge, fitted.m_step, 0.25)
+    rule = eqx.tree_at(lambda m: m.prior.mean, rule, jnp.zeros(0))
+    object.__setattr__(rule, "nodes", 31)  # static
+    save(tmp_path / "m.npz", fitted._replace(m_step=rule))
+    assert (load(tmp_path / "m.npz").m_step.nodes, load(tmp_path / "m.npz").m_step.ridge) == (31, 0.25)
+
+
+def test_the_same_model_makes_the_same_file(tmp_path, file):
+    save(tmp_path / "again.npz", load(file))
+    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
+    old = file.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(store, "os", SimpleNamespace(fsync=full, getpid=os.getpid, replace=os.replace))
+    with pytest.raises(OSError, match="No space left"):
+        save(file, _fitted("slide"))
+    assert file.read_bytes() == old
+    assert [path.name for path in tmp_path.iterdir()] == ["model.npz"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(file, share):
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(StoreError, match=r"model\.npz: .*damaged or cut short \(\d+ bytes\); give the model"):
+        load(file)
+
+
+def test_a_flipped_bit_changes_no_number_unnoticed(file):
+    content, bits = bytearray(file.read_bytes()), _bits(load(file))
+    for place in np.random.default_rng(1).integers(0, len(content), 60):
+        content[place] ^= 0x10
+        file.write_bytes(content)
+        try:
+            assert _bits(load(file)) == bits  # a byte that means nothing, such as a date of the zip
+        except StoreError as error:
+            assert str(file) in str(error)
+        content[place] ^= 0x10
+
+
+def _other_npz(path: Path) -> None:
+    np.savez(path, x=np.zeros(3))
+
+
+def _other_header(path: Path) -> None:
+    np.savez(path, header=np.frombuffer(b'{"kind": "notes"}', np.uint8))
+
+
+FOREIGN = {
+    "empty": (lambda path: path.write_bytes(b""), "no model"),
+    "text": (lambda path: path.write_text("time,u\n0,1\n"), "no model"),
+    "npz": (_other_npz, "no model"),
+    "other npz with a header": (_other_header, "another program"),
+    "pickle": (lambda path: path.write_bytes(pickle.dumps({"a": 1})), "no model"),
+    "folder": (lambda path: path.mkdir(), "cannot be read"),
+    "absent": (lambda path: None, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("make, reason", FOREIGN.values(), ids=FOREIGN)
+def test_a_foreign_file_is_refused(tmp_path, make, reason):
+    path = tmp_path / "foreign.npz"
+    make(path)
+    with pytest.raises(StoreError, match=rf"foreign\.npz: .*{reason}.*; give the model\.npz"):
+        load(path)
+
+
+def _set(**values):
+    return lambda header, arrays: header.update(values)
+
+
+def _wrong_shape(header, arrays):
+    arrays["/state/model/log_q"] = arrays["/state/model/log_q"][None]
+
+
+def _lost_array(header, arrays):
+    del arrays["/state/model/log_q"], header["leaves"]["/state/model/log_q"]
+
+
+def _spare_array(header, arrays):
+    arrays["/state/model/extra"] = np.zeros(2)
+    header["leaves"]["/state/model/extra"] = {"is": "jax"}
+
+
+def _other_code(header, arrays):
+    code = next(place for place, leaf in header["leaves"].items() if leaf["is"] == "code")
+    header["leaves"][code]["of"] = "relu"
+
+
+def _lost_setting(header, arrays):
+    del header["settings"]["/m_step/nodes"]
+
+
+MISFITS = {
+    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 1"),
+    "newer": (_set(format=2), "format 2"),
+    "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
+    "header": (lambda header, _: header.pop("notes"), "lacks something"),
+    "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),
+    "shape": (_wrong_shape, "state/model/log_q: of another shape"),
+    "lost array": (_lost_array, "state/model/log_q: missing in the file"),
+    "spare array": (_spare_array, "state/model/extra: unknown here"),
+    "code": (_other_code, "'relu' in the file"),
+    "setting": (_lost_setting, "m_step/nodes"),
+}
+
+
+@pytest.mark.parametrize("change, reason", MISFITS.values(), ids=MISFITS)
+def test_a_file_of_another_version_is_refused(file, change, reason):
+    _rewrite(file, change)
+    with pytest.raises(StoreError, match=rf"model\.npz: .*{reason}.*; (identify again|registered are)"):
+        load(file)
+
+
+def test_a_rewritten_file_without_a_change_is_accepted(file):
+    bits = _bits(load(file))
+    _rewrite(file, lambda header, arrays: None)
+    assert _bits(load(file)) == bits
+
+
+def test_a_changed_number_breaks_the_checksum(file):
+    with np.load(file) as content:
+        arrays = {name: content[name] for name in content.files}
+    arrays["/state/model/log_q"] = arrays["/state/model/log_q"] + 1e-9
+    np.savez(file, **arrays)
+    with pytest.raises(StoreError, match="checksum does not hold; use another copy"):
+        load(file)
+
+
+def test_numbers_of_64_bits_are_not_rounded_silently(file):
+    with jax.enable_x64(False), pytest.raises(StoreError, match="64 bits; first call jax"):
+        load(file)
+
+
+def test_what_could_not_be_loaded_is_not_saved(tmp_path):
+    fitted = _fitted("slide")
+    law = StribeckLaw(*jnp.ones((5, 1)))
+    odd = fitted._replace(state=fitted.state._replace(model=eqx.tree_at(lambda m: m.unknown, fitted.model, law)))
+    with pytest.raises(StoreError, match=r"another structure at state/model/unknown"):
+        save(tmp_path / "m.npz", odd)
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_fingerprint_tells_data_apart():
+    data = _data(RIGS["slide"])
+    same = Dataset(*(np.array(part) for part in data))
+    other = data._replace(y=np.nextafter(data.y, 9.0))
+    shorter = data._replace(valid=data.valid & (np.arange(40) < 39))
+    assert fingerprint(data) == fingerprint(same)
+    assert len({fingerprint(d) for d in (data, other, shorter)}) == 3

@@ -41,7 +41,7 @@ def _smooth(model, data: Dataset, smoother: AbstractSmoother) -> Posterior:
 
 def smooth(fitted: Identified, data: Dataset) -> Posterior:
     """p(x_k | all y) of every sequence by the cubature smoother, from the likeliest start."""
-    return _smooth(fitted.model, data, CubatureSmoother(fitted.bank))
+    return _smooth(fitted.model, data, CubatureSmoother(fitted.bank, inflations=(1.0, 10.0, 100.0)))
 
 
 @eqx.filter_jit

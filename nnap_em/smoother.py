@@ -73,6 +73,9 @@ class GaussianSmoother(AbstractSmoother):
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses compete."""
     iterations: int = eqx.field(static=True, default=1)
+    """Relinearisations about the smoothed path, at least 1."""
+    inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
+    """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
 
     def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
@@ -88,12 +91,20 @@ class GaussianSmoother(AbstractSmoother):
         score = jax.vmap(score)(starts) + log_weight
         best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
         start = jax.tree.map(lambda a: a[best], starts)
-        filtered = ekf(model, start, seq.u, y, observed, active, self.linearise)
 
-        def again(_, now):
-            return self.relinearise(model, now[1].state, seq)
+        def follow(inflation):
+            loose = eqx.tree_at(lambda m: m.log_q, model, model.log_q + inflation)
+            filtered = ekf(loose, start, seq.u, y, observed, active, self.linearise)
 
-        return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+            def again(_, now):
+                return self.relinearise(model, now[1].state, seq)
+
+            return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+
+        tracks = jax.vmap(follow)(jnp.log(jnp.asarray(self.inflations, y.dtype)))
+        loglik = tracks[0].loglik
+        best = jnp.argmax(jnp.where(jnp.isfinite(loglik), loglik, -jnp.inf))
+        return jax.tree.map(lambda a: a[best], tracks)
 
     def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""

@@ -1,0 +1,286 @@
+"""The M-step's expansion of the log-likelihood: Fisher's identity, dense Fisher information, and the fit to it."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import minimize
+
+from nnap_em.data import Dataset, fill_missing
+from nnap_em.friction import FrictionNetwork, NoFriction
+from nnap_em.gaussian import Gaussian
+from nnap_em.kalman import Tangent, kalman_filter
+from nnap_em.model import StateSpaceModel
+from nnap_em.mstep import ParameterPrior, Quadratic, Weights, expand, hats
+from nnap_em.simulate import simulate
+from nnap_em.smoother import ExtendedKalmanSmoother, Posterior, StartBank, active_steps
+from nnap_em.systems.pendulum import Pendulum
+from nnap_em.systems.slide import Slide
+
+DT = 0.05
+NODES = jnp.asarray([[-8.0, -2.0, 0.5, 3.0, 9.0]])  # beyond all speeds, so that the hats interpolate v exactly
+NO_FRICTION = NoFriction(jnp.ones(1))
+MASS = ParameterPrior(("m",), jnp.asarray([1.2]), jnp.asarray([0.1]))
+
+
+def _model(system, unknown=NO_FRICTION) -> StateSpaceModel:
+    start = Gaussian(jnp.asarray([0.2, 0.0]), jnp.diag(jnp.asarray([0.1, 0.3]) ** 2))
+    log_q, log_r = 2 * jnp.log(jnp.asarray([0.01, 0.1])), 2 * jnp.log(jnp.asarray([0.02, 0.1]))
+    return StateSpaceModel(system, unknown, start, log_q, log_r, (0, 1), DT)
+
+
+def _slide(unknown=NO_FRICTION) -> StateSpaceModel:
+    return _model(Slide(m=jnp.asarray(1.3), joints=(1,)), unknown)
+
+
+def _pendulum() -> StateSpaceModel:
+    return _model(Pendulum(**{k: jnp.asarray(v) for k, v in dict(m=0.5, lc=0.3, I=0.02, g=9.81).items()}, joints=(1,)))
+
+
+def _logs(model, sequences: int = 1, time: int = 40) -> Dataset:
+    """Readings of `model`, a fifth missing (the same rows in all), the last five rows padding."""
+    key_run, key_gap, key_start = jax.random.split(jax.random.key(0), 3)
+    unit = jax.random.normal(key_start, (sequences, 2))
+    x0 = model.start.mean[None] + unit * jnp.sqrt(jnp.diag(model.start.cov))[None]
+    u = jnp.broadcast_to(jnp.sin(jnp.arange(float(time)) * DT * 5)[None, :, None], (sequences, time, 1))
+    data = simulate(model, x0, u, key=key_run).data
+    gone = (jax.random.uniform(key_gap, data.y.shape[1:]) < 0.2)[None]
+    valid = jnp.broadcast_to(jnp.arange(time)[None] < time - 5, (sequences, time))
+    return data._replace(y=jnp.where(gone | ~valid[..., None], jnp.nan, data.y), valid=valid)
+
+
+class _Case(NamedTuple):
+    """One sequence with its posterior, its expansion, and the likelihood that both belong to."""
+
+    model: StateSpaceModel
+    seq: Dataset
+    posterior: Posterior
+    found: Quadratic
+
+    @property
+    def speed(self):
+        return 0.5 * np.asarray(self.posterior.prev + self.posterior.next)[..., 1]
+
+
+@eqx.filter_jit
+def _expand(model, prior, data: Dataset):
+    """Posterior and expansion of every sequence, linearised by tangents about the smoother's fixed point."""
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)
+    posterior = jax.vmap(lambda seq: smoother(model, seq))(data)
+    return posterior, jax.vmap(lambda p, s: expand(model, prior, NODES, p, s, Tangent()))(posterior, data)
+
+
+class _Pushed(NamedTuple):
+    """A model under a small extra force `force` - `damping` v."""
+
+    model: StateSpaceModel
+    force: jax.Array
+    damping: jax.Array
+
+    def transition(self, x, u):
+        bent = eqx.tree_at(lambda m: m.unknown, self.model, lambda v: self.model.unknown(v) - self.damping * v)
+        return bent.transition(x, u, self.force[None])
+
+
+class _Knobs(NamedTuple):
+    """All that the likelihood is differentiated by."""
+
+    log_q: jax.Array
+    log_r: jax.Array
+    force: jax.Array
+    damping: jax.Array
+    mass: jax.Array
+
+
+@eqx.filter_jit
+def _gradient(case: _Case) -> _Knobs:
+    """Gradient of the Kalman likelihood, linearised about the path of `case`, by central differences."""
+    y, observed = fill_missing(case.seq.y)
+    active = active_steps(case.seq.valid)
+    model, zero = case.model, jnp.zeros(())
+
+    def loglik(knobs: _Knobs):
+        noisy = eqx.tree_at(lambda m: (m.log_q, m.log_r), MASS.write(model, knobs.mass), knobs[:2])
+        pushed = _Pushed(noisy, knobs.force, knobs.damping)
+        about = lambda x, u: Tangent()(pushed, Gaussian(x, jnp.eye(2)), u)  # noqa: E731
+        affine = jax.vmap(about)(case.posterior.state.mean, case.seq.u)
+        return kalman_filter(noisy, model.start, affine, y, observed & case.seq.valid[:, None], active).loglik
+
+    now = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model.system))
+    flat, unravel = ravel_pytree(now)
+    shift = 1e-4 * jnp.eye(flat.shape[0])
+    both = jax.vmap(lambda d: loglik(unravel(flat + d)) - loglik(unravel(flat - d)))(shift)
+    return unravel(both / 2e-4)
+
+
+@pytest.fixture(scope="module")
+def slides():
+    """200 sequences of the slide."""
+    model = _slide()
+    data = _logs(model, 200)
+    return model, data, *_expand(model, MASS, data)
+
+
+def _case(model, data, posterior, each) -> _Case:
+    return _Case(model, *jax.tree.map(lambda a: a[0], (data, posterior, each)))
+
+
+@pytest.fixture(scope="module")
+def slide(slides):
+    return _case(*slides)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    model = _pendulum()
+    data = _logs(model)
+    return _case(model, data, *_expand(model, MASS, data))
+
+
+@pytest.mark.parametrize("name", ["slide", "pendulum"])
+def test_score_is_the_gradient_of_the_likelihood(name, request):
+    """Fisher's identity: exact for the Gaussian smoother at fixed linearisation."""
+    case = request.getfixturevalue(name)
+    gradient = _gradient(case)
+    noise = jnp.concatenate([gradient.log_q, gradient.log_r])
+    np.testing.assert_allclose(case.found.noise_score, noise, rtol=1e-6, atol=1e-6)  # differences of step 1e-4
+    # the hats sum to 1, so the sum of the node scores belongs to a constant force. On the slide all is linear: exact;
+    # the pendulum's Jacobian moves with force and mass, which the score takes at the mean only: 3 %
+    rel = 1e-6 if name == "slide" else 0.03
+    assert float(jnp.sum(case.found.score[:-1])) == pytest.approx(float(gradient.force), rel=rel)
+    assert float(case.found.score[-1]) == pytest.approx(float(gradient.mass[0]), rel=rel)
+
+
+def test_torque_score_at_the_nodes_is_that_of_viscous_friction(slide):
+    """The hats interpolate, so sum_i v_i score_i belongs to a force proportional to velocity."""
+    found = slide.found.score[:-1] @ NODES[0]
+    expected = -_gradient(slide).damping
+    inside = active_steps(slide.seq.valid)[:-1]
+    push, q = DT / float(slide.model.system.m), jnp.exp(slide.model.log_q[1])
+    # the speed of a step is the mean of both its ends, which holds half the kick: E kick^2 / (2 q) push too much
+    square = jnp.mean(slide.posterior.kick[..., 1] ** 2, axis=1)
+    kick = 0.5 * push * jnp.sum(jnp.where(inside, square, 0.0)) / q
+    information = push**2 * jnp.sum(jnp.where(inside, slide.speed.mean(1) ** 2, 0.0)) / q
+    # what else differs: velocity within a step, of order (dt force / m), in units of the standard deviation
+    assert abs(float(found - kick - expected)) < 0.05 * float(jnp.sqrt(information))
+
+
+def _dense_readings(model, seq: Dataset, log_q, log_r):
+    """Covariance of all readings of a linear model, and the map from kicks of every step to them."""
+    time, n = seq.t.shape[0], 2
+    f = np.asarray(Tangent()(model, Gaussian(jnp.zeros(n), jnp.eye(n)), jnp.zeros(1)).matrix)
+    inside = np.asarray(active_steps(seq.valid))
+    transfer = np.zeros((time, time, n, n))  # effect on x_k of what is added at x_j
+    for j in range(time):
+        transfer[j, j] = np.eye(n)
+        for k in range(j, time - 1):
+            transfer[k + 1, j] = (f if inside[k] else np.eye(n)) @ transfer[k, j]
+    seen = (~np.isnan(np.asarray(seq.y)) & np.asarray(seq.valid)[:, None]).ravel()
+    maps = [transfer[:, j].reshape(-1, n)[seen] for j in range(time)]  # both states are read
+    cov = maps[0] @ np.asarray(model.start.cov) @ maps[0].T + np.diag(np.tile(np.exp(log_r), time)[seen])
+    for j in range(1, time):
+        cov = cov + inside[j - 1] * (maps[j] * np.exp(log_q)) @ maps[j].T
+    return cov, maps, inside
+
+
+def test_information_is_the_dense_fisher_information(slide):
+    model, seq = slide.model, slide.seq
+    cov, maps, inside = _dense_readings(model, seq, np.asarray(model.log_q), np.asarray(model.log_r))
+    tent = np.stack([np.interp(slide.speed, NODES[0], e).mean(1) for e in np.eye(5)], axis=1)  # steps, nodes
+    force = np.asarray([DT**2 / 2, DT]) / 1.3  # of x and dx to a constant force over one step
+    mass = -0.1 * np.asarray(seq.u) / 1.3 * force[None]
+    columns = np.concatenate([force[None, :, None] * tent[:, None, :], mass[:-1, :, None]], axis=2)
+    jac = sum(inside[k] * maps[k + 1] @ columns[k] for k in range(len(columns)))
+    expected = jac.T @ np.linalg.solve(cov, jac)
+    found = slide.found.information
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())  # condition of cov: 1e4
+
+
+def test_noise_information_is_fishers_on_average(slides):
+    """Sequence by sequence it holds sampled innovations; its mean is tr(S^-1 dS S^-1 dS) / 2."""
+    model, data, _, each = slides
+    n = len(data.t)
+    seq = jax.tree.map(lambda a: a[0], data)
+    log = np.concatenate([model.log_q, model.log_r])
+    cov = lambda log: _dense_readings(model, seq, log[:2], log[2:])[0]  # noqa: E731
+    h = 1e-4
+    slopes = [np.linalg.solve(cov(log), (cov(log + h * e) - cov(log - h * e)) / (2 * h)) for e in np.eye(4)]
+    expected = np.asarray([[0.5 * np.trace(a @ b) for a in slopes] for b in slopes])
+    found = np.asarray(each.noise_information)
+    np.testing.assert_array_less(
+        np.abs(found.mean(0) - expected), 4.5 * found.std(0) / np.sqrt(n) + 1e-6 * expected.max()
+    )
+    # and the scores of draws from the model scatter around 0 with that covariance (16 entries: 4.5 standard errors)
+    score = np.asarray(each.noise_score)
+    np.testing.assert_array_less(np.abs(score.mean(0)), 4.5 * np.sqrt(np.diag(expected) / n))
+    np.testing.assert_allclose(score.T @ score / n, expected, atol=4.5 * np.diag(expected).max() * np.sqrt(2 / n))
+
+
+def test_hats_are_a_partition_of_unity_that_interpolates():
+    nodes = NODES[0]
+    v = jnp.linspace(-12.0, 12.0, 97)
+    weights = np.asarray(jax.vmap(lambda v: hats(nodes, v))(v))
+    eps = np.finfo(float).eps
+    np.testing.assert_allclose(weights.sum(1), 1.0, atol=8 * eps)
+    assert np.all(weights >= 0) and np.all((weights > 0).sum(1) <= 2)
+    values = np.asarray([3.0, -1.0, 0.2, 5.0, 2.0])
+    np.testing.assert_allclose(weights @ values, np.interp(v, nodes, values), atol=64 * eps)  # constant beyond the ends
+    np.testing.assert_allclose(jax.vmap(lambda v: hats(nodes, v))(nodes), np.eye(5), atol=eps)
+
+
+def _quadratic(seed: int, nodes, parameters: int = 0):
+    """Score and information of phi as 400 readings of an interpolated torque would give."""
+    rng = np.random.default_rng(seed)
+    v = rng.normal(size=400) * np.asarray(nodes)[0, -1] / 2
+    rows = np.concatenate(
+        [np.asarray(jax.vmap(lambda v: hats(nodes[0], v))(jnp.asarray(v))), rng.normal(size=(400, parameters))], 1
+    )
+    target = np.concatenate([-np.tanh(3 * np.asarray(nodes)[0]) - 0.1 * np.asarray(nodes)[0], np.full(parameters, 0.5)])
+    information = rows.T @ rows / 0.1**2
+    return jnp.asarray(target), jnp.asarray(information)
+
+
+def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
+    unknown = FrictionNetwork(jnp.asarray([6.0]), jnp.asarray([1.0]), key=jax.random.key(3))
+    model = _slide(unknown)
+    nodes = unknown.nodes(21)
+    weights = Weights(MASS, nodes, 1.0, jnp.asarray([0.3]))
+    target, information = _quadratic(0, nodes, 1)
+    w0 = weights.read(model)
+    phi0 = weights.phi(model, w0)
+    score = information @ (target - phi0)
+    w = weights.fit(model, score, information, 500)
+
+    @jax.jit
+    def loss(w):
+        """Minus the log-likelihood, ridge and symmetry prior, up to constants; written for the target, not for phi0."""
+        phi = jnp.concatenate([jax.vmap(lambda v: unknown.with_weights(w[:-1])(v))(nodes.T)[:, 0], w[-1:]])
+        even = 0.5 * (phi[:21] + phi[:21][::-1]) / jnp.sqrt(21.0)
+        d = phi - target
+        return 0.5 * d @ information @ d + 0.5 * jnp.sum(w**2) + 0.5 * jnp.sum(even**2) / 0.3**2
+
+    better = minimize(loss, w, jac=jax.grad(loss), method="BFGS", options={"maxiter": 2000})
+    assert float(loss(w0)) - float(loss(w)) > 1e3
+    # the loop ends when its smoothed gain is below 1e-3 nats a step; what is left must not matter (a nat = 1 std)
+    assert float(loss(w)) - better.fun < 0.1
+    gradient = jax.grad(loss)(w)
+    hessian, _ = weights.hessian(model, w, information + weights.symmetry())
+    assert 0.5 * float(gradient @ jnp.linalg.solve(hessian, gradient)) < 0.01  # Newton decrement [nats]
+
+
+def test_fit_of_parameters_alone_is_ridge_regression():
+    model = _slide()
+    nodes = jnp.zeros((1, 2)) + jnp.asarray([-1.0, 1.0])[None]
+    weights = Weights(MASS, nodes, 1.0, jnp.asarray([1.0]))
+    information = jnp.diag(jnp.asarray([3.0, 3.0, 50.0]))
+    score = jnp.asarray([1.0, -2.0, 40.0])
+    w0 = weights.read(model)
+    w = weights.fit(model, score, information, 200)
+    # maximum of 40 (w - w0) - 25 (w - w0)^2 - w^2 / 2; the loop stops within 1e-3 nats, of curvature 51
+    np.testing.assert_allclose(w, (40 + 50 * w0) / 51, atol=np.sqrt(2 * 1e-3 / 51))
+    written = weights.write(model, w)
+    assert float(written.system.m) == pytest.approx(1.2 + 0.1 * float(w[0]), rel=1e-14)

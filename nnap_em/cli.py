@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from . import __version__
 
@@ -156,21 +157,23 @@ def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: s
     return make(description=summary, epilog=examples, formatter_class=form, allow_abbrev=False, **options)
 
 
-def _number(text: str, kind: Callable[[str], float], low: float, wanted: str) -> float:
+_N = TypeVar("_N", int, float)
+
+
+def _number(text: str, kind: type[_N], low: int | float, wanted: str) -> _N:
     try:
-        value = kind(text)
+        if low <= (value := kind(text)) < math.inf:
+            return value
     except ValueError:
-        value = math.nan
-    if not low <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"found {text!r}; give {wanted}")
-    return value
+        pass
+    raise argparse.ArgumentTypeError(f"found {text!r}; give {wanted}")
 
 
-def _count(text: str) -> float:
+def _count(text: str) -> int:
     return _number(text, int, 1, "a whole number of 1 or more")
 
 
-def _natural(text: str) -> float:
+def _natural(text: str) -> int:
     return _number(text, int, 0, "a whole number of 0 or more")
 
 

@@ -414,9 +414,7 @@ def _laws(fitted: Identified, table: FrictionTable, say: Say) -> list[dict[str, 
 def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[np.ndarray, "sample dof"]) -> None:
     from .plots import friction_figure  # loads matplotlib
 
-    angles = fitted.model.system.angles
-    curve = (np.asarray(a) for a in (table.velocity, table.torque, table.std))
-    figure = friction_figure(*curve, visited=list(visited.T), rotary=angles)
+    figure = friction_figure(table, visited=list(visited.T), rotary=fitted.model.system.angles)
     image = io.BytesIO()
     figure.savefig(image, format="png")
     replace_bytes(path, image.getvalue())

@@ -1,5 +1,7 @@
 """The unknown term: one small network per joint from velocity to torque."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,19 +64,28 @@ class FrictionNetwork(eqx.Module):
         return eqx.tree_at(lambda f: f.mlp, self, eqx.combine(ravel_pytree(arrays)[1](flat), static))
 
 
-class NoFriction(eqx.Module):
-    """A machine that is declared free of friction: the same interface, nothing to learn."""
+class FixedFriction(eqx.Module):
+    """A map that is known, with the interface of one that is learned: there is nothing to learn."""
 
+    law: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
     scale: Float[Array, " dof"]
 
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        return jnp.zeros_like(v)
+        return self.law(v)
 
     def nodes(self, count: int) -> Float[Array, "dof 2"]:
+        """Two velocities; any would do."""
         return jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
 
     def weights(self) -> Float[Array, " 0"]:
+        """None."""
         return jnp.zeros(0)
 
-    def with_weights(self, flat: Float[Array, " 0"]) -> "NoFriction":
+    def with_weights(self, flat: Float[Array, " 0"]) -> "FixedFriction":
+        """This map."""
         return self
+
+
+def NoFriction(scale: Float[Array, " dof"]) -> FixedFriction:  # noqa: N802  (names a map)
+    """A machine that is declared free of friction."""
+    return FixedFriction(jnp.zeros_like, scale)

@@ -265,7 +265,7 @@ class ScoringMStep(AbstractMStep):
     iterations: int = eqx.field(static=True, default=200)
     stride: float = 1.5
     """Largest change of a log variance in one step."""
-    tie: Float[Array, ""] = eqx.field(default=100.0, converter=jnp.asarray)
+    tie: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
     """Precision with which the ratios of the joints' process noises are held to those of the first model.
 
     A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.

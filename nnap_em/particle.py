@@ -1,10 +1,10 @@
 """Particle smoother: a filter that looks ahead, and draws of whole trajectories backward through its particles.
 
-The filter targets p(x_{0:k} | y_{0:k}) psi_{k+1}-twisted, with any Gaussian potentials
+The filter targets p(x_{0:k} | y_{0:k}) psi~_{k+1}(x_k), with any Gaussian potentials
 
     psi_k(x) = exp(linear_k' x - x' precision_k x / 2)          (up to a factor, which cancels)
 
-as proposal:  x_{k+1} ~ N(f(x_k, u_k), Q) psi_{k+1} / psi~_{k+1}(x_k),  where psi~_{k+1} is the normalising integral, and
+as proposal:  x_{k+1} ~ N(f(x_k, u_k), Q) psi_{k+1} / psi~_{k+1}(x_k),  where psi~_{k+1} is the integral, and
 the weight grows by g(y_k | x_k) psi~_{k+1}(x_k) / psi_k(x_k).  Weights are exact, so that the likelihood is unbiased
 whatever the potentials; they decide only how many particles survive.
 [Guarniero, Johansen & Lee 2017, J. Am. Stat. Assoc. 112(520), sec. 2; Heng et al. 2020, Ann. Stat. 48(5)]
@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower, symmetric
 from .kalman import Filtered, Smoothed
-from .smoother import AbstractSmoother, ExtendedKalmanSmoother, Posterior, active_steps
+from .smoother import AbstractSmoother, GaussianSmoother, Posterior, active_steps
 
 
 class Potentials(NamedTuple):
@@ -117,18 +117,19 @@ class Lookahead(AbstractProposal):
 
     def __call__(self, model, seq: Dataset, filtered: Filtered, smoothed: Smoothed) -> Potentials:
         path, scale = smoothed.state.mean, jnp.exp(0.5 * model.log_q)
-        active = active_steps(seq.valid)
-        matrix, offset = filtered.affine
+        active = active_steps(jnp.asarray(seq.valid))
+        affine = filtered.affine
         following = jnp.concatenate([path[1:], path[-1:]])
-        miss = (jnp.squeeze(matrix @ path[..., None], -1) + offset - following) / scale[None]
-        matrix = matrix * scale[None, None] / scale[None, :, None]
+        miss = (jnp.squeeze(affine.matrix @ path[..., None], -1) + affine.offset - following) / scale[None]
+        matrix = affine.matrix * scale[None, None] / scale[None, :, None]
+        noise = affine.noise / (scale[:, None] * scale[None])[None] + jnp.eye(scale.shape[0], dtype=scale.dtype)[None]
 
         def step(later, slices):
-            active, matrix, miss, reading = slices
-            spread, _ = _twist(jnp.eye(scale.shape[0], dtype=scale.dtype), later.precision)
-            cov = spread @ spread.T
-            ahead = symmetric(jnp.eye(scale.shape[0], dtype=scale.dtype) - cov)  # (precision^-1 + I)^-1
-            linear = matrix.T @ (cov @ later.linear - ahead @ miss)
+            active, matrix, miss, noise, reading = slices
+            spread, _ = _twist(lower(cholesky(noise)), later.precision)
+            seen = spread @ (spread.T @ later.precision)
+            ahead = symmetric(later.precision - later.precision @ seen)  # (precision^-1 + noise)^-1
+            linear = matrix.T @ (later.linear - seen.T @ later.linear - ahead @ miss)
             now = _Readings(
                 reading.precision + jnp.where(active, symmetric(matrix.T @ ahead @ matrix), 0.0),
                 reading.linear + jnp.where(active, linear, 0.0),
@@ -137,7 +138,7 @@ class Lookahead(AbstractProposal):
 
         readings = _readings(model, seq, path)
         blank = jax.tree.map(lambda a: jnp.zeros_like(a[0]), readings)
-        _, (precision, linear) = jax.lax.scan(step, blank, (active, matrix, miss, readings), reverse=True)
+        _, (precision, linear) = jax.lax.scan(step, blank, (active, matrix, miss, noise, readings), reverse=True)
         return Potentials(path, self.temper * precision, self.temper * linear)
 
 
@@ -182,7 +183,9 @@ class _Step(NamedTuple):
     def log_psi(self, x: Float[Array, "state particle"]) -> Float[Array, " particle"]:
         return jnp.sum(x * (self.linear[:, None] - 0.5 * _apply(self.precision, x)), axis=0)
 
-    def look(self, mean: Float[Array, "state particle"]) -> tuple[Float[Array, " particle"], Float[Array, "state particle"]]:
+    def look(
+        self, mean: Float[Array, "state particle"]
+    ) -> tuple[Float[Array, " particle"], Float[Array, "state particle"]]:
         """Log of the integral of N(x; mean, L L') psi(x), and the pull S'(linear - precision mean)."""
         drop = _apply(self.precision, mean)
         pull = _apply(self.spread.T, self.linear[:, None] - drop)
@@ -199,9 +202,7 @@ def _prepare(potentials: Potentials, start: Gaussian) -> _Step:
     return _Step(potentials.precision, potentials.linear, spread, logdet)
 
 
-def systematic(
-    log_w: Float[Array, " particle"], offset: Float[Array, ""], count: int
-) -> Int[Array, " {count}"]:
+def systematic(log_w: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
     """Sorted indices of `count` draws by one uniform `offset` [Kitagawa 1996]."""
     reach = jnp.cumsum(jnp.exp(log_w - jnp.max(log_w)))
     before = jnp.ceil(reach / reach[-1] * count - offset).astype(jnp.int32)  # draws among the particles up to here
@@ -213,18 +214,14 @@ def _cast(tree, dtype):
     return jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, tree)
 
 
-def _step_keys(key: PRNGKeyArray, count: int) -> PRNGKeyArray:
-    """A key for each time that does not depend on how many there are."""
-    return jax.vmap(lambda k: jax.random.fold_in(key, k))(jnp.arange(count))
-
-
 def particle_filter(
     model, potentials: Potentials, seq: Dataset, *, num_particles: int, key: PRNGKeyArray, dtype=jnp.float32
 ) -> ParticleHistory:
     """Filter one sequence; resamples (systematically) where the effective sample size is below half."""
+    key_offset, key_noise = jax.random.split(key)
     exact = model.log_q.dtype
     y, observed = fill_missing(seq.y)
-    leave = active_steps(seq.valid)
+    leave = active_steps(jnp.asarray(seq.valid))
     arrive = jnp.concatenate([jnp.ones(1, bool), leave[:-1]])
     origin = potentials.origin.astype(dtype)
     scale = jnp.exp(0.5 * model.log_q)
@@ -243,15 +240,13 @@ def particle_filter(
 
     def step(carry, slices):
         x, f, pull, log_w, ess = carry
-        key, arrive, leave, origin, origin_next, u, y, observed, now, following = slices
-        key_offset, key_noise = jax.random.split(key)
+        offset, noise, arrive, leave, origin, origin_next, u, y, observed, now, following = slices
         resample = arrive & (ess < 0.5 * size)
         ancestors = jnp.where(
             resample,
-            systematic(log_w, jax.random.uniform(key_offset, (), dtype), num_particles),
+            systematic(log_w, offset, num_particles),
             jnp.arange(num_particles, dtype=jnp.int32),
         )
-        noise = jax.random.normal(key_noise, x.shape, dtype)
         moved = f[:, ancestors] + _apply(now.spread, pull[:, ancestors] + noise)
         x = jnp.where(arrive, moved, x)
         state = origin[:, None] + scale_[:, None] * x
@@ -274,9 +269,13 @@ def particle_filter(
     flat = jnp.full(num_particles, -math.log(num_particles), dtype)
     later = jax.tree.map(lambda a: jnp.concatenate([a[1:], a[-1:]]), (origin, steps))
     observed = observed & seq.valid[:, None]
-    keys = _step_keys(key, y.shape[0])
+    # Drawn at once, time first: the numbers of a time do not depend on how many follow.
+    offset = jax.random.uniform(key_offset, y.shape[:1], dtype)
+    noise = jax.random.normal(key_noise, (y.shape[0], *mean.shape), dtype)
     _, (x, f, log_w, ahead, ancestors, ess, total) = jax.lax.scan(
-        step, (mean, mean, pull, flat, size), (keys, arrive, leave, origin, later[0], u, y, observed, steps, later[1])
+        step,
+        (mean, mean, pull, flat, size),
+        (offset, noise, arrive, leave, origin, later[0], u, y, observed, steps, later[1]),
     )
     loglik = jnp.sum(total) + log_ahead[0].astype(exact)
     return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ahead, ancestors, leave, ess, loglik)
@@ -284,6 +283,11 @@ def particle_filter(
 
 class AbstractBackward(eqx.Module):
     """Draws the particle that a trajectory passes through at k, given where it is at k + 1."""
+
+    @property
+    @abstractmethod
+    def draws(self) -> int:
+        """Uniform numbers needed for one step of one path."""
 
     @abstractmethod
     def __call__(
@@ -293,8 +297,7 @@ class AbstractBackward(eqx.Module):
         log_w: Float[Array, " particle"],
         log_ahead: Float[Array, " particle"],
         parent: Int[Array, " path"],
-        *,
-        key: PRNGKeyArray,
+        uniform: Float[Array, "draw path"],
     ) -> Int[Array, " path"]:
         """Indices with probability proportional to exp(log_w) N(x_next; f, I); `parent` is the genealogical one."""
 
@@ -302,10 +305,14 @@ class AbstractBackward(eqx.Module):
 class ExactBackward(AbstractBackward):
     """Forward filtering, backward sampling: all particles are weighed for each path [Godsill, Doucet & West 2004]."""
 
-    block: int = eqx.field(static=True, default=16)
+    block: int = eqx.field(static=True, default=32)
     """Particles per block of the two-level inverse distribution function."""
 
-    def __call__(self, x_next, f, log_w, log_ahead, parent, *, key):
+    @property
+    def draws(self) -> int:
+        return 1
+
+    def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
         spare = -log_w.shape[0] % self.block
         centre = jnp.mean(f, axis=1, keepdims=True)  # or the squares below would cancel
         x_next, f = x_next - centre, f - centre
@@ -316,7 +323,7 @@ class ExactBackward(AbstractBackward):
         paths = x_next.shape[1]
         w = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True)).reshape(paths, -1, self.block)
         reach = jnp.cumsum(jnp.sum(w, axis=2), axis=1)
-        level = jax.random.uniform(key, (paths,), x_next.dtype) * reach[:, -1]
+        level = uniform[0] * reach[:, -1]
         outer = jnp.minimum(jnp.sum(reach <= level[:, None], axis=1), reach.shape[1] - 1)
         chosen = jnp.take_along_axis(w, outer[:, None, None], axis=1)[:, 0]
         before = jnp.where(outer > 0, jnp.take_along_axis(reach, jnp.maximum(outer - 1, 0)[:, None], axis=1)[:, 0], 0.0)
@@ -335,15 +342,16 @@ class MetropolisBackward(AbstractBackward):
 
     steps: int = eqx.field(static=True, default=4)
 
-    def __call__(self, x_next, f, log_w, log_ahead, parent, *, key):
-        key_candidate, key_accept = jax.random.split(key)
-        shape = (self.steps, x_next.shape[1])
+    @property
+    def draws(self) -> int:
+        return 2 * self.steps
+
+    def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
+        choose, accept = jnp.split(uniform, 2)
         carried = log_w + log_ahead
         reach = jnp.cumsum(jnp.exp(carried - jnp.max(carried)))
-        level = jax.random.uniform(key_candidate, shape, f.dtype) * reach[-1]
-        candidates = jnp.minimum(jnp.searchsorted(reach, level.ravel(), side="right"), f.shape[1] - 1)
-        candidates = candidates.astype(jnp.int32).reshape(shape)
-        log_u = jnp.log(jax.random.uniform(key_accept, shape, f.dtype))
+        candidates = jnp.searchsorted(reach, (choose * reach[-1]).ravel(), side="right")
+        candidates = jnp.minimum(candidates, f.shape[1] - 1).astype(jnp.int32).reshape(choose.shape)
 
         def score(index):
             return -0.5 * jnp.sum((x_next - f[:, index]) ** 2, axis=0) - log_ahead[index]
@@ -351,42 +359,40 @@ class MetropolisBackward(AbstractBackward):
         index, value = parent, score(parent)
         for i in range(self.steps):
             proposed = score(candidates[i])
-            accept = log_u[i] < proposed - value
-            index = jnp.where(accept, candidates[i], index)
-            value = jnp.where(accept, proposed, value)
+            better = jnp.log(accept[i]) < proposed - value
+            index = jnp.where(better, candidates[i], index)
+            value = jnp.where(better, proposed, value)
         return index
 
 
-def ffbs(
-    history: ParticleHistory, backward: AbstractBackward, *, num_paths: int, key: PRNGKeyArray
-) -> Trajectories:
+def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int, key: PRNGKeyArray) -> Trajectories:
     """Draw trajectories backward through the particles of a filter."""
-    key_last, key_scan = jax.random.split(key)
+    key_last, key_steps = jax.random.split(key)
     dtype, exact = history.x.dtype, history.origin.dtype
     last = systematic(history.log_w[-1], jax.random.uniform(key_last, (), dtype), num_paths)
 
     def step(carry, slices):
         index, x_next = carry
-        key, active, x, f, log_w, log_ahead, ancestors = slices
+        uniform, active, x, f, log_w, log_ahead, ancestors = slices
         parent = ancestors[index]
-        index = jnp.where(active, backward(x_next, f, log_w, log_ahead, parent, key=key), parent)
+        index = jnp.where(active, backward(x_next, f, log_w, log_ahead, parent, uniform), parent)
         here = x[:, index]
         return (index, here), (here, x_next - f[:, index])
 
     h = history
-    keys = _step_keys(key_scan, h.x.shape[0] - 1)
+    uniform = jax.random.uniform(key_steps, (h.x.shape[0] - 1, backward.draws, num_paths), dtype)
     end = h.x[-1][:, last]
     before = jax.tree.map(lambda a: a[:-1], (h.active, h.x, h.f, h.log_w, h.log_ahead))
-    _, (x, kick) = jax.lax.scan(step, (last, end), (keys, *before, h.ancestors[1:]), reverse=True)
+    _, (x, kick) = jax.lax.scan(step, (last, end), (uniform, *before, h.ancestors[1:]), reverse=True)
     x = jnp.swapaxes(jnp.concatenate([x, end[None]]), 1, 2).astype(exact)
     kick = jnp.swapaxes(kick, 1, 2).astype(exact)
     return Trajectories(h.origin[:, None] + h.scale[None, None] * x, h.scale[None, None] * kick)
 
 
 class ParticleSmoother(AbstractSmoother):
-    """Draws of p(x_{0:T} | y) through a particle filter guided by an extended Kalman smoother."""
+    """Draws of p(x_{0:T} | y) through a particle filter guided by a Gaussian smoother."""
 
-    guide: ExtendedKalmanSmoother
+    guide: GaussianSmoother
     proposal: AbstractProposal = Lookahead()
     backward: AbstractBackward = ExactBackward()
     num_particles: int = eqx.field(static=True, default=300)
@@ -406,4 +412,4 @@ class ParticleSmoother(AbstractSmoother):
         mean = jnp.mean(x, axis=1)
         e = x - mean[:, None]
         cov = jnp.swapaxes(e, 1, 2) @ e / jnp.asarray(self.num_paths, e.dtype)
-        return Posterior(Gaussian(mean, cov), x[:-1], x[1:], kick, history.loglik)
+        return Posterior(Gaussian(mean, cov), x[:-1], x[1:], kick, jnp.zeros_like(cov[1:]), history.loglik)

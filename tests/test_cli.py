@@ -1,0 +1,482 @@
+"""The commands from end to end on a small slide: whole files, right rows, numbers that can be computed another way."""
+
+import argparse
+import errno
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import nnap_em
+from nnap_em import cli, commands, rig
+from nnap_em.rig import read_rig
+from nnap_em.simulate import examples
+from nnap_em.store import load, read
+from nnap_em.systems import specs
+
+ROOT = Path(__file__).resolve().parents[1]
+STEPS = 150
+SIMULATE = ("--system", "slide", "--sequences", "4", "--test", "4", "--steps", str(STEPS), "--seed", "3")
+EPOCHS = 9
+SHORT = 61
+"""Rows of the one test sequence that is shorter than the others: it ends before the given time."""
+
+
+def _run(*argv) -> int:
+    return cli.main([str(word) for word in argv])
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    return {name: table[name] for name in table.dtype.names}
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def _without_declared_noise(folder: Path) -> None:
+    text = (folder / "rig.toml").read_text()
+    (folder / "rig.toml").write_text(re.sub(r"\[measurement\.noise_std\]\n.*\n", "", text))
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Path:
+    """A data set with a short test sequence and gaps in another; the noise of the readings is not declared."""
+    folder = tmp_path_factory.mktemp("cli") / "bench"
+    assert _run("simulate", folder, *SIMULATE) == 0
+    _without_declared_noise(folder)
+    lines = (folder / "test/001.csv").read_text().splitlines(keepends=True)
+    (folder / "test/001.csv").write_text("".join(lines[: 1 + SHORT]))
+    lines = (folder / "test/002.csv").read_text().splitlines()
+    lines[130:136] = [line.rpartition(",")[0] + "," for line in lines[130:136]]
+    (folder / "test/002.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fit(bench) -> Path:
+    out = bench.parent / "fit"
+    assert _run("identify", bench, "--out", out, "--epochs", EPOCHS, "--quiet") == 0
+    return out
+
+
+def test_help_shows_examples_and_loads_no_jax():
+    code = """
+import sys, time
+from nnap_em import cli
+for command in ("", "simulate", "identify", "predict", "smooth"):
+    try:
+        cli.main([command, "--help"] if command else ["--help"])
+    except SystemExit as stop:
+        assert stop.code == 0
+assert not {"jax", "numpy", "equinox", "matplotlib"} & set(sys.modules)
+assert time.process_time() < 0.5
+"""
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.count("example") >= 5
+    for command in ("simulate bench", "identify bench --out fit", "predict fit bench/test", "smooth fit bench/test"):
+        assert f"nnap-em {command}" in found.stdout
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        _run("--version")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert capsys.readouterr().out == f"nnap-em {project['version']}\n"
+    assert project["version"] == nnap_em.__version__
+
+
+def test_public_names_are_what_they_say():
+    for name in nnap_em.__all__:
+        value = getattr(nnap_em, name)
+        assert not isinstance(value, type(sys)), f"{name} is a module"
+        assert name in dir(nnap_em)
+    from nnap_em import identify
+    from nnap_em.identify import identify as same
+
+    assert identify is same
+    with pytest.raises(AttributeError, match="no attribute 'identity'"):
+        _ = nnap_em.identity  # type: ignore[attr-defined]
+
+
+def test_command_line_offers_what_the_library_has():
+    assert sorted(cli.SYSTEMS) == sorted(examples) == sorted(specs)
+    bank = commands.StartBank((1, 1))
+    for name in cli.SMOOTHERS:
+        args = argparse.Namespace(smoother=name, particles=7 if name == "particle" else None)
+        smoother = commands._smoother(args)(bank)
+        assert isinstance(smoother, commands.AbstractSmoother)
+    assert smoother.num_particles == 7
+
+
+def test_simulated_logs_are_the_truth_with_the_declared_noise(tmp_path):
+    noise = ("--process-noise", 1e-4, 2e-3, "--measurement-noise", 0.002, 0.03)
+    assert _run("simulate", tmp_path / "a", *SIMULATE, "--measured", "dx", "x", *noise) == 0
+    declared = read_rig(tmp_path / "a/rig.toml", specs)
+    assert (declared.measured, declared.noise_std) == (("dx", "x"), {"dx": 0.03, "x": 0.002})
+    groups = [f"{group}/{i:03d}.csv" for group in ("train", "test") for i in range(4)]
+    wanted = ["rig.toml", "truth/friction.csv", *groups, *(f"truth/{name}" for name in groups)]
+    assert _files(tmp_path / "a") == sorted(wanted)
+    misfit = {"x": [], "dx": []}
+    for name in groups:
+        log, truth = _read(tmp_path / "a" / name), _read(tmp_path / "a/truth" / name)
+        assert list(log) == ["time", "u", "dx", "x"]
+        assert len(log["time"]) == STEPS + 1
+        np.testing.assert_array_equal(log["u"], truth["u"])
+        np.testing.assert_allclose(truth["time"], 0.01 * np.arange(STEPS + 1), atol=1e-12)
+        for state in misfit:
+            misfit[state].append(log[state] - truth[state])
+    for state, std in (("x", 0.002), ("dx", 0.03)):
+        values = np.concatenate(misfit[state])
+        np.testing.assert_allclose(values.std(), std, rtol=4 / np.sqrt(2 * values.size))
+    friction = _read(tmp_path / "a/truth/friction.csv")
+    v = friction["velocity"]
+    exact = -((1.0 + 0.5 * np.exp(-((v / 0.05) ** 2))) * np.tanh(v / 0.02) + 2.0 * v)  # the slide's Stribeck law
+    np.testing.assert_allclose(friction["torque"], exact, rtol=1e-9, atol=1e-9)
+    assert _run("simulate", tmp_path / "b", *SIMULATE) == 0
+    assert (tmp_path / "b/train/000.csv").read_bytes() != (tmp_path / "a/train/000.csv").read_bytes()
+
+
+@pytest.mark.parametrize("system", ["acrobot", "pendubot", "pendulum"])
+def test_every_system_is_simulated(tmp_path, system):
+    size = ("--sequences", 1, "--test", 0, "--steps", 30)
+    for name in "ab":
+        assert _run("simulate", tmp_path / name, "--system", system, *size, "--seed", 1) == 0
+    declared = read_rig(tmp_path / "a/rig.toml", specs)
+    table = commands.read_logs(tmp_path / "a/train", declared).data
+    assert table.y.shape == (1, 31, len(declared.measured))
+    assert np.isfinite(table.y).all()
+    assert not (tmp_path / "a/test").exists()
+    assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in _files(tmp_path / "a"))
+
+
+def test_a_folder_with_something_in_it_is_left_alone(bench, capsys):
+    before = _files(bench)
+    assert _run("simulate", bench, *SIMULATE) == 2
+    assert "is there already; give a new folder" in capsys.readouterr().err
+    assert _files(bench) == before
+
+
+def test_identify_writes_whole_results(bench, fit):
+    wanted = ["checkpoint.npz", "friction.csv", "friction.png", "model.npz", "report.json"]
+    assert _files(fit) == wanted
+    assert (fit / "friction.png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads((fit / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report["format"] == 1
+    assert list(report["fit"]) == ["given_s", "horizons_s", "x"]
+    assert report["error"]["fit"] == {"x": report["fit"]["x"]}
+    assert len(report["log_likelihood"]) == len(report["epochs"]) == EPOCHS
+    assert report["log_likelihood"] == load(fit / "model.npz").state.loglik.tolist()
+    reading = report["noise"]["measurement"]["x"]
+    assert (reading["estimated"], reading["unit"]) == (True, "m")
+    np.testing.assert_allclose(reading["std"], 1e-3, rtol=0.2)
+    assert set(report["noise"]["process_per_step"]) == {"x", "dx"}
+    assert report["friction_law"][0]["joint"] == 1
+    assert report["versions"]["jax"] == jax.__version__
+
+
+def test_the_learned_friction_is_the_true_one(bench, fit):
+    learned = _read(fit / "friction.csv")
+    assert list(learned) == ["joint", "velocity", "torque", "torque_std"]
+    assert (learned["joint"] == 1).all()
+    assert len(learned["velocity"]) == 101
+    truth = _read(bench / "truth/friction.csv")
+    exact = np.interp(learned["velocity"], truth["velocity"], truth["torque"])
+    far = np.abs(learned["velocity"]) > 0.1  # the truth's table is coarse about its knee
+    z = (learned["torque"] - exact)[far] / learned["torque_std"][far]
+    assert np.sqrt(np.mean(z**2)) < 3.0
+    assert np.sqrt(np.mean((learned["torque"] - exact) ** 2) / np.mean(exact**2)) < 0.15
+
+
+def test_reported_errors_are_those_of_the_predictions(bench, fit, tmp_path):
+    assert _run("predict", fit, bench / "test", "--given", "1.0", "--out", tmp_path / "p") == 0
+    assert _files(tmp_path / "p") == [f"{i:03d}.csv" for i in range(4)]
+    since, miss = [], []
+    for name in _files(tmp_path / "p"):
+        predicted, log = _read(tmp_path / "p" / name), _read(bench / "test" / name)
+        assert list(predicted) == ["time", "x", "dx", "x_std", "dx_std"]
+        np.testing.assert_array_equal(predicted["time"], log["time"])
+        assert all(np.isfinite(values).all() for values in predicted.values())
+        assert (predicted["x_std"] > 0).all()
+        since.append(log["time"] - log["time"][0] - 1.0)
+        miss.append(predicted["x"] - log["x"])
+    since, miss = np.concatenate(since), np.concatenate(miss)
+    report = json.loads((fit / "report.json").read_text())["fit"]
+    for horizon, reported in zip(report["horizons_s"], report["x"], strict=True):
+        inside = (since > 1e-6) & (since < horizon + 1e-6) & np.isfinite(miss)
+        np.testing.assert_allclose(reported, np.sqrt(np.mean(miss[inside] ** 2)), rtol=1e-6)
+
+
+def test_predictions_hold_the_truth(bench, fit, tmp_path):
+    """The true state, inputs after the given time included, within the stated standard deviations."""
+    z = []
+    assert _run("predict", fit / "model.npz", bench / "test", "--given", "0.5", "--out", tmp_path, "--seed", 4) == 0
+    for name in ("000.csv", "002.csv", "003.csv"):
+        predicted, truth = _read(tmp_path / name), _read(bench / "truth/test" / name)
+        ahead = truth["time"] > 0.5 + 1e-6
+        z += [(predicted[s] - truth[s])[ahead] / predicted[f"{s}_std"][ahead] for s in ("x", "dx")]
+    assert np.sqrt(np.mean(np.square(z))) < 3.0
+
+
+def test_readings_after_the_given_time_change_nothing(bench, fit, tmp_path):
+    shutil.copytree(bench / "test", tmp_path / "test")
+    for path in (tmp_path / "test").iterdir():
+        lines = path.read_text().splitlines()
+        lines[42:] = [line.rpartition(",")[0] + "," for line in lines[42:]]
+        path.write_text("\n".join(lines) + "\n")
+    for folder, out in ((bench / "test", "a"), (tmp_path / "test", "b")):
+        assert _run("predict", fit, folder, "--given", "0.4", "--out", tmp_path / out) == 0
+    for name in _files(tmp_path / "a"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_path):
+    assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
+    error, noise, z = [], [], []
+    for name in _files(bench / "test"):
+        smoothed, log, truth = _read(tmp_path / name), _read(bench / "test" / name), _read(bench / "truth/test" / name)
+        assert list(smoothed) == ["time", "x", "dx", "x_std", "dx_std"]
+        np.testing.assert_array_equal(smoothed["time"], log["time"])
+        rows = slice(len(log["time"]))
+        error.append(smoothed["x"] - truth["x"][rows])
+        noise.append(log["x"] - truth["x"][rows])
+        z += [(smoothed[s] - truth[s][rows]) / smoothed[f"{s}_std"] for s in ("x", "dx")]
+    assert np.std(np.concatenate(error)) < 0.8 * np.nanstd(np.concatenate(noise))
+    assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 2.0
+
+
+def _stop_after(epochs: int, monkeypatch):
+    """Ctrl-C right after a checkpoint."""
+    whole = commands.save
+
+    def save(path, fitted, **options):
+        whole(path, fitted, **options)
+        if fitted.state.epoch == epochs:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "save", save)
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "stopped"
+    argv = ("identify", bench, "--out", out, "--epochs", EPOCHS)
+    with monkeypatch.context() as patch:
+        _stop_after(4, patch)
+        assert _run(*argv) == 130
+    said = capsys.readouterr().err
+    assert said.startswith("nnap-em: compiling for 4 sequences of 151 rows")
+    assert re.search(r"epoch   2 of 9  horizon 0\.60 s  log-likelihood [\d.]+ per sequence  noise std x 0\.00", said)
+    assert f"stopped after epoch 4; to go on: nnap-em identify {bench} --out {out}" in said
+    assert _files(out) == ["checkpoint.npz"]
+    assert _run(*argv, "--resume") == 0
+    assert "resumed after epoch 4" in capsys.readouterr().err
+    assert (out / "friction.csv").read_bytes() == (fit / "friction.csv").read_bytes()
+    whole, stopped = (json.loads((folder / "report.json").read_text()) for folder in (fit, out))
+    for name in ("fit", "noise", "parameters", "friction_law", "log_likelihood", "left_out"):
+        assert whole[name] == stopped[name]
+    assert [e["epoch"] for e in stopped["epochs"]] == list(range(1, EPOCHS + 1))
+    one, other = (load(folder / "model.npz") for folder in (fit, out))
+    leaves = zip(jax.tree.leaves(one.model), jax.tree.leaves(other.model), strict=True)
+    assert all(np.array_equal(a, b) for a, b in leaves if isinstance(a, jax.Array))
+
+
+def test_a_stop_before_the_first_epoch_keeps_nothing(bench, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "identify", stop)
+    assert _run("identify", bench, "--out", tmp_path / "new") == 130
+    assert "nothing was kept" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def _other_data(bench: Path) -> None:
+    path = bench / "train/000.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], lines[-1].rpartition(",")[0] + ",0.5"]) + "\n")
+
+
+def _other_rig(bench: Path) -> None:
+    path = bench / "rig.toml"
+    path.write_text(path.read_text().replace("m = 1.0", "m = 1.1"))
+
+
+RESUMES = {
+    "data": (_other_data, (), "made from other training data"),
+    "rig": (_other_rig, (), "made for another rig.toml"),
+    "seed": (lambda bench: None, ("--seed", "8"), "made with --seed 0, not 8; resume with --seed 0"),
+    "smoother": (lambda bench: None, ("--smoother", "ekf"), "resume with --smoother cubature"),
+}
+
+
+@pytest.mark.parametrize("change, options, reason", RESUMES.values(), ids=RESUMES)
+def test_resume_refuses_what_the_checkpoint_is_not_of(bench, fit, tmp_path, capsys, change, options, reason):
+    shutil.copytree(bench, tmp_path / "bench")
+    change(tmp_path / "bench")
+    before = {name: (fit / name).stat().st_mtime_ns for name in _files(fit)}
+    assert _run("identify", tmp_path / "bench", "--out", fit, "--resume", *options) == 2
+    assert reason in capsys.readouterr().err
+    assert {name: (fit / name).stat().st_mtime_ns for name in _files(fit)} == before
+
+
+def test_without_test_sequences_there_is_no_error_to_report(bench, tmp_path, capsys):
+    shutil.copytree(bench, tmp_path / "bench")
+    shutil.rmtree(tmp_path / "bench/test")
+    assert _run("identify", tmp_path / "bench", "--out", tmp_path / "fit", "--epochs", 1) == 0
+    report = json.loads((tmp_path / "fit/report.json").read_text())
+    assert report["fit"] is report["error"] is None
+    assert "no test sequences" in report["error_note"]
+    assert "no test sequences" in capsys.readouterr().err
+
+
+def test_test_sequences_do_not_change_the_fit(bench, fit, tmp_path):
+    """One epoch with and without them."""
+    shutil.copytree(bench, tmp_path / "bench")
+    shutil.rmtree(tmp_path / "bench/test")
+    for folder, out in ((bench, "a"), (tmp_path / "bench", "b")):
+        assert _run("identify", folder, "--out", tmp_path / out, "--epochs", 1, "--quiet") == 0
+    assert (tmp_path / "a/friction.csv").read_bytes() == (tmp_path / "b/friction.csv").read_bytes()
+
+
+def test_json_has_null_for_what_is_no_number(tmp_path):
+    commands.write_json(tmp_path / "x.json", {"a": [1.0, float("nan")], "b": {"c": float("inf"), "d": "é"}})
+    found = json.loads((tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
+    assert found == {"a": [1.0, None], "b": {"c": None, "d": "é"}}
+
+
+def _bench_file(name: str, old: str, new: str):
+    def change(bench: Path) -> None:
+        path = bench / name
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new, 1))
+
+    return change
+
+
+IDENTIFY = ("identify", "{bench}", "--out", "{out}")
+PREDICT = ("predict", "{fit}", "{bench}/test", "--given", "1", "--out", "{out}")
+BAD = {
+    "no rig": (lambda b: (b / "rig.toml").unlink(), IDENTIFY, r"bench/rig\.toml: cannot be read"),
+    "rig typo": (_bench_file("rig.toml", "friction =", "fricton ="), IDENTIFY, "did you mean 'friction'"),
+    "no train": (lambda b: shutil.rmtree(b / "train"), IDENTIFY, "bench/train: is no folder"),
+    "bad number": (_bench_file("train/002.csv", "0.02,", "0.02,oops"), IDENTIFY, r"train/002\.csv: line 4, column 'u'"),
+    "bad test file": (_bench_file("test/002.csv", "time", "tme"), IDENTIFY, r"test/002\.csv: line 1, column 'time'"),
+    "test in train": (
+        lambda b: shutil.copy(b / "test/000.csv", b / "train/900.csv"),
+        IDENTIFY,
+        r"test file 000\.csv: the same content as train file 900\.csv",
+    ),
+    "nothing to resume": (lambda b: None, (*IDENTIFY, "--resume"), "checkpoint.npz: is not there; leave --resume out"),
+    "out is a file": (
+        lambda b: None,
+        ("identify", "{bench}", "--out", "{bench}/rig.toml"),
+        r"rig\.toml: File exists",
+    ),
+    "no model": (lambda b: None, ("smooth", "{bench}", "{bench}/test", "--out", "{out}"), "model.npz: cannot be read"),
+    "model is a log": (
+        lambda b: None,
+        ("smooth", "{bench}/test/000.csv", "{bench}/test", "--out", "{out}"),
+        r"000\.csv: no model",
+    ),
+    "no logs": (lambda b: shutil.rmtree(b / "test"), PREDICT, "bench/test: is no folder"),
+    "column lost": (_bench_file("test/001.csv", ",x", ",z"), PREDICT, r"test/001\.csv: line 1, column 'x': missing"),
+    "state unknown": (
+        lambda b: None,
+        ("simulate", "{out}", "--system", "slide", "--measured", "y"),
+        "--measured y: no state of this system; possible here: x, dx",
+    ),
+    "state twice": (
+        lambda b: None,
+        ("simulate", "{out}", "--system", "slide", "--measured", "x", "x"),
+        "--measured x x: a state stands there twice",
+    ),
+}
+
+
+@pytest.mark.parametrize("change, argv, reason", BAD.values(), ids=BAD)
+def test_a_mistake_gives_one_line_and_writes_nothing(bench, fit, tmp_path, capsys, change, argv, reason):
+    shutil.copytree(bench, tmp_path / "bench")
+    change(tmp_path / "bench")
+    before = _files(tmp_path)
+    places = {"bench": tmp_path / "bench", "fit": fit, "out": tmp_path / "out"}
+    assert _run(*(word.format(**places) for word in argv)) == 2
+    said = capsys.readouterr()
+    assert re.fullmatch(rf"nnap-em: error: .*{reason}.*\n", said.err)
+    assert said.out == ""
+    assert _files(tmp_path) == before
+    assert not (tmp_path / "out").exists()
+
+
+USAGE = {
+    "no command": ((), "required"),
+    "no out": (("identify", "bench"), "--out"),
+    "zero epochs": (
+        ("identify", "bench", "--out", "x", "--epochs", "0"),
+        "found '0'; give a whole number of 1 or more",
+    ),
+    "particles": (("identify", "bench", "--out", "x", "--particles", "9"), "--particles goes with --smoother particle"),
+    "smoother": (("identify", "bench", "--out", "x", "--smoother", "ukf"), "invalid choice: 'ukf'"),
+    "given": (("predict", "m", "t", "--out", "x", "--given", "-1"), "found '-1'; give seconds, 0 or more"),
+    "given nan": (("predict", "m", "t", "--out", "x", "--given", "nan"), "found 'nan'; give seconds"),
+    "noise": (("simulate", "x", "--process-noise", "0", "1"), "found '0'; give a number above 0"),
+}
+
+
+@pytest.mark.parametrize("argv, reason", USAGE.values(), ids=USAGE)
+def test_wrong_usage_is_refused(capsys, argv, reason):
+    with pytest.raises(SystemExit, match="2"):
+        _run(*argv)
+    assert reason in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_nothing_half_written(bench, fit, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(rig, "os", SimpleNamespace(replace=full, getpid=os.getpid))
+    assert _run("smooth", fit, bench / "test", "--out", tmp_path / "out") == 2
+    assert capsys.readouterr().err == "nnap-em: error: No space left on device\n"
+    assert _files(tmp_path) == []
+    assert _run("simulate", tmp_path / "new", *SIMULATE) == 2
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"]
+
+
+def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
+    def bug(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(commands, "smooth", bug)
+    with pytest.raises(ZeroDivisionError):
+        _run("smooth", fit, bench / "test", "--out", tmp_path / "out")
+
+
+def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypatch, capsys):
+    whole = commands.smooth
+
+    def lost(fitted, data):
+        posterior = whole(fitted, data)
+        mean = posterior.state.mean.at[2, 10:, 1].set(np.inf)
+        return posterior._replace(state=posterior.state._replace(mean=mean))
+
+    monkeypatch.setattr(commands, "smooth", lost)
+    assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
+    assert f"nnap-em: warning: 002.csv: {STEPS + 1 - 10} values run away" in capsys.readouterr().err
+    assert np.isnan(_read(tmp_path / "002.csv")["dx"]).sum() == STEPS + 1 - 10
+
+
+def test_the_model_file_tells_how_it_came_to_be(bench, fit):
+    stored = read(fit / "model.npz")
+    assert stored.notes["settings"] == {"smoother": "cubature", "particles": None, "seed": 0}
+    assert [epoch["epoch"] for epoch in stored.notes["epochs"]] == list(range(1, EPOCHS + 1))
+    assert stored.fitted.rig == read_rig(bench / "rig.toml", specs)

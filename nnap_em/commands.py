@@ -386,9 +386,10 @@ def _velocities(fitted: Identified, train: Logs, history: list[dict[str, Any]]) 
 
 
 def _visited(velocity: Float[np.ndarray, "sample dof"], nodes: int = 101) -> Float[np.ndarray, "dof node"]:
-    """Velocities from the 0.5th to the 99.5th percentile of each joint."""
+    """Velocities from the 0.5th to the 99.5th percentile of each joint, dense near rest, where friction bends."""
     low, high = np.percentile(velocity, [0.5, 99.5], axis=0)
-    return np.linspace(low, high, nodes, axis=1)
+    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
+    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), nodes))).T
 
 
 def _write_friction(path: Path, velocity, torque, std) -> None:

@@ -93,7 +93,7 @@ def _head(figure: Figure, title: str, axes: Sequence[Axes], note: str = "") -> N
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             seen.setdefault(label, handle)
     width, height = figure.get_size_inches()
-    columns = min(len(seen), max(1, int(width / 1.7)))
+    columns = min(len(seen), max(1, int(width / 1.3)))
     rows = -(-len(seen) // max(columns, 1))
     top = 0.30 + 0.17 * (note.count("\n") + 1) * bool(note)
     figure.text(0.08 / width, 1 - 0.08 / height, title, va="top", ha="left", fontsize=11, weight="bold")
@@ -109,6 +109,7 @@ def _head(figure: Figure, title: str, axes: Sequence[Axes], note: str = "") -> N
             borderaxespad=0.2,
             columnspacing=1.4,
             handlelength=1.6,
+            markerscale=4,
         )
     figure.get_layout_engine().set(rect=(0, 0, 1, 1 - (top + 0.05 + 0.21 * rows) / height))  # type: ignore[union-attr]
 

@@ -137,10 +137,10 @@ def make_tasks(rig: Rig, data: Dataset, effort: Effort, *, key) -> list[Task]:
     whole = Schedule(first=data.t.shape[1])
 
     def particles(guide, count, paths):
-        return ParticleSmoother(guide, num_particles=count, num_paths=paths)
+        return ParticleSmoother(guide, num_particles=count, num_paths=paths, dtype=jnp.float64)
 
     def cloud(guide):
-        return particle_cloud(ParticleSmoother(guide, Guided(), num_particles=effort.cloud))
+        return particle_cloud(ParticleSmoother(guide, Guided(), num_particles=effort.cloud, dtype=jnp.float64))
 
     rough = particles(network_rts, effort.network_particles, effort.network_paths)
     fine = particles(rts, effort.particles, effort.paths)
@@ -218,12 +218,12 @@ def _forecast(model, state, u, keys):
     return jax.vmap(lambda s, u, k: forecast(model, s, u, samples=100, key=k))(state, u, keys)
 
 
-def prediction_error(model, smoother, test: Experiment, horizon: float, *, key) -> np.ndarray:
-    """RMS error of the predicted angles over `horizon` [s], the median of the sequences [rad]."""
+def prediction_errors(model, smoother, test: Experiment, horizons: list[float], *, key) -> list[np.ndarray]:
+    """RMS error of the predicted angles over each horizon [s], the median of the sequences [rad]."""
     _, last, paths = predict(model, smoother, test.data, key=key)
-    count = round(horizon / model.dt)
-    error = np.mean(paths, axis=1)[:, 1 : count + 1, :2] - test.x[:, last + 1 : last + count + 1, :2]
-    return np.median(rms((error + np.pi) % (2 * np.pi) - np.pi, 1), axis=0)
+    error = np.mean(paths, axis=1)[:, 1:, :2] - test.x[:, last + 1 :, :2]
+    error = (error + np.pi) % (2 * np.pi) - np.pi
+    return [np.median(rms(error[:, : round(h / model.dt)], 1), axis=0) for h in horizons]
 
 
 def make_table(trained: list[Trained], truth, bank: StartBank, train: Experiment, test: Experiment, effort, key) -> str:
@@ -242,8 +242,7 @@ def make_table(trained: list[Trained], truth, bank: StartBank, train: Experiment
         friction = friction_error(model, truth, train.x) if physical and model is not truth else (None, None)
         smoothing = smoothing_error(model, smoother, train, key=key) if physical else None
         row = [name, *map(cell, friction), cell(smoothing)]
-        for horizon in horizons:
-            first, second = prediction_error(model, smoother, test, horizon, key=key)
+        for first, second in prediction_errors(model, smoother, test, horizons, key=key):
             row += [cell(first), cell(second if physical else None)]
         rows.append([*row, epochs, seconds])
     text = "\n".join("| " + " | ".join(row) + " |" for row in rows)

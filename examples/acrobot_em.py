@@ -245,6 +245,7 @@ def make_table(trained: list[Trained], truth, bank: StartBank, train: Experiment
         for first, second in prediction_errors(model, smoother, test, horizons, key=key):
             row += [cell(first), cell(second if physical else None)]
         rows.append([*row, epochs, seconds])
+        say("  " + ", ".join(rows[-1]))
     text = "\n".join("| " + " | ".join(row) + " |" for row in rows)
     e = effort
     notes = (

@@ -43,9 +43,7 @@ def paper_rig(start_std: float) -> Rig:
     """What the owner of the paper's acrobot declares: Table I, no noise, the start's prior."""
     start = {"theta2": Declared(0.0, start_std), "dtheta1": Declared(0.0, 0.02), "dtheta2": Declared(0.0, 0.02)}
     parameters = {name: Declared(value, 0.0) for name, value in table_i.items()}
-    return Rig(
-        "paper", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, start
-    )
+    return Rig("paper", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, start)
 
 
 def visited(x, bins: int = 2001):
@@ -152,7 +150,9 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
         "theta2 prediction 1 s / true model": scores[1.0][1] / truth_scores[1.0][1],
         "theta2 prediction 2 s [rad]": scores[2.0][1],
         "theta2 prediction 2 s / true model": scores[2.0][1] / truth_scores[2.0][1],
-        "sequences lost at the end (left out or theta2 off by > .3 rad)": float(max(lost[-1], (smooth_error > 0.3).sum())),
+        "sequences lost at the end (left out or theta2 off by > .3 rad)": float(
+            max(lost[-1], (smooth_error > 0.3).sum())
+        ),
         "coverage of the 90 % friction band [%]": 100 * float(np.sum(count * inside) / np.sum(count)),
         "coverage of the 90 % band of 1 s predictions [%]": 100 * float(hits),
         "epochs": float(fitted.state.epoch),

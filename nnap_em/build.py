@@ -86,7 +86,7 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset, lag: int = 5
     gravity = np.abs(np.asarray(system.bias(quarter, jnp.zeros(dof))))
     drive = np.zeros(dof)
     for i, joint in enumerate(rig.input_joints):
-        drive[joint - 1] = np.sqrt(np.mean(u[..., i] ** 2))
+        drive[joint - 1] = np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 
@@ -146,7 +146,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
         jnp.asarray([rig.parameters[n].mean for n in free]),
         jnp.asarray([rig.parameters[n].std for n in free]),
     )
-    mstep = ScoringMStep(prior, open_, tuple(d is None for d in declared), nodes, shape=model.log_q)
+    mstep = ScoringMStep(prior, unknown.weights(), open_, tuple(d is None for d in declared), nodes, shape=model.log_q)
     return Problem(model, mstep, start_bank(model, states, rig, system))
 
 

@@ -32,13 +32,13 @@ class EMState(NamedTuple):
     """Where the M-step would go from `best`."""
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the M-step's weights at `best`."""
-    top: float
-    """Mean log-likelihood of `best`."""
+    top: Float[np.ndarray, " seq"]
+    """Log-likelihood of every sequence under `best`; -inf before there is one, NaN where a sequence is left out."""
     stride: float
     """Share of the way to `proposal` that is tried."""
     key: PRNGKeyArray
     loglik: Float[np.ndarray, " epoch"]
-    """Mean log-likelihood per sequence of the epochs so far."""
+    """Mean log-likelihood of the sequences used, of every epoch so far."""
 
 
 class FitError(RuntimeError):
@@ -76,7 +76,7 @@ def em_step(
 
 def start_state(model: StateSpaceModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
-    return EMState(0, model, model, model, m_step.no_hessian(model), -math.inf, 1.0, key, np.zeros(0))
+    return EMState(0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0))
 
 
 def fit(
@@ -96,7 +96,7 @@ def fit(
     nats twice running.  `watch(state, samples seen, sequences used)` is called after every epoch.
     Raises FitError when no sequence can be followed.
     """
-    longest = data.t.shape[1]
+    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     if state.epoch == 0:
         model = _settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key)
         state = state._replace(model=model, best=model)
@@ -112,18 +112,20 @@ def fit(
                 "signs and the start prior, or declare a wider one"
             )
         if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
-            state = state._replace(top=-math.inf, stride=1.0)
-        state = _judge(state, proposal, info.hessian, np.asarray(loglik))
+            state = state._replace(top=np.full(used.size, -np.inf), stride=1.0)
+        state = _judge(state, proposal, info.hessian, np.asarray(loglik), used)
         watch(state, seen, used)
     return state
 
 
-def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik: Float[np.ndarray, " seq"]) -> EMState:
+def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik, used) -> EMState:
     """Accept the model that was tried, or go back to the best one and try a shorter way from there."""
-    mean = float(np.mean(np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)))
-    if mean >= state.top - 0.5:
+    loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
+    mean = float(np.mean(loglik[used]))
+    if np.nanmean(loglik - state.top) >= -0.5:
+        top = np.where(used, loglik, np.nan)
         stride = min(1.0, 2 * state.stride)
-        state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=mean, stride=stride)
+        state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=top, stride=stride)
     else:
         state = state._replace(stride=state.stride / 3)
     way = lambda a, b: a + state.stride * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
@@ -134,7 +136,10 @@ def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik: Float[np.
 def _settle_noise(model, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
     """`model` with its process noise scaled by the likeliest of `scales`: how far its first motion is off is unknown."""
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
-    logliks = [float(jnp.nansum(em_step(trial, data, smoother, m_step.early(), key)[2])) for trial in trials]
+    logliks = []
+    for trial in trials:
+        _, info, loglik = em_step(trial, data, smoother, m_step.early(), key)
+        logliks.append(float(np.mean(np.asarray(loglik)[np.asarray(info.used)])) if np.any(info.used) else -math.inf)
     return trials[int(np.argmax(logliks))]
 
 

@@ -67,7 +67,12 @@ def hats(nodes: Float[Array, " count"], v: Float[Array, ""]) -> Float[Array, " c
 
 
 def expand(
-    model, prior: ParameterPrior, nodes: Float[Array, "dof count"], posterior: Posterior, seq: Dataset, linearise=Tangent()
+    model,
+    prior: ParameterPrior,
+    nodes: Float[Array, "dof count"],
+    posterior: Posterior,
+    seq: Dataset,
+    linearise=Tangent(),
 ) -> Quadratic:
     """The log-likelihood of one sequence to second order."""
     y, observed = fill_missing(seq.y)
@@ -87,7 +92,7 @@ def expand(
 
     def columns(prev, following, kick, excess, by_force, by_parameter):
         """Mean sensitivity of x_{k+1} to phi, and expected score, over the nodes of one step."""
-        speed = 0.5 * (prev + following)[:, dof:]
+        speed = 0.5 * (prev + following - kick)[:, dof:]  # half the kick would count as signal
         weights = jax.vmap(jax.vmap(hats), in_axes=(None, 0))(nodes, speed)  # node dof count
         push = spd_solve(jnp.diag(q) + excess, kick.T).T
         pull = push @ by_force  # node dof
@@ -147,6 +152,8 @@ class Weights(eqx.Module):
     nodes: Float[Array, "dof count"]
     ridge: float
     """Precision of the weights' prior; the network's output is scaled so that 1 is natural."""
+    centre: Float[Array, " weight"]
+    """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
     asymmetry: Float[Array, " dof"]
     """Prior standard deviation [N m] of the even part of a friction map, its mean over the nodes."""
 
@@ -167,6 +174,10 @@ class Weights(eqx.Module):
         """Prior precision of the weights."""
         cut = w.shape[0] - len(self.prior.names)
         return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
+
+    def middle(self) -> Float[Array, " weight"]:
+        """Prior mean of the weights."""
+        return jnp.concatenate([self.centre, jnp.zeros(len(self.prior.names), self.centre.dtype)])
 
     def symmetry(self) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
@@ -189,13 +200,14 @@ class Weights(eqx.Module):
         w0 = self.read(model)
         phi0 = self.phi(model, w0)
         precision = self.precision(w0)
+        middle = self.middle()
         symmetry = self.symmetry()
         score = score - symmetry @ phi0
         information = information + symmetry
 
         def loss(w):
             d = self.phi(model, w) - phi0
-            return -score @ d + 0.5 * d @ information @ d + 0.5 * jnp.sum(precision * w**2)
+            return -score @ d + 0.5 * d @ information @ d + 0.5 * jnp.sum(precision * (w - middle) ** 2)
 
         def going(carry):
             _, _, damping, count, gain = carry
@@ -204,7 +216,7 @@ class Weights(eqx.Module):
         def body(carry):
             w, value, damping, count, gain = carry
             hessian, jac = self.hessian(model, w, information)
-            gradient = jac.T @ (information @ (self.phi(model, w) - phi0) - score) + precision * w
+            gradient = jac.T @ (information @ (self.phi(model, w) - phi0) - score) + precision * (w - middle)
             factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.diag(jnp.diag(hessian)))
             trial = w - jax.scipy.linalg.cho_solve(factor, gradient)
             new = loss(trial)
@@ -222,7 +234,7 @@ class MStepInfo(NamedTuple):
     """What an M-step lets one see and reuse."""
 
     hessian: Float[Array, "weight weight"]
-    """Posterior precision of the weights (zero for M-steps that know none)."""
+    """Posterior precision of the weights, at those of the model that was given (zero for M-steps that know none)."""
     used: Bool[Array, " seq"]
     """Sequences that took part."""
 
@@ -258,6 +270,8 @@ class ScoringMStep(AbstractMStep):
     """Fisher scoring of the marginal likelihood for the hybrid model: weights, parameters, noise and start."""
 
     prior: ParameterPrior
+    centre: Float[Array, " weight"]
+    """Mean of the prior of the network's weights."""
     learn_start: tuple[bool, ...] = eqx.field(static=True)
     learn_r: tuple[bool, ...] = eqx.field(static=True)
     nodes: int = eqx.field(static=True, default=41)
@@ -275,7 +289,7 @@ class ScoringMStep(AbstractMStep):
     """Log variances of the process noise of the first model."""
 
     def weights(self, model) -> Weights:
-        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge, 0.1 * model.unknown.scale)
+        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge, self.centre, 0.1 * model.unknown.scale)
 
     def early(self) -> "ScoringMStep":
         return eqx.tree_at(lambda m: m.tie, self, jnp.asarray(1e4))
@@ -292,7 +306,7 @@ class ScoringMStep(AbstractMStep):
         pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
         total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
         w = weights.fit(model, total.score, total.information, self.iterations)
-        hessian, _ = weights.hessian(model, w, total.information + weights.symmetry())
+        hessian, _ = weights.hessian(model, weights.read(model), total.information + weights.symmetry())
         fitted = weights.write(model, w)
         log_q, log_r = self._noise(model, total)
         start = self._start(model.start, jax.tree.map(lambda a: pick(a[:, 0]), posterior.state), used)
@@ -325,5 +339,7 @@ class ScoringMStep(AbstractMStep):
         count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)
         mean = jnp.where(learn, jnp.sum(first.mean, axis=0) / count, start.mean)
         square = jnp.where(used[:, None], (first.mean - mean[None]) ** 2, 0.0)
-        variance = (jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)) / (count + 1)
+        variance = (jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)) / (
+            count + 1
+        )
         return Gaussian(mean, jnp.diag(jnp.where(learn, variance, jnp.diag(start.cov))))

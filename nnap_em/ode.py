@@ -45,7 +45,9 @@ def integrate(
     h = dt / substeps
 
     def body(x, _):
-        x, _, _, _, _ = solver.step(term, jnp.zeros(()), jnp.asarray(h, x.dtype), x, None, None, made_jump=False)
+        x, _, _, _, _ = solver.step(
+            term, jnp.zeros((), x.dtype), jnp.asarray(h, x.dtype), x, None, None, made_jump=False
+        )
         return x, None
 
     x, _ = jax.lax.scan(body, x, None, length=substeps)

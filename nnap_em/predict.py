@@ -28,10 +28,9 @@ class Prediction(NamedTuple):
 
 
 def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
-    """Rows with time <= first time + given [s], to a thousandth of a sample."""
+    """Rows with time <= first time + given [s], to a microsecond."""
     t = np.asarray(data.t, np.float64)
-    step = np.median(np.diff(t, axis=1)) if t.shape[1] > 1 else 0.0
-    return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-3 * step)
+    return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
 
 
 @eqx.filter_jit
@@ -79,9 +78,7 @@ def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key:
     return jax.vmap(one)(state.mean, state.cov, data.u, known, keys)
 
 
-def predict(
-    fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100
-) -> Prediction:
+def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:
     """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
 
     Uncertainty of the present state, of the friction and parameters, and process noise are in it; measurement noise is not.
@@ -109,7 +106,7 @@ def horizon_errors(
         inside = observed[..., i] & np.asarray(prediction.ahead)
         rms = []
         for horizon in horizons:
-            e = error[inside & (since <= horizon + 1e-3 * fitted.rig.dt)]
+            e = error[inside & (since <= horizon + 1e-6)]
             rms.append(float(np.sqrt(np.mean(e**2))) if e.size else float("nan"))
         out[name] = rms
     return out

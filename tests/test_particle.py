@@ -1,0 +1,240 @@
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from nnap_em.data import Dataset
+from nnap_em.gaussian import Gaussian
+from nnap_em.particle import (
+    Bootstrap,
+    ExactBackward,
+    Guided,
+    Lookahead,
+    MetropolisBackward,
+    ParticleSmoother,
+    ffbs,
+    particle_filter,
+    systematic,
+)
+from nnap_em.simulate import paper_experiment, paper_model
+from nnap_em.smoother import ExtendedKalmanSmoother, StartBank
+
+PROPOSALS = {"bootstrap": Bootstrap(), "guided": Guided(), "lookahead": Lookahead(1.0), "tempered": Lookahead(0.8)}
+BACKWARD = {"exact": ExactBackward(), "metropolis": MetropolisBackward(10)}
+SEEDS = 200
+
+
+class _Oscillator(eqx.Module):
+    """A damped mass on a spring, position read: the Kalman smoother is exact."""
+
+    matrix: Float[Array, "state state"]
+    drive: Float[Array, " state"]
+    start: Gaussian
+    log_q: Float[Array, " state"]
+    log_r: Float[Array, " obs"]
+
+    def transition(self, x, u):
+        rows = [self.matrix[i, 0] * x[0] + self.matrix[i, 1] * x[1] + self.drive[i] * u[0] for i in range(2)]
+        return jnp.stack(rows)
+
+    def emission(self, x):
+        return x[:1]
+
+
+def _oscillator():
+    return _Oscillator(
+        jnp.array([[0.98, 0.1], [-0.3, 0.9]]),
+        jnp.array([0.0, 0.1]),
+        Gaussian(jnp.array([1.0, 0.0]), jnp.array([[0.3, 0.1], [0.1, 0.5]])),
+        2 * jnp.log(jnp.array([0.02, 0.1])),
+        2 * jnp.log(jnp.array([0.1])),
+    )
+
+
+def _linear_data(model, steps=30):
+    """One sequence with a gap; the second half of the gap ends nowhere near a reading."""
+    rng = np.random.default_rng(3)
+    u = np.sin(0.4 * np.arange(steps + 1))[:, None]
+    x, y = np.array([1.3, -0.4]), []
+    for k in range(steps + 1):
+        y.append(x[:1] + 0.1 * rng.standard_normal(1))
+        x = np.asarray(model.matrix) @ x + np.asarray(model.drive) * u[k, 0] + [0.02, 0.1] * rng.standard_normal(2)
+    y = np.array(y)
+    y[[4, 12, 13, 14, 15]] = np.nan
+    return Dataset(*map(jnp.asarray, (0.1 * np.arange(steps + 1), u, y, np.ones(steps + 1, bool))))
+
+
+def _padded(seq, rows):
+    return Dataset(
+        jnp.pad(seq.t, (0, rows), mode="edge"),
+        jnp.pad(seq.u, ((0, rows), (0, 0))),
+        jnp.pad(seq.y, ((0, rows), (0, 0)), constant_values=jnp.nan),
+        jnp.pad(seq.valid, (0, rows)),
+    )
+
+
+def _guide(dim):
+    return ExtendedKalmanSmoother(StartBank((1,) * dim), iterations=1)
+
+
+@jax.jit
+def _run_linear(model, seq, potentials, keys):
+    def run(key):
+        key_filter, key_paths = jax.random.split(key)
+        history = particle_filter(model, potentials, seq, num_particles=500, key=key_filter)
+        paths = {name: ffbs(history, rule, num_paths=40, key=key_paths) for name, rule in BACKWARD.items()}
+        return history.loglik, history.ess, paths
+
+    return jax.vmap(run)(keys)
+
+
+@functools.cache
+def _linear_runs(proposal):
+    """SEEDS independent runs: the exact answer, log-likelihoods, and the trajectories of both samplers."""
+    model = _oscillator()
+    seq = _linear_data(model)
+    filtered, smoothed = _guide(2).path(model, seq)
+    potentials = PROPOSALS[proposal](model, seq, filtered, smoothed)
+    return model, filtered, smoothed, _run_linear(model, seq, potentials, jax.random.split(jax.random.key(5), SEEDS))
+
+
+def _within(samples, known, sigmas=4.5):
+    """Means over runs equal `known` within standard errors: 4.5 leaves 1 in 1000 for the 180 numbers of a test."""
+    error = np.std(samples, axis=0, ddof=1) / np.sqrt(len(samples))
+    assert np.all(np.abs(np.mean(samples, axis=0) - known) < sigmas * error)
+
+
+@pytest.mark.parametrize("rule", BACKWARD)
+@pytest.mark.parametrize("proposal", PROPOSALS)
+def test_trajectories_have_the_moments_of_the_exact_smoother(proposal, rule):
+    model, _, smoothed, (_, _, paths) = _linear_runs(proposal)
+    mean, cov = map(np.asarray, smoothed.state)
+    x, kick = map(np.asarray, paths[rule])
+    _within(x.mean(axis=2), mean)
+    _within(((x - mean[:, None]) ** 2).mean(axis=2), np.diagonal(cov, axis1=1, axis2=2))
+    # cov of x_{k+1} - A x_k from the lag-one gains; its mean is that of the smoothed path
+    a, u = np.asarray(model.matrix), np.sin(0.4 * np.arange(len(mean) - 1))[:, None]
+    expected = mean[1:] - mean[:-1] @ a.T - u * np.asarray(model.drive)
+    lag = np.asarray(smoothed.gain) @ cov[1:]
+    spread = cov[1:] - a @ lag - np.swapaxes(a @ lag, 1, 2) + a @ cov[:-1] @ a.T
+    _within(kick.mean(axis=2), expected)
+    _within(((kick - expected[:, None]) ** 2).mean(axis=2), np.diagonal(spread, axis1=1, axis2=2))
+
+
+@pytest.mark.parametrize("proposal", PROPOSALS)
+def test_likelihood_is_unbiased(proposal):
+    _, filtered, _, (loglik, _, _) = _linear_runs(proposal)
+    ratio = np.exp(np.asarray(loglik - filtered.loglik))
+    error = 4 * np.std(ratio, ddof=1) / np.sqrt(SEEDS) + 1e-5  # the last for single precision
+    assert abs(np.mean(ratio) - 1) < error
+
+
+def test_full_lookahead_is_perfect_on_a_linear_system():
+    _, filtered, _, (loglik, ess, _) = _linear_runs("lookahead")
+    # single precision: 31 steps of log weights of size 10, eps 6e-8 each
+    np.testing.assert_allclose(loglik, filtered.loglik, atol=2e-4)
+    np.testing.assert_allclose(ess, 500, rtol=1e-4)
+
+
+def test_sight_saves_particles():
+    ess = [np.mean(np.asarray(_linear_runs(p)[3][1])) for p in ("bootstrap", "guided", "lookahead")]
+    assert ess[0] < ess[1] < ess[2]
+
+
+_smooth = eqx.filter_jit(ParticleSmoother(_guide(2), num_particles=50, num_paths=20))
+
+
+def test_padding_changes_no_number():
+    model = _oscillator()
+    seq = _linear_data(model)
+    short = _smooth(model, seq, key=jax.random.key(2))
+    long = _smooth(model, _padded(seq, 7), key=jax.random.key(2))
+    n = seq.y.shape[0]
+    # the random numbers are the same; the two compiled programs may round differently in the last single digit
+    for a, b in ((long.prev, short.prev), (long.next, short.next), (long.kick, short.kick)):
+        np.testing.assert_allclose(a[: n - 1], b, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(long.loglik, short.loglik, atol=1e-5)
+    assert np.all(np.asarray(long.kick[n - 1 :]) == 0)
+    assert np.all(np.asarray(long.next[n - 1 :] - long.prev[n - 1 :]) == 0)
+
+
+def test_one_key_one_result():
+    model = _oscillator()
+    seq = _linear_data(model)
+    one, same, other = (_smooth(model, seq, key=jax.random.key(k)) for k in (7, 7, 8))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True))
+    assert not np.array_equal(one.prev, other.prev)
+
+
+@pytest.mark.parametrize("rule", (ExactBackward(), ExactBackward(5), MetropolisBackward(60)), ids=repr)
+def test_backward_step_draws_from_its_law(rule):
+    draws = 20_000
+    key_f, key_w, key_ahead, key = jax.random.split(jax.random.key(11), 4)
+    f, log_w, log_ahead = (jax.random.normal(k, s) for k, s in ((key_f, (3, 37)), (key_w, (37,)), (key_ahead, (37,))))
+    target = jnp.array([0.3, -0.5, 0.1])
+    uniform = jax.random.uniform(key, (rule.draws, draws))
+    index = rule(jnp.tile(target[:, None], (1, draws)), f, log_w, log_ahead, jnp.zeros(draws, jnp.int32), uniform)
+    p = np.asarray(jax.nn.softmax(log_w - 0.5 * jnp.sum((target[:, None] - f) ** 2, axis=0)))
+    share = np.bincount(np.asarray(index), minlength=37) / draws
+    assert np.all(np.abs(share - p) < 4 * np.sqrt(p * (1 - p) / draws) + 1e-6)
+
+
+def test_systematic_draws_each_particle_its_share():
+    key_w, key_u = jax.random.split(jax.random.key(1))
+    log_w = 2 * jax.random.normal(key_w, (50,), jnp.float32)
+    for offset in jax.random.uniform(key_u, (20,), jnp.float32):
+        index = np.asarray(systematic(log_w, offset, 80))
+        share = 80 * np.asarray(jax.nn.softmax(log_w))
+        counts = np.bincount(index, minlength=50)
+        assert len(index) == 80 and np.all(np.abs(counts - share) < 1 + 1e-4)  # [Kitagawa 1996]
+
+
+@functools.cache
+def _acrobot():
+    """The paper's acrobot with gaps: two samplers on one filter."""
+    model = paper_model(start_std=0.05)
+    data, _ = paper_experiment(model, 1, 80, key=jax.random.key(4))
+    seq = jax.tree.map(lambda a: a[0], data)
+    seq = seq._replace(y=seq.y.at[30:40].set(jnp.nan).at[60, 1].set(jnp.nan))
+
+    def run(model, seq, key):
+        key_filter, key_exact, key_mcmc = jax.random.split(key, 3)
+        filtered, smoothed = _guide(4).path(model, seq)
+        potentials = Lookahead()(model, seq, filtered, smoothed)
+        history = particle_filter(model, potentials, seq, num_particles=300, key=key_filter)
+        exact = ffbs(history, ExactBackward(), num_paths=400, key=key_exact)
+        mcmc = ffbs(history, MetropolisBackward(20), num_paths=400, key=key_mcmc)
+        return filtered.loglik, smoothed, history.ess, history.loglik, exact, mcmc
+
+    return model, seq, jax.jit(run)(model, seq, jax.random.key(9))
+
+
+def test_acrobot_agrees_with_the_kalman_smoother():
+    _, _, (loglik_kalman, smoothed, ess, loglik, exact, _) = _acrobot()
+    mean, cov = map(np.asarray, smoothed.state)
+    std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    x = np.asarray(exact.x)
+    # mean of 400 paths through 300 particles: error std sqrt(1/400 + 1/300) = .08 std, the curvature of f on top
+    assert np.sqrt(np.mean(((x.mean(axis=1) - mean) / std) ** 2)) < 0.2
+    assert abs(np.mean(np.log(x.std(axis=1) / std))) < 0.1
+    assert np.min(ess) > 150
+    assert abs(float(loglik - loglik_kalman)) < 0.5
+
+
+def test_exact_and_metropolis_paths_agree():
+    _, _, (_, _, _, _, exact, mcmc) = _acrobot()
+    a, b = np.asarray(exact.x), np.asarray(mcmc.x)
+    error = np.sqrt((a.var(axis=1) + b.var(axis=1)) / 400)  # given the filter, paths are independent draws
+    assert np.max(np.abs(a.mean(axis=1) - b.mean(axis=1)) / error) < 4.5
+
+
+def test_kick_is_the_process_noise_of_a_path():
+    model, seq, (_, _, _, _, exact, _) = _acrobot()
+    step = jax.vmap(jax.vmap(model.transition, in_axes=(0, None)))
+    kick = exact.x[1:] - jax.jit(step)(exact.x[:-1], seq.u[:-1])
+    # the cached f is good to single rounding of the state: some eps * |x| = 6e-7, against a process noise of 2e-4
+    np.testing.assert_allclose(exact.kick, kick, atol=1e-5)

@@ -137,10 +137,10 @@ def make_tasks(rig: Rig, data: Dataset, effort: Effort, *, key) -> list[Task]:
     whole = Schedule(first=data.t.shape[1])
 
     def particles(guide, count, paths):
-        return ParticleSmoother(guide, num_particles=count, num_paths=paths, dtype=jnp.float64)
+        return ParticleSmoother(guide, num_particles=count, num_paths=paths)
 
     def cloud(guide):
-        return particle_cloud(ParticleSmoother(guide, Guided(), num_particles=effort.cloud, dtype=jnp.float64))
+        return particle_cloud(ParticleSmoother(guide, Guided(), num_particles=effort.cloud))
 
     rough = particles(network_rts, effort.network_particles, effort.network_paths)
     fine = particles(rts, effort.particles, effort.paths)

@@ -4,7 +4,6 @@ Without physics the latent space is unique only up to an invertible map [paper, 
 may be anything that helps to predict the others.
 """
 
-from abc import ABCMeta
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,12 +18,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .build import reading_noise
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower
-from .model import StateSpaceModel
+from .model import AbstractModel
 from .mstep import AbstractMStep, MStepInfo, kept
 from .smoother import Posterior, active_steps
 
 
-class NetworkModel(eqx.Module):
+class NetworkModel(AbstractModel):
     """x_{k+1} = x_k + step * mlp(([x_k, u_k] - centre) / spread) + w_k, y_k = some entries of x_k + v_k."""
 
     mlp: eqx.nn.MLP
@@ -54,10 +53,6 @@ class NetworkModel(eqx.Module):
         return jnp.stack([x[i] for i in self.measured])
 
 
-# It has all that smoothers and EM ask of a model, and passes for one where types are checked; nothing is inherited.
-ABCMeta.register(StateSpaceModel, NetworkModel)
-
-
 def build_network(
     data: Dataset,
     measured: Sequence[int],
@@ -83,13 +78,13 @@ def build_network(
     mean[list(measured)], std[list(measured)] = np.nanmean(y[:, 0], axis=0), np.nanstd(y[:, 0], axis=0) + noise
     a = lambda values: jnp.asarray(values, data.y.dtype)  # noqa: E731
     return NetworkModel(
-        eqx.nn.MLP(states + u.shape[-1], states, width, depth, jnp.tanh, dtype=data.y.dtype, key=key),
-        a(np.concatenate([centre, np.mean(u, axis=0)])),
-        a(np.concatenate([spread, np.std(u, axis=0) + 1e-9])),
-        a(step),
-        Gaussian(a(mean), jnp.diag(a(std**2))),
-        a(2 * np.log(step)),
-        a(2 * np.log(noise)),
+        mlp=eqx.nn.MLP(states + u.shape[-1], states, width, depth, jnp.tanh, dtype=data.y.dtype, key=key),
+        centre=a(np.concatenate([centre, np.mean(u, axis=0)])),
+        spread=a(np.concatenate([spread, np.std(u, axis=0) + 1e-9])),
+        step=a(step),
+        start=Gaussian(a(mean), jnp.diag(a(std**2))),
+        log_q=a(2 * np.log(step)),
+        log_r=a(2 * np.log(noise)),
         measured=tuple(measured),
         dt=dt,
     )
@@ -130,7 +125,7 @@ class GradientMStep(AbstractMStep):
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
         return jnp.zeros((0, 0), model.log_q.dtype)
 
-    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[NetworkModel, MStepInfo]:
         finite = jnp.all(jnp.isfinite(posterior.prev) & jnp.isfinite(posterior.next), axis=(1, 2, 3))
         used = kept(posterior, data) & finite
         pairs = gather_pairs(posterior, data, used)

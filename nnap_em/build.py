@@ -4,9 +4,10 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from .data import Dataset
 from .friction import FrictionNetwork, NoFriction
@@ -115,7 +116,7 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
 
 
 def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: int = 41) -> Problem:
-    """The model that EM starts from: declared physics, a small random friction network, noise as large as the motion."""
+    """The model that EM starts from: declared physics, a small random friction network, noise as large as motion."""
     system = build_system(rig)
     scales = measure_scales(rig, system, data)
     states = system.coordinates + system.rates
@@ -132,11 +133,11 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
         )
         unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_hush)
     model = StateSpaceModel(
-        system,
-        unknown,
-        start,
-        2 * jnp.log(jnp.concatenate([jnp.asarray(kick * rig.dt), jnp.asarray(kick)])),
-        2 * jnp.log(jnp.asarray(noise)),
+        system=system,
+        unknown=unknown,
+        start=start,
+        log_q=2 * jnp.log(jnp.concatenate([jnp.asarray(kick * rig.dt), jnp.asarray(kick)])),
+        log_r=2 * jnp.log(jnp.asarray(noise)),
         measured=tuple(states.index(n) for n in rig.measured),
         dt=rig.dt,
     )
@@ -152,7 +153,9 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
 
 def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
     """The output layer, scaled so that the first friction is nearly none."""
-    return eqx.tree_at(lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, 0.0 * layer.bias))
+    return eqx.tree_at(
+        lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, jax.tree.map(jnp.zeros_like, layer.bias))
+    )
 
 
 def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:

@@ -177,7 +177,15 @@ def _noisy(model: StateSpaceModel, states, measured, process, reading) -> StateS
     index = tuple(states.index(name) for name in measured)
     log_r = 2 * jnp.log(jnp.asarray([rate if i >= dof else position for i in index]))
     log_q = model.log_q if process is None else 2 * jnp.log(jnp.repeat(jnp.asarray(process), dof))
-    return StateSpaceModel(model.system, model.unknown, model.start, log_q, log_r, measured=index, dt=model.dt)
+    return StateSpaceModel(
+        system=model.system,
+        unknown=model.unknown,
+        start=model.start,
+        log_q=log_q,
+        log_r=log_r,
+        measured=index,
+        dt=model.dt,
+    )
 
 
 def _declare(system: str, model: StateSpaceModel, states, measured) -> Rig:

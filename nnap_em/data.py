@@ -89,7 +89,7 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
 
 
 def horizon(data: Dataset, samples: int) -> Dataset:
-    """The first `samples` samples of every sequence; the rest stays in place as padding, so that shapes do not change."""
+    """The first `samples` samples of every sequence; the rest stays as padding, so that shapes do not change."""
     seen = np.arange(data.t.shape[-1]) < samples
     return data._replace(valid=data.valid & np.broadcast_to(seen, data.valid.shape))
 

@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, horizon
-from .model import StateSpaceModel
+from .model import AbstractModel
 from .mstep import AbstractMStep, MStepInfo
 from .smoother import AbstractSmoother, Posterior
 
@@ -24,11 +23,11 @@ class EMState(NamedTuple):
     """Everything that is needed to go on: resuming from it gives the same numbers."""
 
     epoch: int
-    model: StateSpaceModel
+    model: AbstractModel
     """The model that the next epoch tries."""
-    best: StateSpaceModel
+    best: AbstractModel
     """The likeliest model so far at the present horizon."""
-    proposal: StateSpaceModel
+    proposal: AbstractModel
     """Where the M-step would go from `best`."""
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the M-step's weights at `best`."""
@@ -58,7 +57,7 @@ class Schedule(eqx.Module):
         return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
 
 
-def e_step(model: StateSpaceModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
     """Smooth every sequence of `data`."""
     keys = jax.random.split(key, data.t.shape[0])
     return jax.vmap(lambda seq, key: smoother(model, seq, key=key))(data, keys)
@@ -66,17 +65,20 @@ def e_step(model: StateSpaceModel, data: Dataset, smoother: AbstractSmoother, *,
 
 @eqx.filter_jit
 def em_step(
-    model: StateSpaceModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
-) -> tuple[StateSpaceModel, MStepInfo, Float[Array, " seq"]]:
+    model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
+) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"]]:
     """One E-step and one M-step."""
     posterior = e_step(model, data, smoother, key=key)
     model, info = m_step(model, posterior, data)
     return model, info, posterior.loglik
 
 
-def start_state(model: StateSpaceModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
+def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
     return EMState(0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0))
+
+
+SCHEDULE = Schedule()
 
 
 def fit(
@@ -86,7 +88,7 @@ def fit(
     m_step: AbstractMStep,
     *,
     epochs: int = 20,
-    schedule: Schedule = Schedule(),
+    schedule: Schedule = SCHEDULE,
     tolerance: float = 0.05,
     watch: Callable[[EMState, int, Bool[np.ndarray, " seq"]], None] = lambda state, seen, used: None,
 ) -> EMState:
@@ -108,8 +110,8 @@ def fit(
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
-                f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; check units, "
-                "signs and the start prior, or declare a wider one"
+                f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; "
+                "check units, signs and the start prior, or declare a wider one"
             )
         if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
             state = state._replace(top=np.full(used.size, -np.inf), stride=1.0)
@@ -118,7 +120,7 @@ def fit(
     return state
 
 
-def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik, used) -> EMState:
+def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EMState:
     """Accept the model that was tried, or go back to the best one and try a shorter way from there."""
     loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
     mean = float(np.mean(loglik[used]))
@@ -133,8 +135,10 @@ def _judge(state: EMState, proposal: StateSpaceModel, hessian, loglik, used) -> 
     return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
 
 
-def _settle_noise(model, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
-    """`model` with its process noise scaled by the likeliest of `scales`: how far its first motion is off is unknown."""
+def _settle_noise(
+    model: AbstractModel, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)
+):
+    """`model` with its process noise scaled by the likeliest of `scales`: nobody knows how far its motion is off."""
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
     for trial in trials:

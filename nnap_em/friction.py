@@ -86,6 +86,6 @@ class FixedFriction(eqx.Module):
         return self
 
 
-def NoFriction(scale: Float[Array, " dof"]) -> FixedFriction:  # noqa: N802  (names a map)
+def NoFriction(scale: Float[Array, " dof"]) -> FixedFriction:
     """A machine that is declared free of friction."""
     return FixedFriction(jnp.zeros_like, scale)

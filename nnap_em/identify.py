@@ -1,7 +1,7 @@
 """From a declared rig and its logs to a fitted model: the main job in one call."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .build import Problem, build
 from .data import Dataset
-from .em import EMState, Schedule, fit, start_state
+from .em import SCHEDULE, EMState, Schedule, fit, start_state
 from .model import StateSpaceModel
 from .mstep import ScoringMStep
 from .rig import Rig
@@ -30,7 +30,7 @@ class Identified(NamedTuple):
     @property
     def model(self) -> StateSpaceModel:
         """The likeliest model."""
-        return self.state.best
+        return cast(StateSpaceModel, self.state.best)
 
 
 class FrictionTable(NamedTuple):
@@ -63,11 +63,11 @@ def identify(
     key: PRNGKeyArray,
     smoother: Callable[[StartBank], AbstractSmoother] = CubatureSmoother,
     epochs: int = 20,
-    schedule: Schedule = Schedule(),
+    schedule: Schedule = SCHEDULE,
     start: Identified | None = None,
     watch: Watch = lambda state, seen, used: None,
 ) -> Identified:
-    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start` if given.
+    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start`.
 
     Raises FitError when no sequence can be followed.
     """

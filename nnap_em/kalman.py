@@ -58,6 +58,9 @@ class Tangent(eqx.Module):
         return Affine(matrix, value - matrix @ about.mean, jnp.zeros_like(matrix))
 
 
+TANGENT = Tangent()
+
+
 class Cubature(eqx.Module):
     """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square.
 
@@ -127,7 +130,7 @@ def ekf(
     y: Float[Array, "time obs"],
     observed: Bool[Array, "time obs"],
     active: Bool[Array, " time"],
-    linearise: Callable = Tangent(),
+    linearise: Callable = TANGENT,
 ) -> Filtered:
     """Extended Kalman filter: linearised about its own filtered states, by tangents or by cubature.
 

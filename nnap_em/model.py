@@ -1,5 +1,6 @@
 """The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k) + v_k."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
@@ -11,7 +12,30 @@ from .ode import integrate
 from .systems.base import AbstractSystem
 
 
-class StateSpaceModel(eqx.Module):
+class AbstractModel(eqx.Module):
+    """All that smoothers and EM ask of a model."""
+
+    start: eqx.AbstractVar[Gaussian]
+    """Prior of the state in the first row."""
+    log_q: eqx.AbstractVar[Float[Array, " state"]]
+    """Log of the process-noise variance per step."""
+    log_r: eqx.AbstractVar[Float[Array, " obs"]]
+    """Log of the measurement variance."""
+    measured: eqx.AbstractVar[tuple[int, ...]]
+    """Which states are read, in the order of y."""
+    dt: eqx.AbstractVar[float]
+    """Sample interval [s]."""
+
+    @abstractmethod
+    def transition(self, x: Float[Array, " state"], u: Float[Array, " input"]) -> Float[Array, " state"]:
+        """Mean of the state one sample later."""
+
+    @abstractmethod
+    def emission(self, x: Float[Array, " state"]) -> Float[Array, " obs"]:
+        """Mean of the reading."""
+
+
+class StateSpaceModel(AbstractModel):
     """Known physics with an unknown torque, observed through noise [paper, eqs. 6 to 8 and 16]."""
 
     system: AbstractSystem

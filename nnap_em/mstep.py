@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, spd_solve
-from .kalman import Cubature, Tangent, kalman_filter
-from .model import StateSpaceModel
+from .kalman import TANGENT, Cubature, Tangent, kalman_filter
+from .model import AbstractModel, StateSpaceModel
 from .smoother import Posterior, active_steps
 
 
@@ -67,18 +67,18 @@ def hats(nodes: Float[Array, " count"], v: Float[Array, ""]) -> Float[Array, " c
 
 
 def expand(
-    model,
+    model: StateSpaceModel,
     prior: ParameterPrior,
     nodes: Float[Array, "dof count"],
     posterior: Posterior,
     seq: Dataset,
-    linearise=Tangent(),
+    linearise: Tangent | Cubature = TANGENT,
 ) -> Quadratic:
     """The log-likelihood of one sequence to second order."""
     y, observed = fill_missing(seq.y)
     observed = observed & seq.valid[:, None]
-    active = active_steps(seq.valid)
-    dof, count = nodes.shape
+    active = active_steps(jnp.asarray(seq.valid))
+    dof = nodes.shape[0]
     path = posterior.state.mean
     value = prior.read(model.system)
     q, r = jnp.exp(model.log_q), jnp.exp(model.log_r)
@@ -243,7 +243,7 @@ class AbstractMStep(eqx.Module):
     """A rule for the next model, given the posterior of every sequence."""
 
     @abstractmethod
-    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[AbstractModel, MStepInfo]:
         """The next model."""
 
     @abstractmethod

@@ -1,7 +1,7 @@
 """One sample interval of an ordinary differential equation, through diffrax, differentiable forward and backward."""
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import diffrax
 import jax
@@ -17,8 +17,8 @@ class RK4(diffrax.AbstractERK):
     [Hairer, Norsett & Wanner 1993, table II.1.2]
     """
 
-    scan_kind: str | None = "bounded"
-    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
+    scan_kind: Literal["lax", "checkpointed", "bounded"] | None = "bounded"
+    tableau: ClassVar[diffrax.ButcherTableau | diffrax.MultiButcherTableau] = diffrax.ButcherTableau(
         a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
         b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
         b_error=np.zeros(4),

@@ -12,7 +12,7 @@ from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower
 from .identify import Identified, phi_samples
 from .mstep import hats
-from .smoother import AbstractSmoother, CubatureSmoother, Posterior
+from .smoother import CubatureSmoother, GaussianSmoother, Posterior
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
@@ -34,7 +34,7 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
 
 
 @eqx.filter_jit
-def _smooth(model, data: Dataset, smoother: AbstractSmoother) -> Posterior:
+def _smooth(model, data: Dataset, smoother: GaussianSmoother) -> Posterior:
     return jax.vmap(lambda seq: smoother(model, seq))(data)
 
 
@@ -81,7 +81,8 @@ def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key:
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:
     """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
 
-    Uncertainty of the present state, of the friction and parameters, and process noise are in it; measurement noise is not.
+    Uncertainty of the present state, of friction and parameters, and process noise are in it; measurement noise is
+    not.
     """
     known = given_samples(data, given)
     posterior = smooth(fitted, data._replace(valid=known))
@@ -94,7 +95,7 @@ def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArra
 def horizon_errors(
     prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = HORIZONS
 ) -> dict[str, list[float]]:
-    """Root mean square of prediction minus reading over (given, given + horizon], per measured column; NaN where no data."""
+    """RMS of prediction minus reading over (given, given + horizon], per measured column; NaN where no data."""
     y, observed = (np.asarray(a) for a in fill_missing(jnp.asarray(data.y)))
     since = np.asarray(data.t) - np.asarray(data.t)[:, :1] - given
     system = fitted.model.system

@@ -73,11 +73,11 @@ def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.
     system = Acrobot(**{k: a(v)[0] for k, v in {**Acrobot.optional, **table_i}.items()}, joints=drives)
     cov = jnp.diag(a(0.9, start_std, 0.02, 0.02) ** 2)
     return StateSpaceModel(
-        system,
-        paper_friction(dtype),
-        Gaussian(jnp.asarray([jnp.pi, 0.0, 0.0, 0.0], dtype), cov),
-        2 * jnp.log(a(q_std[0], q_std[0], q_std[1], q_std[1])),
-        2 * jnp.log(a(*r_std)),
+        system=system,
+        unknown=paper_friction(dtype),
+        start=Gaussian(jnp.asarray([jnp.pi, 0.0, 0.0, 0.0], dtype), cov),
+        log_q=2 * jnp.log(a(q_std[0], q_std[0], q_std[1], q_std[1])),
+        log_r=2 * jnp.log(a(*r_std)),
         measured=(0, 2),
         dt=0.01,
     )
@@ -141,11 +141,11 @@ def _one_joint(
 ) -> StateSpaceModel:
     """A machine with one joint, at rest on average, whose position is read."""
     return StateSpaceModel(
-        system,
-        friction,
-        Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2)),
-        2 * jnp.log(jnp.asarray(q_std)),
-        2 * jnp.log(jnp.asarray([r_std])),
+        system=system,
+        unknown=friction,
+        start=Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2)),
+        log_q=2 * jnp.log(jnp.asarray(q_std)),
+        log_r=2 * jnp.log(jnp.asarray([r_std])),
         measured=(0,),
         dt=0.01,
     )

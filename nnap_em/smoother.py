@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, cubature, lower
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, rts
+from .model import AbstractModel
 
 
 class Posterior(NamedTuple):
@@ -30,7 +31,7 @@ class AbstractSmoother(eqx.Module):
     """An E-step for one sequence."""
 
     @abstractmethod
-    def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray) -> Posterior:
+    def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray) -> Posterior:
         """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
 
 
@@ -77,24 +78,24 @@ class GaussianSmoother(AbstractSmoother):
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
 
-    def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
+    def path(self, model: AbstractModel, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
-        active = active_steps(seq.valid)
+        u, active = jnp.asarray(seq.u), active_steps(jnp.asarray(seq.valid))
         starts, log_weight = self.bank.hypotheses(model.start)
         head = self.window
 
-        def score(start):
-            return ekf(model, start, seq.u[:head], y[:head], observed[:head], active[:head], self.linearise).loglik
+        def loglik_from(start):
+            return ekf(model, start, u[:head], y[:head], observed[:head], active[:head], self.linearise).loglik
 
-        score = jax.vmap(score)(starts) + log_weight
+        score = jax.vmap(loglik_from)(starts) + log_weight
         best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
         start = jax.tree.map(lambda a: a[best], starts)
 
         def follow(inflation):
             loose = eqx.tree_at(lambda m: m.log_q, model, model.log_q + inflation)
-            filtered = ekf(loose, start, seq.u, y, observed, active, self.linearise)
+            filtered = ekf(loose, start, u, y, observed, active, self.linearise)
 
             def again(_, now):
                 return self.relinearise(model, now[1].state, seq)
@@ -106,14 +107,15 @@ class GaussianSmoother(AbstractSmoother):
         best = jnp.argmax(jnp.where(jnp.isfinite(loglik), loglik, -jnp.inf))
         return jax.tree.map(lambda a: a[best], tracks)
 
-    def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
+    def relinearise(self, model: AbstractModel, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""
         y, observed = fill_missing(seq.y)
         affine = jax.vmap(lambda state, u: self.linearise(model, state, u))(path, seq.u)
-        filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active_steps(seq.valid))
+        active = active_steps(jnp.asarray(seq.valid))
+        filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active)
         return filtered, rts(filtered)
 
-    def __call__(self, model, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
+    def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
         filtered, smoothed = self.path(model, seq)
         prev, following = pair_nodes(smoothed)
         affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
@@ -121,12 +123,12 @@ class GaussianSmoother(AbstractSmoother):
         return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik)
 
 
-def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:  # noqa: N802  (names a smoother)
+def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
     """The extended Kalman (tangent) filter with RTS smoother."""
     return GaussianSmoother(bank, Tangent(), **options)
 
 
-def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:  # noqa: N802
+def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:
     """The cubature (sigma-point) filter with RTS smoother."""
     return GaussianSmoother(bank, Cubature(), **options)
 

@@ -1,4 +1,4 @@
-"""Real rigs: theta2 smoothed from joint 1 alone, and predictions, on the test recordings: the table of docs/measured.md.
+"""Real rigs: theta2 smoothed from joint 1 alone, and predictions, on test recordings: the table of docs/measured.md.
 
     python benchmarks/measured.py [--data ../shared/data/measured] [rig ...]
 
@@ -92,10 +92,12 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}, "
-        f"jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
+        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
+        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
     )
-    print("| rig | theta2 smoothed, RMSE per test recording [rad] | 0.2 s theta1 / theta2 | 0.5 s theta1 / theta2 | plain refit 0.2 s; 0.5 s | left out of the fit | epochs, seconds |")
+    heads = ["rig", "theta2 smoothed, RMSE per test recording [rad]", "0.2 s theta1 / theta2", "0.5 s theta1 / theta2"]
+    heads += ["plain refit 0.2 s; 0.5 s", "left out of the fit", "epochs, seconds"]
+    print("| " + " | ".join(heads) + " |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in args.rigs:
         row = study(args.data / name, args.seed)

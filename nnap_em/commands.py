@@ -260,11 +260,12 @@ class _Watch:
         notes = {"settings": self.settings, "epochs": self.history}
         save(self.args.out / CHECKPOINT, fitted, fingerprint=self.mark, notes=notes)
         noise = [f"{name} {np.exp(0.5 * r):.3g}" for name, r in _readings(fitted) if name not in fitted.rig.noise_std]
+        sampled = f"  effective samples {state.ess:.0f}" if np.isfinite(state.ess) else ""
         self.say(
             f"epoch {state.epoch:3d} of {self.args.epochs}  horizon {epoch.horizon_s:.2f} s"
             f"  log-likelihood {epoch.log_likelihood:.2f} per sequence"
             f"  noise std {', '.join(noise) or 'as declared'}"
-            f"  left out {len(out)} of {len(used)}  {epoch.seconds:.1f} s"
+            f"{sampled}  left out {len(out)} of {len(used)}  {epoch.seconds:.1f} s"
         )
 
 

@@ -38,6 +38,8 @@ class EMState(NamedTuple):
     key: PRNGKeyArray
     loglik: Float[np.ndarray, " epoch"]
     """Mean log-likelihood of the sequences used, of every epoch so far."""
+    ess: float
+    """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
 
 
 class FitError(RuntimeError):
@@ -66,16 +68,18 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
 @eqx.filter_jit
 def em_step(
     model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
-) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"]]:
-    """One E-step and one M-step."""
+) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:
+    """One E-step and one M-step: the next model, the log-likelihoods of this one and the effective sample sizes."""
     posterior = e_step(model, data, smoother, key=key)
     model, info = m_step(model, posterior, data)
-    return model, info, posterior.loglik
+    return model, info, posterior.loglik, posterior.ess
 
 
 def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
-    return EMState(0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0))
+    return EMState(
+        0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), math.inf
+    )
 
 
 SCHEDULE = Schedule()
@@ -106,7 +110,7 @@ def fit(
         seen = schedule.horizon(state.epoch, longest)
         key = jax.random.fold_in(state.key, state.epoch)
         rule = m_step.early() if seen < longest else m_step
-        proposal, info, loglik = em_step(state.model, horizon(data, seen), smoother, rule, key)
+        proposal, info, loglik, ess = em_step(state.model, horizon(data, seen), smoother, rule, key)
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
@@ -116,6 +120,7 @@ def fit(
         if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
             state = state._replace(top=np.full(used.size, -np.inf), stride=1.0)
         state = _judge(state, proposal, info.hessian, np.asarray(loglik), used)
+        state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         watch(state, seen, used)
     return state
 
@@ -142,7 +147,7 @@ def _settle_noise(
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
     for trial in trials:
-        _, info, loglik = em_step(trial, data, smoother, m_step.early(), key)
+        _, info, loglik, _ = em_step(trial, data, smoother, m_step.early(), key)
         logliks.append(float(np.mean(np.asarray(loglik)[np.asarray(info.used)])) if np.any(info.used) else -math.inf)
     return trials[int(np.argmax(logliks))]
 

@@ -25,6 +25,8 @@ class Posterior(NamedTuple):
     excess: Float[Array, "*seq steps state state"]
     """Covariance of a kick beyond the process noise, where the smoother's transition is an approximation."""
     loglik: Float[Array, "*seq"]
+    ess: Float[Array, "*seq"]
+    """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
 
 
 class AbstractSmoother(eqx.Module):
@@ -78,7 +80,7 @@ class GaussianSmoother(AbstractSmoother):
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
 
-    def path(self, model: AbstractModel, seq: Dataset) -> tuple[Filtered, Smoothed]:
+    def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
@@ -107,7 +109,7 @@ class GaussianSmoother(AbstractSmoother):
         best = jnp.argmax(jnp.where(jnp.isfinite(loglik), loglik, -jnp.inf))
         return jax.tree.map(lambda a: a[best], tracks)
 
-    def relinearise(self, model: AbstractModel, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
+    def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""
         y, observed = fill_missing(seq.y)
         affine = jax.vmap(lambda state, u: self.linearise(model, state, u))(path, seq.u)
@@ -118,9 +120,10 @@ class GaussianSmoother(AbstractSmoother):
     def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
         filtered, smoothed = self.path(model, seq)
         prev, following = pair_nodes(smoothed)
+        endless = jnp.full_like(filtered.loglik, jnp.inf)
         affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
         kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
-        return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik)
+        return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:

@@ -189,6 +189,20 @@ def test_identify_writes_whole_results(bench, fit):
     assert report["versions"]["jax"] == jax.__version__
 
 
+def test_particles_identify_as_well(bench, fit, tmp_path):
+    """Two epochs with few particles, against the same epochs of the cubature smoother: the slide is almost linear."""
+    argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")
+    assert _run("identify", bench, "--out", tmp_path, *argv) == 0
+    assert _files(tmp_path) == _files(fit)
+    found, other = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, fit))
+    assert read(tmp_path / "model.npz").notes["settings"] == {"smoother": "particle", "particles": 50, "seed": 0}
+    assert found["left_out"] == []
+    # the same first model: within what `fit` allows for the noise of a stochastic smoother
+    assert found["log_likelihood"][0] == pytest.approx(other["log_likelihood"][0], abs=0.5)
+    assert found["log_likelihood"][1] > found["log_likelihood"][0] + 10
+    assert all(np.isfinite(values).all() for values in _read(tmp_path / "friction.csv").values())
+
+
 def test_the_learned_friction_is_the_true_one(bench, fit):
     learned = _read(fit / "friction.csv")
     assert list(learned) == ["joint", "velocity", "torque", "torque_std"]

@@ -1,0 +1,54 @@
+"""Logs of real machines: every shared rig gives a model and finite first E-step, one is identified."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nnap_em.build import build
+from nnap_em.data import Dataset, read_logs
+from nnap_em.em import e_step
+from nnap_em.identify import identify
+from nnap_em.rig import Rig, read_rig
+from nnap_em.smoother import ExtendedKalmanSmoother
+from nnap_em.systems import specs
+
+_e_step = eqx.filter_jit(e_step)
+
+
+def _read(folder: Path, sequences: int, rows: int) -> tuple[Rig, Dataset]:
+    """The head of the first training sequences."""
+    rig = read_rig(folder / "rig.toml", specs)
+    data = read_logs(folder / "train", rig).data
+    return rig, jax.tree.map(lambda a: jnp.asarray(a[:sequences, :rows]), data)
+
+
+def test_every_shared_rig_has_a_finite_first_e_step(shared):
+    folders = sorted(path.parent for path in (shared / "data").glob("*/*/rig.toml"))
+    assert folders
+    for folder in folders:
+        rig, data = _read(folder, 2, 100)
+        problem = build(rig, data, key=jax.random.key(0))
+        posterior = _e_step(problem.model, data, ExtendedKalmanSmoother(problem.bank), key=jax.random.key(1))
+        assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(posterior)), folder
+
+
+def test_a_measured_arm_is_identified(shared):
+    """The second joint is hidden; the fitted model explains the first one better than the first model does."""
+    rig, data = _read(shared / "data/measured/dfki_c1_joint1", 4, 60)
+    used = []
+    fitted = identify(
+        rig,
+        data,
+        key=jax.random.key(0),
+        smoother=ExtendedKalmanSmoother,
+        epochs=4,
+        watch=lambda state, seen, kept: used.append(kept),
+    )
+    loglik = fitted.state.loglik
+    assert len(loglik) == 4 and np.all(np.isfinite(loglik))
+    assert all(np.all(kept) for kept in used)
+    assert loglik.max() > loglik[0]
+    assert np.all(np.linalg.eigvalsh(np.asarray(fitted.state.hessian)) > 0)

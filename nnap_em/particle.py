@@ -413,5 +413,5 @@ class ParticleSmoother(AbstractSmoother):
         e = x - mean[:, None]
         cov = jnp.swapaxes(e, 1, 2) @ e / jnp.asarray(self.num_paths, e.dtype)
         inside = jnp.concatenate([jnp.ones(1, bool), history.active[:-1]])
-        ess = (jnp.sum(jnp.where(inside, history.ess, 0.0)) / jnp.sum(inside)).astype(history.loglik.dtype)
+        ess = jnp.mean(history.ess, where=inside).astype(history.loglik.dtype)
         return Posterior(Gaussian(mean, cov), x[:-1], x[1:], kick, jnp.zeros_like(cov[1:]), history.loglik, ess)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 class RK4(diffrax.AbstractERK):
     """Kutta's classical fourth-order method as a diffrax solver.
 
-    `scan_kind="lax"` lets `jax.jacfwd` and `jax.grad` both pass through a step.
+    `scan_kind="bounded"` lets `jax.jacfwd` and `jax.grad` both pass through a step.
     [Hairer, Norsett & Wanner 1993, table II.1.2]
     """
 

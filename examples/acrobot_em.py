@@ -255,7 +255,7 @@ def make_table(trained: list[Trained], truth, bank: StartBank, train: Experiment
         f"Predictions start after {GIVEN:g} s of readings; RMS over the horizon, median of {e.test} sequences.",
         "A data-driven model has no θ₂ of its own: its latent space is not unique.",
         f"{e.train} training sequences of {e.steps} samples.  Times include compilation.",
-        f"Particles / paths: {e.particles} / {e.paths} (hybrid), {e.network_particles} / {e.network_paths} (data-driven)."
+        f"Particles / paths: {e.particles} / {e.paths} (hybrid), {e.network_particles} / {e.network_paths} (network)."
         if e.particle_models
         else "Particle smoothers are left out.",
     )

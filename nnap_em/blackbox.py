@@ -48,7 +48,7 @@ class NetworkModel(AbstractModel):
         """Mean of the state one sample later."""
         return x + self.step * self.mlp((jnp.concatenate([x, u]) - self.centre) / self.spread)
 
-    def emission(self, x: Float[Array, " state"]) -> Float[Array, " obs"]:
+    def emission(self, x: Float[Array, " state"], u: Float[Array, " input"] | None = None) -> Float[Array, " obs"]:
         """Mean of the reading."""
         return jnp.stack([x[i] for i in self.measured])
 

@@ -29,7 +29,7 @@ from .identify import FrictionTable, Identified, begin, friction_table, identify
 from .law import PARAMETERS, UNITS, describe, fit_law
 from .model import StateSpaceModel
 from .particle import ParticleSmoother
-from .predict import HORIZONS, horizon_errors, predict, smooth
+from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .rig import Declared, Rig, RigError, nearest, read_rig, replace_text, write_rig
 from .rig import _unit as unit
 from .simulate import Experiment, examples, sweep_experiment
@@ -152,7 +152,7 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after all readings of the sequence."""
     fitted = read(_model_file(args.model)).fitted
     logs = read_logs(args.folder, fitted.rig)
-    state = smooth(fitted, logs.data).state
+    state = smoothed_states(fitted, logs.data)
     std = np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     _write_states(args.out, logs, fitted, np.asarray(state.mean), std)
     say(f"wrote {len(logs.files)} files to {args.out}")

@@ -111,5 +111,5 @@ def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
         return {}
     cov = jnp.linalg.inv(fitted.state.hessian)[-len(prior.names) :, -len(prior.names) :]
     std = prior.std * jnp.sqrt(jnp.diag(cov))
-    value = prior.mean + prior.std * prior.read(fitted.model.system)
-    return {n: (float(v), float(s)) for n, v, s in zip(prior.names, value, std, strict=True)}
+    value = prior.mean + prior.std * prior.read(fitted.model)
+    return {n: (float(v), float(s)) for n, v, s in zip(prior.names, value, std, strict=True) if "." not in n}

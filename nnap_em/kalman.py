@@ -25,6 +25,13 @@ class Affine(NamedTuple):
     """Covariance of what the affine map leaves out of the transition; 0 for a tangent."""
 
 
+class Reading(NamedTuple):
+    """y_k = rows x_k + offset + noise, for every row of a sequence."""
+
+    rows: Float[Array, "*time obs state"]
+    offset: Float[Array, "*time obs"]
+
+
 class Filtered(NamedTuple):
     """p(x_k | y_{0:k}), its one-step prediction and the innovations, whitened one reading at a time."""
 
@@ -36,6 +43,7 @@ class Filtered(NamedTuple):
     """Log innovation variance; 0 where not measured."""
     gain: Float[Array, "*time obs state"]
     affine: Affine
+    reading: Reading
     loglik: Float[Array, ""]
 
 
@@ -80,15 +88,27 @@ class Cubature(eqx.Module):
         return Affine(matrix, mean - matrix @ about.mean, noise)
 
 
-def _condition(state: Gaussian, rows, r, y, observed):
-    """Absorb readings one at a time: y_i = rows_i x + noise of variance r_i."""
+def linear_reading(model, x: Float[Array, " state"], u: Float[Array, " input"]) -> Reading:
+    """The emission linearised at x."""
+
+    def both(x):
+        y = model.emission(x, u)
+        return y, y
+
+    rows, value = jax.jacfwd(both, has_aux=True)(x)
+    return Reading(rows, value - rows @ x)
+
+
+def _condition(state: Gaussian, reading: Reading, r, y, observed):
+    """Absorb readings one at a time: y_i = rows_i x + offset_i + noise of variance r_i."""
     mean, cov = state
+    rows = reading.rows
     whitened, log_variance, gains = [], [], []
     for i in range(y.shape[0]):
         pc = cov @ rows[i]
         s = rows[i] @ pc + r[i]
         gain = jnp.where(observed[i], pc / s, 0.0)
-        e = y[i] - rows[i] @ mean
+        e = y[i] - reading.offset[i] - rows[i] @ mean
         mean = mean + gain * e
         cov = cov - gain[:, None] * pc[None, :]
         whitened.append(jnp.where(observed[i], e / jnp.sqrt(s), 0.0))
@@ -97,30 +117,34 @@ def _condition(state: Gaussian, rows, r, y, observed):
     return Gaussian(mean, symmetric(cov)), jnp.stack(whitened), jnp.stack(log_variance), jnp.stack(gains)
 
 
-def _filter(model, start: Gaussian, y, observed, active, inputs, affine_at) -> Filtered:
-    """Kalman recursion; `affine_at(state, input)` gives the transition that follows a filtered state."""
-    q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
-    rows = jax.jacfwd(model.emission)(start.mean)
+def _filter(log_q, log_r, start: Gaussian, y, observed, active, inputs, affine_at, reading_at) -> Filtered:
+    """Kalman recursion.
+
+    `affine_at(state, input)` gives the transition that follows a filtered state, `reading_at(mean, input)` the
+    emission at a predicted mean.
+    """
+    q, r = jnp.diag(jnp.exp(log_q)), jnp.exp(log_r)
     stay = jnp.eye(start.mean.shape[0], dtype=start.mean.dtype)
     rest = Affine(stay, jnp.zeros_like(start.mean), jnp.zeros_like(stay))
 
     def step(predicted, slices):
         y, observed, active, inputs = slices
-        state, whitened, log_variance, gain = _condition(predicted, rows, r, y, observed)
+        reading = reading_at(predicted.mean, inputs)
+        state, whitened, log_variance, gain = _condition(predicted, reading, r, y, observed)
         affine = affine_at(state, inputs)
         affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
         following = Gaussian(
             affine.matrix @ state.mean + affine.offset,
             symmetric(affine.matrix @ state.cov @ affine.matrix.T) + affine.noise + jnp.where(active, q, 0.0),
         )
-        return following, (state, predicted, whitened, log_variance, gain, affine)
+        return following, (state, predicted, whitened, log_variance, gain, affine, reading)
 
-    _, (state, predicted, whitened, log_variance, gain, affine) = jax.lax.scan(
+    _, (state, predicted, whitened, log_variance, gain, affine, reading) = jax.lax.scan(
         step, start, (y, observed, active, inputs)
     )
     count = jnp.sum(observed).astype(whitened.dtype)
     loglik = -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi))
-    return Filtered(state, predicted, whitened, log_variance, gain, affine, loglik)
+    return Filtered(state, predicted, whitened, log_variance, gain, affine, reading, loglik)
 
 
 def ekf(
@@ -137,19 +161,41 @@ def ekf(
     Entries of y that are not `observed` may hold anything finite.  The state rests over steps that are not `active`
     (padding); the last affine map leads out of the data.
     """
-    return _filter(model, start, y, observed, active, u, lambda state, u: linearise(model, state, u))
+    return _filter(
+        model.log_q,
+        model.log_r,
+        start,
+        y,
+        observed,
+        active,
+        u,
+        lambda state, u: linearise(model, state, u),
+        lambda mean, u: linear_reading(model, mean, u),
+    )
 
 
 def kalman_filter(
-    model,
+    log_q: Float[Array, " state"],
+    log_r: Float[Array, " obs"],
     start: Gaussian,
     affine: Affine,
+    reading: Reading,
     y: Float[Array, "time obs"],
     observed: Bool[Array, "time obs"],
     active: Bool[Array, " time"],
 ) -> Filtered:
     """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
-    return _filter(model, start, y, observed, active, affine, lambda state, affine: affine)
+    return _filter(
+        log_q,
+        log_r,
+        start,
+        y,
+        observed,
+        active,
+        (affine, reading),
+        lambda state, given: given[0],
+        lambda mean, given: given[1],
+    )
 
 
 def rts(filtered: Filtered) -> Smoothed:

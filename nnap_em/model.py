@@ -4,9 +4,12 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .data import Dataset
+from .effects.base import AbstractEffect, Scene
 from .gaussian import Gaussian, spd_solve
 from .ode import integrate
 from .systems.base import AbstractSystem
@@ -28,15 +31,22 @@ class AbstractModel(eqx.Module):
 
     @abstractmethod
     def transition(self, x: Float[Array, " state"], u: Float[Array, " input"]) -> Float[Array, " state"]:
-        """Mean of the state one sample later."""
+        """Mean of the state one sample later; `u` is a row of `inputs`."""
 
     @abstractmethod
-    def emission(self, x: Float[Array, " state"]) -> Float[Array, " obs"]:
-        """Mean of the reading."""
+    def emission(self, x: Float[Array, " state"], u: Float[Array, " input"] | None = None) -> Float[Array, " obs"]:
+        """Mean of the reading; `u` is a row of `inputs`."""
+
+    def inputs(self, seq: Dataset) -> Float[Array, "time input"]:
+        """What acts from outside in every row."""
+        return jnp.asarray(seq.u)
 
 
 class StateSpaceModel(AbstractModel):
-    """Known physics with an unknown torque, observed through noise [paper, eqs. 6 to 8 and 16]."""
+    """Known physics with an unknown torque, observed through noise [paper, eqs. 6 to 8 and 16].
+
+    The state is (q, v), then the memory of the effects in their order.
+    """
 
     system: AbstractSystem
     unknown: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
@@ -52,22 +62,103 @@ class StateSpaceModel(AbstractModel):
     dt: float = eqx.field(static=True)
     """Sample interval [s]."""
     substeps: int = eqx.field(static=True, default=2)
+    effects: tuple[AbstractEffect, ...] = ()
+    """What the declared physics lacks."""
+
+    def inputs(self, seq: Dataset) -> Float[Array, "time input"]:
+        """The inputs; with effects: what reaches the joints, the time [s], and what reached them one row before."""
+        if not self.effects:
+            return jnp.asarray(seq.u)
+        u = jnp.asarray(seq.u)
+        for effect in self.effects:
+            if effect.joint in self.system.joints:
+                i = self.system.joints.index(effect.joint)
+                u = u.at[:, i].set(effect.input(u[:, i], self.dt))
+        before = jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]])
+        return jnp.concatenate([u, jnp.asarray(seq.t)[:, None], before], axis=1)
 
     def rate(
         self, x: Float[Array, " state"], u: Float[Array, " input"], force: Float[Array, " dof"]
     ) -> Float[Array, " state"]:
         """Time derivative of the state under inputs u and an extra generalised force [N m]."""
-        q, v = jnp.split(x, 2)
-        total = self.system.drive(u) + self.unknown(v) + force - self.system.bias(q, v)
-        return jnp.concatenate([v, spd_solve(self.system.mass(q), total)])
+        dof, drives = force.shape[0], len(self.system.joints)
+        q, v, memory = x[:dof], x[dof : 2 * dof], x[2 * dof :]
+        time = u[drives] if self.effects else jnp.zeros((), x.dtype)
+        system = self.system
+        for effect in self.effects:
+            system = effect.physics(system, time)
+        torque = self.unknown(v)
+        scene = Scene(system, q, v, system.drive(u[:drives]), time, torque, self.unknown)
+        rates, place = [v], 2 * dof
+        total = scene.drive + force - system.bias(q, v)
+        rest = []
+        for effect in self.effects:
+            own = memory[place - 2 * dof : place - 2 * dof + effect.memory]
+            torque = effect.friction(torque, scene)
+            total = total + effect.force(scene, own)
+            rest.append(effect.drift(scene, own))
+            place += effect.memory
+        rates.append(spd_solve(system.mass(q), total + torque))
+        return jnp.concatenate(rates + rest)
 
     def transition(
         self, x: Float[Array, " state"], u: Float[Array, " input"], force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " state"]:
         """Mean of the state one sample later."""
-        extra = jnp.zeros(x.shape[0] // 2, x.dtype) if force is None else force
-        return integrate(lambda x: self.rate(x, u, extra), x, self.dt, self.substeps)
+        extra = jnp.zeros(len(self.system.coordinates), x.dtype) if force is None else force
+        return integrate(lambda x: self.rate(x, u, extra), x, self.dt, self.steps)
 
-    def emission(self, x: Float[Array, " state"]) -> Float[Array, " obs"]:
+    @property
+    def steps(self) -> int:
+        """Integration steps of one sample, as many as the stiffest effect asks for."""
+        return max([self.substeps, *(effect.substeps for effect in self.effects)])
+
+    def readable(self, x: Float[Array, " state"], u: Float[Array, " input"] | None = None) -> Float[Array, " readable"]:
+        """What sensors on all coordinates and rates would read without noise."""
+        names = self.system.coordinates + self.system.rates
+        r = x[: len(names)]
+
+        def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
+            """The state `delay` [s] ago, by one backward step under the inputs of the row before."""
+            assert u is not None
+            drives = len(self.system.joints)
+            before = jnp.concatenate([u[drives + 1 :], u[drives:]])
+            still = jnp.zeros(len(self.system.coordinates), x.dtype)
+            return integrate(lambda x: -delay * self.rate(x, before, still), x, 1.0, 1)[: len(names)]
+
+        for effect in self.effects:
+            for i, name in enumerate(names):
+                if effect.channel in (name, "all"):
+                    r = r.at[i].set(effect.reading(r[i], lambda delay, i=i: past(delay)[i]))
+        return r
+
+    def shown(self, x: Float[Array, " state"], u: Float[Array, " input"] | None = None) -> Float[Array, " readable"]:
+        """Coordinates and rates; those that are measured as their sensors read them."""
+        r = self.readable(x, u)
+        return jnp.stack([r[i] if i in self.measured else x[i] for i in range(r.shape[0])])
+
+    def emission(self, x: Float[Array, " state"], u: Float[Array, " input"] | None = None) -> Float[Array, " obs"]:
         """Mean of the reading."""
-        return jnp.stack([x[i] for i in self.measured])
+        r = self.readable(x, u)
+        return jnp.stack([r[i] for i in self.measured])
+
+
+def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) -> StateSpaceModel:
+    """`model` with other effects: memory states are dropped or begin at rest."""
+    dof = len(model.system.coordinates)
+    spread = [effect.memory_scale() for effect in effects if effect.memory]
+    wide = jnp.concatenate([jnp.ones(0, model.log_q.dtype), *spread])
+    mean = jnp.concatenate([model.start.mean[: 2 * dof], jnp.zeros_like(wide)])
+    cov = jax.scipy.linalg.block_diag(model.start.cov[: 2 * dof, : 2 * dof], jnp.diag((0.1 * wide) ** 2))
+    log_q = jnp.concatenate([model.log_q[: 2 * dof], 2 * jnp.log(1e-3 * wide)])
+    return StateSpaceModel(
+        model.system,
+        model.unknown,
+        Gaussian(mean, cov),
+        log_q,
+        model.log_r,
+        model.measured,
+        model.dt,
+        model.substeps,
+        effects,
+    )

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, spd_solve
-from .kalman import TANGENT, Cubature, Tangent, kalman_filter
+from .kalman import TANGENT, Affine, Cubature, Filtered, Reading, Tangent, kalman_filter, linear_reading
 from .model import AbstractModel, StateSpaceModel
 from .smoother import Posterior, active_steps
 
@@ -30,21 +30,27 @@ class ParameterPrior(eqx.Module):
     """Physical parameters to be estimated, with the owner's belief; estimated in its standard deviations."""
 
     names: tuple[str, ...] = eqx.field(static=True)
+    """Of the system, "m2", or of an effect by its place, "0.k"."""
     mean: Float[Array, " param"]
     std: Float[Array, " param"]
 
-    def read(self, system) -> Float[Array, " param"]:
-        """The system's values as (value - mean) / std."""
+    def places(self, model) -> list:
+        """The parameters in the model."""
+        pairs = [name.rpartition(".") for name in self.names]
+        return [getattr(model.effects[int(at)] if at else model.system, name) for at, _, name in pairs]
+
+    def read(self, model) -> Float[Array, " param"]:
+        """The model's values as (value - mean) / std."""
         if not self.names:
             return self.mean
-        return (jnp.stack([getattr(system, n) for n in self.names]) - self.mean) / self.std
+        return (jnp.stack(self.places(model)) - self.mean) / self.std
 
     def write(self, model, z: Float[Array, " param"]):
         """The model with values mean + std z."""
         if not self.names:
             return model
         values = self.mean + self.std * z
-        return eqx.tree_at(lambda m: [getattr(m.system, n) for n in self.names], model, list(values))
+        return eqx.tree_at(self.places, model, list(values))
 
 
 class Quadratic(NamedTuple):
@@ -66,6 +72,70 @@ def hats(nodes: Float[Array, " count"], v: Float[Array, ""]) -> Float[Array, " c
     return rise - fall
 
 
+class Local(NamedTuple):
+    """A model along a path: all that depends on its structure."""
+
+    affine: Affine
+    reading: Reading
+    by_force: Float[Array, "*time state dof"]
+    """Sensitivity of the next state to a force held over the step."""
+    by_parameter: Float[Array, "*time state param"]
+    reading_by_parameter: Float[Array, "*time obs param"]
+
+
+def local(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, linearise: Tangent | Cubature = TANGENT
+) -> Local:
+    """The model of one sequence, linearised about the Gaussians of `path`, and its sensitivities at their means."""
+    value = prior.read(model)
+    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
+    u = model.inputs(seq)
+    by_input = jax.jacfwd(lambda p: prior.write(model, p).inputs(seq))(value)
+
+    def tangents(x, u, slope):
+        def both(force, p, u):
+            now = prior.write(model, p)
+            return now.transition(x, u, force), now.emission(x, u)
+
+        moved, read = jax.jacfwd(both, argnums=(0, 1, 2))(still, value, u)
+        return moved[0], moved[1] + moved[2] @ slope, read[1] + read[2] @ slope
+
+    affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, u)
+    reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, u)
+    return Local(affine, reading, *jax.vmap(tangents)(path.mean, u, by_input))
+
+
+def whitened_sensitivities(
+    filtered: Filtered,
+    columns: Float[Array, "time state column"],
+    readings: Float[Array, "time obs column"],
+    observed: Bool[Array, "time obs"],
+) -> Float[Array, "time obs column"]:
+    """Sensitivity of the whitened readings to what moves the next state by `columns` and the reading by `readings`."""
+
+    def step(s, slices):
+        matrix, rows, columns, readings, gain, log_variance, observed = slices
+        out = []
+        for i in range(rows.shape[0]):
+            j = rows[i] @ s + readings[i]
+            out.append(jnp.where(observed[i], j * jnp.exp(-0.5 * log_variance[i]), 0.0))
+            s = s - gain[i][:, None] * j[None, :]
+        return matrix @ s + columns, jnp.stack(out)
+
+    f = filtered
+    slices = (f.affine.matrix, f.reading.rows, columns, readings, f.gain, f.log_variance, observed)
+    return jax.lax.scan(step, jnp.zeros_like(columns[0]), slices)[1]
+
+
+def friction_columns(
+    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], by_force: Float[Array, "state dof"]
+) -> tuple[Float[Array, "state phi"], Float[Array, "node dof count"]]:
+    """Sensitivity of the next state to the torques at the nodes, and the weights of the nodes."""
+    weights = jax.vmap(jax.vmap(hats), in_axes=(None, 0))(nodes, speed)
+    mean = jnp.mean(weights, axis=0)
+    return (by_force[:, :, None] * mean[None]).reshape(by_force.shape[0], -1), weights
+
+
 def expand(
     model: StateSpaceModel,
     prior: ParameterPrior,
@@ -75,72 +145,68 @@ def expand(
     linearise: Tangent | Cubature = TANGENT,
 ) -> Quadratic:
     """The log-likelihood of one sequence to second order."""
+    here = local(model, prior, posterior.state, seq, linearise)
+    nodes_now = jnp.concatenate([posterior.prev, posterior.next[-1:]])
+    read = jax.vmap(jax.vmap(model.emission, in_axes=(0, None)))(nodes_now, model.inputs(seq))
+    return quadratic(model.log_q, model.log_r, model.start, here, nodes, posterior, read, seq)
+
+
+def quadratic(
+    log_q: Float[Array, " state"],
+    log_r: Float[Array, " obs"],
+    start: Gaussian,
+    here: Local,
+    nodes: Float[Array, "dof count"],
+    posterior: Posterior,
+    read: Float[Array, "time node obs"],
+    seq: Dataset,
+) -> Quadratic:
+    """`expand` from the local model alone: the same program for every structure of the same size."""
     y, observed = fill_missing(seq.y)
     observed = observed & seq.valid[:, None]
     active = active_steps(jnp.asarray(seq.valid))
     dof = nodes.shape[0]
-    path = posterior.state.mean
-    value = prior.read(model.system)
-    q, r = jnp.exp(model.log_q), jnp.exp(model.log_r)
-
-    def tangents(x, u):
-        zero = jnp.zeros(dof, x.dtype)
-        return jax.jacfwd(lambda force, p: prior.write(model, p).transition(x, u, force), argnums=(0, 1))(zero, value)
-
-    affine = jax.vmap(lambda state, u: linearise(model, state, u))(posterior.state, seq.u)
-    by_force, by_parameter = jax.vmap(tangents)(path, seq.u)
+    q, r = jnp.exp(log_q), jnp.exp(log_r)
 
     def columns(prev, following, kick, excess, by_force, by_parameter):
         """Mean sensitivity of x_{k+1} to phi, and expected score, over the nodes of one step."""
-        speed = 0.5 * (prev + following - kick)[:, dof:]  # half the kick would count as signal
-        weights = jax.vmap(jax.vmap(hats), in_axes=(None, 0))(nodes, speed)  # node dof count
+        speed = 0.5 * (prev + following - kick)[:, dof : 2 * dof]  # half the kick would count as signal
+        sensitivity, weights = friction_columns(nodes, speed, by_force)
         push = spd_solve(jnp.diag(q) + excess, kick.T).T
         pull = push @ by_force  # node dof
         score = jnp.mean(pull[:, :, None] * weights, axis=0).ravel()
         score = jnp.concatenate([score, jnp.mean(push, axis=0) @ by_parameter])
         expected = jnp.diag(spd_solve(jnp.diag(q) + excess, jnp.eye(q.shape[0], dtype=q.dtype)))
         square = 0.5 * q * (jnp.mean(push**2, axis=0) - expected)
-        sensitivity = (by_force[:, :, None] * jnp.mean(weights, axis=0)[None]).reshape(kick.shape[1], -1)
         return jnp.concatenate([sensitivity, by_parameter], axis=1), score, square
 
     sensitivity, score, square = jax.vmap(columns)(
-        posterior.prev, posterior.next, posterior.kick, posterior.excess, by_force[:-1], by_parameter[:-1]
+        posterior.prev, posterior.next, posterior.kick, posterior.excess, here.by_force[:-1], here.by_parameter[:-1]
     )
     inside = active[:-1]
     score = jnp.sum(jnp.where(inside[:, None], score, 0.0), axis=0)
     score_q = jnp.sum(jnp.where(inside[:, None], square, 0.0), axis=0)
-    read = jax.vmap(model.emission)
-    nodes_now = jnp.concatenate([posterior.prev, posterior.next[-1:]])
-    misfit = jnp.mean((y[:, None] - jax.vmap(read)(nodes_now)) ** 2, axis=1)
+    miss = y[:, None] - read
+    misfit = jnp.mean(miss**2, axis=1)
     score_r = 0.5 * jnp.sum(jnp.where(observed, misfit / r[None] - 1.0, 0.0), axis=0)
+    weighed = jnp.where(observed, jnp.mean(miss, axis=1) / r[None], 0.0)
+    params = here.by_parameter.shape[-1]
+    of_readings = jnp.einsum("to,top->p", weighed, here.reading_by_parameter)
+    score = score + jnp.concatenate([jnp.zeros(score.shape[0] - params, score.dtype), of_readings])
 
     def noise_filter(log_q, log_r):
-        noisy = eqx.tree_at(lambda m: (m.log_q, m.log_r), model, (log_q, log_r))
-        filtered = kalman_filter(noisy, model.start, affine, y, observed, active)
+        filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
         return (filtered.innovation, filtered.log_variance), filtered
 
-    (jac_e, jac_s), filtered = jax.jacfwd(noise_filter, argnums=(0, 1), has_aux=True)(model.log_q, model.log_r)
+    (jac_e, jac_s), filtered = jax.jacfwd(noise_filter, argnums=(0, 1), has_aux=True)(log_q, log_r)
     jac_e, jac_s = (jnp.concatenate(j, axis=-1).reshape(-1, q.shape[0] + r.shape[0]) for j in (jac_e, jac_s))
     jac_e = jac_e + 0.5 * filtered.innovation.reshape(-1, 1) * jac_s
     noise_information = jac_e.T @ jac_e + 0.5 * jac_s.T @ jac_s
 
-    rows = jax.jacfwd(model.emission)(path[0])
-
-    def step(s, slices):
-        matrix, columns, gain, log_variance, observed = slices
-        out = []
-        for i in range(rows.shape[0]):
-            j = rows[i] @ s
-            out.append(jnp.where(observed[i], j * jnp.exp(-0.5 * log_variance[i]), 0.0))
-            s = s - gain[i][:, None] * j[None, :]
-        return matrix @ s + columns, jnp.stack(out)
-
     padded = jnp.concatenate([jnp.where(inside[:, None, None], sensitivity, 0.0), jnp.zeros_like(sensitivity[:1])])
-    _, jac = jax.lax.scan(
-        step,
-        jnp.zeros_like(sensitivity[0]),
-        (filtered.affine.matrix, padded, filtered.gain, filtered.log_variance, observed),
-    )
+    of_torque = jnp.zeros((*misfit.shape, sensitivity.shape[-1] - params), misfit.dtype)
+    readings = jnp.concatenate([of_torque, here.reading_by_parameter], axis=-1)
+    jac = whitened_sensitivities(filtered, padded, readings, observed)
     jac = jac.reshape(-1, jac.shape[-1])
     return Quadratic(score, jac.T @ jac, jnp.concatenate([score_q, score_r]), noise_information)
 
@@ -158,7 +224,7 @@ class Weights(eqx.Module):
     """Prior standard deviation [N m] of the even part of a friction map, its mean over the nodes."""
 
     def read(self, model) -> Float[Array, " weight"]:
-        return jnp.concatenate([model.unknown.weights(), self.prior.read(model.system)])
+        return jnp.concatenate([model.unknown.weights(), self.prior.read(model)])
 
     def write(self, model, w: Float[Array, " weight"]):
         cut = w.shape[0] - len(self.prior.names)
@@ -308,26 +374,25 @@ class ScoringMStep(AbstractMStep):
         w = weights.fit(model, total.score, total.information, self.iterations)
         hessian, _ = weights.hessian(model, weights.read(model), total.information + weights.symmetry())
         fitted = weights.write(model, w)
-        log_q, log_r = self._noise(model, total)
+        log_q, log_r = self._noise(model, total, weights.nodes.shape[0])
         start = self._start(model.start, jax.tree.map(lambda a: pick(a[:, 0]), posterior.state), used)
         fitted = eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, (log_q, log_r, start))
         return fitted, MStepInfo(hessian, used)
 
-    def _noise(self, model, total: Quadratic):
+    def _noise(self, model, total: Quadratic, dof: int):
         info = total.noise_information
-        learn = jnp.asarray([True] * model.log_q.shape[0] + list(self.learn_r))
+        learn = jnp.asarray([i < 2 * dof for i in range(model.log_q.shape[0])] + list(self.learn_r))
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
         n = model.log_q.shape[0]
-        hold = jnp.zeros_like(info).at[:n, :n].set(self._hold(n))
+        hold = jnp.zeros_like(info).at[: 2 * dof, : 2 * dof].set(self._hold(dof))
         off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
         step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
         step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
         return model.log_q + step[:n], model.log_r + step[n:]
 
-    def _hold(self, n: int) -> Float[Array, "state state"]:
+    def _hold(self, dof: int) -> Float[Array, "state state"]:
         """Prior precision of the log process noises: kicks act on rates, and reach angles over one step."""
-        dof = n // 2
         rate = jnp.eye(dof)
         angle = jnp.concatenate([rate, -rate], axis=1)
         ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)

@@ -84,9 +84,10 @@ def _readings(model, seq: Dataset, path: Float[Array, "time state"]) -> _Reading
     """C'R^-1 C and C'R^-1 (y - g(path)), in units of the process noise."""
     y, observed = fill_missing(seq.y)
     weight = jnp.where(observed & seq.valid[:, None], jnp.exp(-model.log_r)[None], 0.0)
-    rows = jax.vmap(jax.jacfwd(model.emission))(path) * jnp.exp(0.5 * model.log_q)[None, None]
+    u = model.inputs(seq)
+    rows = jax.vmap(jax.jacfwd(model.emission))(path, u) * jnp.exp(0.5 * model.log_q)[None, None]
     pull = jnp.swapaxes(rows * weight[..., None], -1, -2)
-    misfit = y - jax.vmap(model.emission)(path)
+    misfit = y - jax.vmap(model.emission)(path, u)
     return _Readings(pull @ rows, jnp.squeeze(pull @ misfit[..., None], -1))
 
 
@@ -229,12 +230,12 @@ def particle_filter(
         (model.start.mean - origin[0].astype(exact)) / scale, model.start.cov / (scale[:, None] * scale[None, :])
     )
     steps = _cast(_prepare(potentials, start), dtype)
-    model, scale_, u, y = _cast((model, scale, seq.u, y), dtype)
+    model, scale_, u, y = _cast((model, scale, model.inputs(seq), y), dtype)
     r = jnp.exp(model.log_r)
     size = jnp.asarray(num_particles, dtype)
 
-    def log_g(x, y, observed):
-        e = y[:, None] - jax.vmap(model.emission, in_axes=1, out_axes=1)(x)
+    def log_g(x, u, y, observed):
+        e = y[:, None] - jax.vmap(model.emission, in_axes=(1, None), out_axes=1)(x, u)
         terms = -0.5 * (e**2 / r[:, None] + model.log_r[:, None] + math.log(2 * math.pi))
         return jnp.sum(jnp.where(observed[:, None], terms, 0.0), axis=0)
 
@@ -254,7 +255,7 @@ def particle_filter(
         f = jnp.where(leave, (f - origin_next[:, None]) / scale_[:, None], x)
         log_ahead, pull = following.look(f)
         log_ahead = jnp.where(leave, log_ahead, 0.0)
-        filtered = jnp.where(resample, -jnp.log(size), log_w) + log_g(state, y, observed) - now.log_psi(x)
+        filtered = jnp.where(resample, -jnp.log(size), log_w) + log_g(state, u, y, observed) - now.log_psi(x)
         grown = filtered + log_ahead
         total = jax.nn.logsumexp(grown)
         log_w = jnp.where(arrive, grown - total, log_w)

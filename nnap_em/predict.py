@@ -19,7 +19,10 @@ HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Prediction(NamedTuple):
-    """Mean and standard deviation of the noise-free state, for every row of the data."""
+    """Mean and standard deviation of the noise-free state, for every row of the data.
+
+    What is measured is as its sensor would read it: with a biased sensor the bias is in.
+    """
 
     mean: Float[Array, "seq time state"]
     std: Float[Array, "seq time state"]
@@ -43,19 +46,36 @@ def smooth(fitted: Identified, data: Dataset) -> Posterior:
     return _smooth(fitted.model, data, CubatureSmoother(fitted.bank, inflations=(1.0, 10.0, 100.0)))
 
 
+def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
+    """Smoothed states of one sequence as `model.shown` has them."""
+
+    def one(mean, cov, u):
+        rows = jax.jacfwd(model.shown)(mean, u)
+        return Gaussian(model.shown(mean, u), rows @ cov @ rows.T)
+
+    return jax.vmap(one)(state.mean, state.cov, model.inputs(seq))
+
+
+@eqx.filter_jit
+def _shown(model, state: Gaussian, data: Dataset) -> Gaussian:
+    return jax.vmap(lambda state, seq: show(model, state, seq))(state, data)
+
+
 @eqx.filter_jit
 def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key: PRNGKeyArray):
     """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
     prior, nodes = m_step.prior, m_step.weights(model).nodes
     dof, count = nodes.shape
     tables = deviations[:, : dof * count].reshape(-1, dof, count)
-    parameters = prior.read(model.system)[None] + deviations[:, dof * count :]
+    parameters = prior.read(model)[None] + deviations[:, dof * count :]
 
     def advance(x, u, table, parameters):
-        force = jnp.sum(jax.vmap(hats)(nodes, x[dof:]) * table, axis=-1)
-        return prior.write(model, parameters).transition(x, u, force)
+        force = jnp.sum(jax.vmap(hats)(nodes, x[dof : 2 * dof]) * table, axis=-1)
+        now = prior.write(model, parameters)
+        return now.transition(x, u, force), now.shown(x, u)
 
-    def one(mean, cov, u, known, key):
+    def one(mean, cov, seq, known, key):
+        u = jax.vmap(lambda p: prior.write(model, p).inputs(seq), out_axes=1)(parameters)
         last = jnp.sum(known) - 1
         key_start, key_noise = jax.random.split(key)
         shape = (tables.shape[0], mean.shape[-1])
@@ -65,17 +85,23 @@ def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key:
 
         def step(x, slices):
             k, u, kick = slices
-            following = jax.vmap(advance, in_axes=(0, None, 0, 0))(x, u, tables, parameters) + kick
-            x = jnp.where(k >= last, following, x)
-            return x, (jnp.mean(x, axis=0), jnp.std(x, axis=0))
+            following, shown = jax.vmap(advance)(x, u, tables, parameters)
+            x = jnp.where(k >= last, following + kick, x)
+            return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
 
         _, (m, s) = jax.lax.scan(step, start, (jnp.arange(u.shape[0]), u, kick))
         ahead = (jnp.arange(u.shape[0]) > last)[:, None]
-        m, s = (jnp.concatenate([a[:1], a[:-1]]) for a in (m, s))
-        return jnp.where(ahead, m, mean), jnp.where(ahead, s, jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2)))
+        past = show(model, Gaussian(mean, cov), seq)
+        std = jnp.sqrt(jnp.diagonal(past.cov, axis1=1, axis2=2))
+        return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
 
     keys = jax.random.split(key, known.shape[0])
-    return jax.vmap(one)(state.mean, state.cov, data.u, known, keys)
+    return jax.vmap(one)(state.mean, state.cov, data, known, keys)
+
+
+def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
+    """What `smooth` gives, in the coordinates of `Prediction`."""
+    return _shown(fitted.model, smooth(fitted, data).state, data)
 
 
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:

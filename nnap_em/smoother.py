@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, cubature, lower
-from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, rts
+from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, linear_reading, rts
 from .model import AbstractModel
 
 
@@ -84,7 +84,7 @@ class GaussianSmoother(AbstractSmoother):
         """Filtered and smoothed states of the last iteration."""
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
-        u, active = jnp.asarray(seq.u), active_steps(jnp.asarray(seq.valid))
+        u, active = model.inputs(seq), active_steps(jnp.asarray(seq.valid))
         starts, log_weight = self.bank.hypotheses(model.start)
         head = self.window
 
@@ -112,9 +112,12 @@ class GaussianSmoother(AbstractSmoother):
     def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""
         y, observed = fill_missing(seq.y)
-        affine = jax.vmap(lambda state, u: self.linearise(model, state, u))(path, seq.u)
+        u = model.inputs(seq)
+        affine = jax.vmap(lambda state, u: self.linearise(model, state, u))(path, u)
+        reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, u)
         active = active_steps(jnp.asarray(seq.valid))
-        filtered = kalman_filter(model, model.start, affine, y, observed & seq.valid[:, None], active)
+        observed = observed & seq.valid[:, None]
+        filtered = kalman_filter(model.log_q, model.log_r, model.start, affine, reading, y, observed, active)
         return filtered, rts(filtered)
 
     def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:

@@ -26,7 +26,7 @@ class _Oscillator(eqx.Module):
     def transition(self, x, u):
         return jnp.asarray([[0.99, 0.1], [-0.1, 0.97]]) @ x + jnp.asarray([0.0, 0.1]) * u[0]
 
-    def emission(self, x):
+    def emission(self, x, u=None):
         return x[jnp.asarray(self.measured)]
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Affine, Cubature, Tangent, ekf, kalman_filter, rts
+from nnap_em.kalman import Affine, Cubature, Reading, Tangent, ekf, kalman_filter, rts
 
 LOG_2PI = np.log(2 * np.pi)
 
@@ -30,7 +30,7 @@ class _Linear(eqx.Module):
     def transition(self, x, u, force=None):
         return self.a @ x + self.b @ u
 
-    def emission(self, x):
+    def emission(self, x, u=None):
         return self.c @ x
 
 
@@ -104,9 +104,14 @@ def _active(time: int) -> jax.Array:
     return jnp.arange(time) < time - 1
 
 
+def _reading(p: _Problem) -> Reading:
+    rows = jnp.broadcast_to(p.model.c, (p.y.shape[0], *p.model.c.shape))
+    return Reading(rows, jnp.zeros_like(p.y))
+
+
 @jax.jit
 def _run(p: _Problem, observed, active):
-    filtered = kalman_filter(p.model, p.start, p.affine, p.y, observed, active)
+    filtered = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), p.y, observed, active)
     return filtered, rts(filtered)
 
 
@@ -158,7 +163,7 @@ def test_extended_filter_is_kalmans_on_a_linear_system(linearise):
     p = _problem(1)
     observed = jnp.ones(p.y.shape, bool)
     extended = ekf(p.model, p.start, p.u, p.y, observed, _active(6), linearise)
-    plain = kalman_filter(p.model, p.start, p.affine, p.y, observed, _active(6))
+    plain = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), p.y, observed, _active(6))
     for a, b in zip(jax.tree.leaves(extended), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)  # matrix, offset and noise are rounded, nothing else
 

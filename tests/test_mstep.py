@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from nnap_em.data import Dataset, fill_missing
 from nnap_em.friction import FrictionNetwork, NoFriction
 from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Tangent, kalman_filter
+from nnap_em.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.model import StateSpaceModel
 from nnap_em.mstep import ParameterPrior, Quadratic, Weights, expand, hats
 from nnap_em.simulate import simulate
@@ -109,9 +109,11 @@ def _gradient(case: _Case) -> _Knobs:
         pushed = _Pushed(noisy, knobs.force, knobs.damping)
         about = lambda x, u: Tangent()(pushed, Gaussian(x, jnp.eye(2)), u)  # noqa: E731
         affine = jax.vmap(about)(case.posterior.state.mean, case.seq.u)
-        return kalman_filter(noisy, model.start, affine, y, observed & case.seq.valid[:, None], active).loglik
+        reading = jax.vmap(lambda x, u: linear_reading(noisy, x, u))(case.posterior.state.mean, case.seq.u)
+        seen = observed & case.seq.valid[:, None]
+        return kalman_filter(noisy.log_q, noisy.log_r, model.start, affine, reading, y, seen, active).loglik
 
-    now = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model.system))
+    now = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model))
     flat, unravel = ravel_pytree(now)
     shift = 1e-4 * jnp.eye(flat.shape[0])
     both = jax.vmap(lambda d: loglik(unravel(flat + d)) - loglik(unravel(flat - d)))(shift)

@@ -41,7 +41,10 @@ class _Oscillator(eqx.Module):
         rows = [self.matrix[i, 0] * x[0] + self.matrix[i, 1] * x[1] + self.drive[i] * u[0] for i in range(2)]
         return jnp.stack(rows)
 
-    def emission(self, x):
+    def inputs(self, seq):
+        return jnp.asarray(seq.u)
+
+    def emission(self, x, u=None):
         return x[:1]
 
 

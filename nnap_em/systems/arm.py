@@ -1,6 +1,8 @@
 """The double pendulum in a vertical plane, the arm of the acrobot and of the pendubot."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +11,14 @@ from jaxtyping import Array, Float
 from .base import AbstractSystem
 
 Scalar = Float[Array, ""]
+
+
+def _payload(arm: "TwoLinkArm", mass: Scalar) -> "TwoLinkArm":
+    """A point mass at the tip of link 2, as other mass, centre and inertia of that link."""
+    total = arm.m2 + mass
+    lc2 = (arm.m2 * arm.lc2 + mass * arm.l2) / total
+    inertia = arm.I2 + arm.m2 * (lc2 - arm.lc2) ** 2 + mass * (arm.l2 - lc2) ** 2
+    return replace(arm, m2=total, lc2=lc2, I2=inertia)
 
 
 class TwoLinkArm(AbstractSystem):
@@ -21,6 +31,21 @@ class TwoLinkArm(AbstractSystem):
     rates: ClassVar[tuple[str, ...]] = ("dtheta1", "dtheta2")
     angles: ClassVar[tuple[bool, ...]] = (True, True)
     optional: ClassVar[dict[str, float]] = {"Ir": 0.0, "gr": 1.0}
+
+    variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {
+        ("payload", 2): (_payload, lambda arm: arm.m2),
+        ("link_inertia", 1): (
+            lambda arm, dI: replace(arm, I1=arm.I1 + dI),
+            lambda arm: arm.m1 * arm.l1**2,
+        ),
+        ("link_inertia", 2): (
+            lambda arm, dI: replace(arm, I2=arm.I2 + dI),
+            lambda arm: arm.m2 * arm.l2**2,
+        ),
+        ("link_length", 1): (lambda arm, dl: replace(arm, l1=arm.l1 + dl), lambda arm: arm.l1),
+        ("center_of_mass", 1): (lambda arm, dlc: replace(arm, lc1=arm.lc1 + dlc), lambda arm: arm.l1),
+        ("center_of_mass", 2): (lambda arm, dlc: replace(arm, lc2=arm.lc2 + dlc), lambda arm: arm.l2),
+    }
 
     m1: Scalar
     """Mass of link 1 [kg]."""
@@ -55,3 +80,13 @@ class TwoLinkArm(AbstractSystem):
         gravity2 = self.m2 * self.lc2 * self.g * jnp.sin(q[0] + q[1])
         gravity1 = (self.m1 * self.lc1 + self.m2 * self.l1) * self.g * jnp.sin(q[0]) + gravity2
         return jnp.stack([gravity1 - h * v[1] * (2 * v[0] + v[1]), gravity2 + h * v[0] ** 2])
+
+    def tip(self, q: Float[Array, " dof"]) -> Float[Array, " axis"]:
+        outer = q[0] + q[1]
+        return jnp.stack(
+            [self.l1 * jnp.sin(q[0]) + self.l2 * jnp.sin(outer), -self.l1 * jnp.cos(q[0]) - self.l2 * jnp.cos(outer)]
+        )
+
+    def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        outer = self.m2 * self.lc2 * jnp.cos(q[0] + q[1])
+        return -jnp.stack([(self.m1 * self.lc1 + self.m2 * self.l1) * jnp.cos(q[0]) + outer, outer])

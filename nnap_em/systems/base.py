@@ -1,7 +1,8 @@
 """What a machine must give to become a model: names, mass matrix and bias force."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +21,9 @@ class AbstractSystem(eqx.Module):
     angles: ClassVar[tuple[bool, ...]]
     optional: ClassVar[dict[str, float]] = {}
 
+    variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {}
+    """How a body may differ: (effect, joint) to (system, amount) -> system and system -> typical amount."""
+
     joints: eqx.AbstractVar[tuple[int, ...]]
     """The joint (counted from 1) that each input drives."""
 
@@ -37,3 +41,15 @@ class AbstractSystem(eqx.Module):
         for i, joint in enumerate(self.joints):
             force[joint - 1] = force[joint - 1] + u[i]
         return jnp.stack(force)
+
+    def vary(self, kind: str, joint: int | None, amount: Float[Array, ""]) -> "AbstractSystem":
+        """The machine with one body changed by `amount` (an entry of `variations`)."""
+        return self.variations[kind, joint or 1][0](self, amount)
+
+    def tip(self, q: Float[Array, " dof"]) -> Float[Array, " axis"] | None:
+        """Place of the tip [m], where the machine has one that air could brake."""
+        return None
+
+    def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"] | None:
+        """Generalised force of a unit horizontal acceleration of the base [N m s^2/m], where the base can shake."""
+        return None

@@ -1,6 +1,8 @@
 """A single driven pendulum."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +18,11 @@ class Pendulum(AbstractSystem):
     rates: ClassVar[tuple[str, ...]] = ("dtheta1",)
     angles: ClassVar[tuple[bool, ...]] = (True,)
 
+    variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {
+        ("link_inertia", 1): (lambda rod, dI: replace(rod, I=rod.I + dI), lambda rod: rod.I + rod.m * rod.lc**2),
+        ("center_of_mass", 1): (lambda rod, dlc: replace(rod, lc=rod.lc + dlc), lambda rod: rod.lc),
+    }
+
     m: Float[Array, ""]
     """Mass [kg]."""
     lc: Float[Array, ""]
@@ -30,3 +37,6 @@ class Pendulum(AbstractSystem):
 
     def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         return self.m * self.g * self.lc * jnp.sin(q)
+
+    def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        return -self.m * self.lc * jnp.cos(q)

@@ -1,6 +1,8 @@
 """A linear slide: one mass, one force, friction."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +18,10 @@ class Slide(AbstractSystem):
     rates: ClassVar[tuple[str, ...]] = ("dx",)
     angles: ClassVar[tuple[bool, ...]] = (False,)
 
+    variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {
+        ("payload", 1): (lambda slide, mass: replace(slide, m=slide.m + mass), lambda slide: slide.m),
+    }
+
     m: Float[Array, ""]
     """Moving mass [kg]."""
     joints: tuple[int, ...] = eqx.field(static=True)
@@ -25,3 +31,6 @@ class Slide(AbstractSystem):
 
     def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         return jnp.zeros_like(q)
+
+    def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        return -self.m * jnp.ones_like(q)

@@ -1,0 +1,78 @@
+"""A model with more effects: what the fit then has to estimate, and where it starts."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .build import measure_scales
+from .data import Dataset
+from .effects import AbstractEffect, Around, Candidate, catalogue, fields
+from .gaussian import Gaussian
+from .model import StateSpaceModel, with_effects
+from .mstep import ParameterPrior, ScoringMStep
+from .rig import Rig
+from .smoother import StartBank
+
+
+def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian) -> Around:
+    """Sizes on the smoothed paths and in the logs."""
+    scales = measure_scales(rig, model.system, data)
+    dof = len(model.system.coordinates)
+    valid = np.asarray(data.valid)
+    mean = np.asarray(path.mean)[valid & np.isfinite(np.asarray(path.mean)).all(-1)]
+    low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
+    y = np.asarray(data.y)
+    clock = np.asarray(data.t)[valid]
+    return Around(
+        model.system,
+        scales.torque,
+        np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9,
+        low,
+        high,
+        np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),
+        rig.measured,
+        np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
+        rig.dt,
+        (float(clock.min()), float(clock.max())),
+        rig.friction,
+    )
+
+
+def proposals(around: Around) -> list[Candidate]:
+    """Everything in the catalogue that this machine could have."""
+    return [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
+
+
+def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> AbstractEffect:
+    """The effect where the score test puts it; where it is not linear, a probe itself."""
+    if not candidate.start.linear:
+        return candidate.probes[0]
+
+    def combine(start, *probes):
+        return start + sum(float(c) * (p - start) for c, p in zip(coefficients, probes, strict=True))
+
+    return jax.tree.map(combine, candidate.start, *candidate.probes)
+
+
+def augment(
+    model: StateSpaceModel, m_step: ScoringMStep, effect: AbstractEffect, candidate: Candidate
+) -> tuple[StateSpaceModel, ScoringMStep]:
+    """`model` with `effect` behind its others, and the rule that estimates it too."""
+    place = len(model.effects)
+    names = tuple(f"{place}.{name}" for name in fields(effect))
+    centre = candidate.start if effect.linear else effect
+    mean = [getattr(centre, name) for name in fields(effect)]
+    std = [getattr(candidate.spread, name) for name in fields(effect)]
+    prior = ParameterPrior(
+        m_step.prior.names + names,
+        jnp.concatenate([m_step.prior.mean, jnp.stack(mean)]),
+        jnp.concatenate([m_step.prior.std, jnp.stack(std)]),
+    )
+    full = with_effects(model, (*model.effects, effect))
+    return full, eqx.tree_at(
+        lambda m: (m.prior, m.shape), m_step, (prior, full.log_q), is_leaf=lambda leaf: leaf is None
+    )

@@ -1,0 +1,147 @@
+"""What an effect is: a named law that changes force, drive, body, friction or reading, with parameters and units.
+
+A new effect is one new file in this folder; the catalogue finds it.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..systems.base import AbstractSystem
+
+Scalar = Float[Array, ""]
+
+
+class Scene(NamedTuple):
+    """What an effect sees of the machine at one moment."""
+
+    system: AbstractSystem
+    q: Float[Array, " dof"]
+    v: Float[Array, " dof"]
+    drive: Float[Array, " dof"]
+    """Generalised force of the inputs [N m]."""
+    time: Scalar
+    friction: Float[Array, " dof"]
+    """Torque of the learned map at v [N m]."""
+    map: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
+    """The learned map itself."""
+
+
+class Around(NamedTuple):
+    """Sizes that candidates are built from, all read off the logs and the declared physics."""
+
+    system: AbstractSystem
+    torque: Float[np.ndarray, " dof"]
+    """Typical torque of gravity and drive [N m]."""
+    speed: Float[np.ndarray, " dof"]
+    """Largest velocity [rad/s]."""
+    low: Float[np.ndarray, " dof"]
+    """Smallest and largest coordinate on the smoothed paths [rad]."""
+    high: Float[np.ndarray, " dof"]
+    drive: Float[np.ndarray, " input"]
+    """Largest input [N m]."""
+    measured: tuple[str, ...]
+    reading: Float[np.ndarray, " obs"]
+    """Typical size of each reading."""
+    dt: float
+    duration: tuple[float, float]
+    """First and last time on the clock [s]."""
+    learned: bool
+    """True where a friction map is learned."""
+
+
+class Candidate(NamedTuple):
+    """An effect to be tried, without a value yet."""
+
+    start: "AbstractEffect"
+    """Strengths zero (linear), inner parameters at one place of their grid."""
+    probes: tuple["AbstractEffect", ...]
+    """The effect with one strength each at a typical size: the directions that the score test looks along."""
+    spread: "AbstractEffect"
+    """Prior standard deviation of every parameter."""
+
+
+class AbstractEffect(eqx.Module):
+    """A law that the declared physics may lack.  Array fields are its parameters; the hooks say what it changes."""
+
+    name: ClassVar[str]
+    """Key of the vocabulary."""
+    units: ClassVar[dict[str, str]] = {}
+    """Reported parameters and their units on a rotary joint."""
+    memory: ClassVar[int] = 0
+    """States of its own."""
+    substeps: ClassVar[int] = 1
+    """Integration steps per sample that it needs."""
+    linear: ClassVar[bool] = True
+    """False where a probe itself, not its multiple, is the place to start a fit from."""
+
+    joint: eqx.AbstractVar[int | None]
+    """The joint that it acts on, counted from 1; None: all, or no joint."""
+    channel: eqx.AbstractVar[str | None]
+    """The reading that it acts on."""
+
+    @classmethod
+    def candidates(cls, around: Around) -> list[Candidate]:
+        """What of this kind is to be tried on a machine; nothing where the machine cannot have it."""
+        return []
+
+    def values(self) -> dict[str, Scalar]:
+        """The reported parameters under the vocabulary's names."""
+        return {name: getattr(self, name) for name in self.units}
+
+    def possible(self) -> bool:
+        """Whether a fitted value makes physical sense."""
+        return True
+
+    def inputs_named(self) -> tuple[str, ...]:
+        """Of what it is a function, for laws without a name."""
+        return ()
+
+    def memory_scale(self) -> Float[Array, " memory"]:
+        """Typical size of its own states."""
+        return jnp.ones(self.memory)
+
+    def input(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
+        """What reaches the joint of the commanded input, mean over each sample."""
+        return u
+
+    def physics(self, system: AbstractSystem, time: Scalar) -> AbstractSystem:
+        """The machine as it truly is."""
+        return system
+
+    def friction(self, torque: Float[Array, " dof"], scene: Scene) -> Float[Array, " dof"]:
+        """The friction torque as it truly is."""
+        return torque
+
+    def force(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " dof"]:
+        """Generalised force that comes on top [N m]."""
+        return jnp.zeros_like(scene.v)
+
+    def drift(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
+        """Time derivative of its own states."""
+        return memory
+
+    def reading(self, value: Scalar, past: Callable[[Scalar], Scalar]) -> Scalar:
+        """What the sensor of its channel reads; `past(delay)` is the value some seconds ago."""
+        return value
+
+
+def fields(effect: AbstractEffect | type[AbstractEffect]) -> tuple[str, ...]:
+    """Names of the parameters, in the order of a fit."""
+    return tuple(f.name for f in dataclasses.fields(effect) if not f.metadata.get("static", False))
+
+
+def at_joint(joint: int | None, value: Scalar, scene: Scene) -> Float[Array, " dof"]:
+    """A generalised force at one joint."""
+    assert joint is not None
+    return jnp.zeros_like(scene.v).at[joint - 1].set(value)
+
+
+def a(value: float) -> Scalar:
+    """A number as an array of the default precision."""
+    return jnp.asarray(value, float)

@@ -1,0 +1,197 @@
+"""Forces that depend on the position: springs, tilt, cogging, stops, magnets of a brake."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .base import AbstractEffect, Around, Candidate, Scalar, a, at_joint
+
+
+def joints(around: Around) -> range:
+    """Joints, counted from 1."""
+    return range(1, len(around.system.coordinates) + 1)
+
+
+class TorsionalSpring(AbstractEffect):
+    """-k (theta_j - theta0)."""
+
+    name: ClassVar[str] = "torsional_spring"
+    units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
+    k: Scalar
+    moment: Scalar
+    """k theta0 [N m]."""
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j in joints(around):
+            reach = max(abs(around.low[j - 1]), abs(around.high[j - 1]), 1e-3)
+            size = float(around.torque[j - 1]) / reach
+            start, probe = cls(a(0.0), a(0.0), j), cls(a(0.1 * size), a(0.0), j)
+            out.append(Candidate(start, (probe,), cls(a(size), a(size * reach), j)))
+        return out
+
+    def values(self):
+        return {"k": self.k, "theta0": self.moment / jnp.where(self.k == 0, 1.0, self.k)}
+
+    def possible(self):
+        return float(self.k) > 0
+
+    def force(self, scene, memory):
+        assert self.joint is not None
+        return at_joint(self.joint, self.moment - self.k * scene.q[self.joint - 1], scene)
+
+
+class BaseTilt(AbstractEffect):
+    """Gravity acts on theta1 + angle."""
+
+    name: ClassVar[str] = "base_tilt"
+    units: ClassVar[dict[str, str]] = {"angle": "rad"}
+    angle: Scalar
+    joint: int | None = eqx.field(static=True, default=None)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        if not hasattr(around.system, "g"):
+            return []
+        return [Candidate(cls(a(0.0)), (cls(a(0.03)),), cls(a(0.5)))]
+
+    def force(self, scene, memory):
+        tilted = scene.q.at[0].add(self.angle)
+        return scene.system.bias(scene.q, scene.v) - scene.system.bias(tilted, scene.v)
+
+
+class Cogging(AbstractEffect):
+    """amplitude sin(k theta_j + phase)."""
+
+    name: ClassVar[str] = "cogging"
+    units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
+    sine: Scalar
+    cosine: Scalar
+    k: Scalar
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j in joints(around):
+            if not around.system.angles[j - 1]:
+                continue
+            size = float(around.torque[j - 1])
+            spread = cls(a(0.5 * size), a(0.5 * size), a(0.5), j)
+            for k in (*range(1, 13), 14, 16, 18, 20, 24):
+                start = cls(a(0.0), a(0.0), a(float(k)), j)
+                probes = (cls(a(0.05 * size), a(0.0), a(float(k)), j), cls(a(0.0), a(0.05 * size), a(float(k)), j))
+                out.append(Candidate(start, probes, spread))
+        return out
+
+    def values(self):
+        amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
+        return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
+
+    def force(self, scene, memory):
+        assert self.joint is not None
+        angle = self.k * scene.q[self.joint - 1]
+        return at_joint(self.joint, self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle), scene)
+
+
+class TorqueOffset(AbstractEffect):
+    """A constant torque; a learned friction map holds it."""
+
+    name: ClassVar[str] = "torque_offset"
+    units: ClassVar[dict[str, str]] = {"value": "N m"}
+    value: Scalar
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        size = [float(t) for t in around.torque]
+        return [
+            Candidate(cls(a(0.0), j), (cls(a(0.05 * size[j - 1]), j),), cls(a(0.5 * size[j - 1]), j))
+            for j in joints(around)
+        ]
+
+    def force(self, scene, memory):
+        return at_joint(self.joint, self.value, scene)
+
+
+class HardStop(AbstractEffect):
+    """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
+
+    name: ClassVar[str] = "hard_stop"
+    units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
+    substeps: ClassVar[int] = 4
+    linear: ClassVar[bool] = False
+    upper: Scalar
+    lower: Scalar
+    stiffness: Scalar
+    """Log of the contact stiffness [N m/rad]."""
+    damping: Scalar
+    """Log of the contact damping [N m s/rad]."""
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j in joints(around):
+            low, high = float(around.low[j - 1]), float(around.high[j - 1])
+            k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
+            middle = 0.5 * (low + high)
+            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), j)
+            for share in (0.5, 0.65, 0.8, 0.9, 0.97):
+                up, down = middle + share * size, middle - share * size
+                start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j)
+                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), j)
+                out.append(Candidate(start, (probe,), spread))
+        return out
+
+    def force(self, scene, memory):
+        assert self.joint is not None
+        q, v = scene.q[self.joint - 1], scene.v[self.joint - 1]
+        above, below = jnp.maximum(q - self.upper, 0.0), jnp.maximum(self.lower - q, 0.0)
+        touch = jnp.tanh((above + below) / 0.01)
+        push = jnp.exp(self.stiffness) * (below - above) - jnp.exp(self.damping) * touch * v
+        return at_joint(self.joint, push, scene)
+
+
+class EddyBrake(AbstractEffect):
+    """-c cos^2(theta_j - center) w_j."""
+
+    name: ClassVar[str] = "eddy_brake"
+    units: ClassVar[dict[str, str]] = {"c": "N m s/rad", "center": "rad"}
+    even: Scalar
+    """c cos(2 center)."""
+    odd: Scalar
+    """c sin(2 center)."""
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j in joints(around):
+            if not around.system.angles[j - 1]:
+                continue
+            size = float(around.torque[j - 1] / around.speed[j - 1])
+            probes = (cls(a(0.1 * size), a(0.0), j), cls(a(0.0), a(0.1 * size), j))
+            out.append(Candidate(cls(a(0.0), a(0.0), j), probes, cls(a(size), a(size), j)))
+        return out
+
+    def values(self):
+        c = jnp.sqrt(self.even**2 + self.odd**2 + 1e-30)
+        return {"c": c, "center": 0.5 * jnp.arctan2(self.odd, self.even)}
+
+    def force(self, scene, memory):
+        assert self.joint is not None
+        twice = 2 * scene.q[self.joint - 1]
+        level = jnp.sqrt(self.even**2 + self.odd**2 + 1e-16)
+        share = 0.5 * (level + self.even * jnp.cos(twice) + self.odd * jnp.sin(twice))
+        return at_joint(self.joint, -share * scene.v[self.joint - 1], scene)

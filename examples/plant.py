@@ -794,7 +794,7 @@ STRONG: dict[str, tuple[Effect, ...]] = {
     "cogging": ({"name": "cogging", "joint": 2, "amplitude": 0.03, "k": 5.0, "phase": 0.5},),
     "torque_offset": ({"name": "torque_offset", "joint": 2, "value": 0.03},),
     "backlash": ({"name": "backlash", "joint": 2, "gap": 0.15},),
-    "presliding_friction": ({"name": "presliding_friction", "joint": 2, "sigma0": 3.0},),
+    "presliding_friction": ({"name": "presliding_friction", "joint": 2, "sigma0": 0.4},),
     "position_dependent_friction": (
         {"name": "position_dependent_friction", "joint": 1, "depth": 0.6, "n": 1.0, "phase": 0.4},
     ),
@@ -828,7 +828,7 @@ _THIRDS: dict[str, dict[str, float]] = {
     "cogging": {"amplitude": 0.01},
     "torque_offset": {"value": 0.01},
     "backlash": {"gap": 0.05},
-    "presliding_friction": {"sigma0": 9.0},
+    "presliding_friction": {"sigma0": 1.2},
     "position_dependent_friction": {"depth": 0.2},
     "friction_drift": {"change": -0.17},
     "sensor_bias": {"bias": 0.033},

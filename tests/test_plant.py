@@ -1,0 +1,351 @@
+"""The truth of our benchmarks against closed forms, invariances and the library that must read its folders."""
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import plant
+import pytest
+
+from nnap_em import read_logs, read_rig, specs
+
+SMALL = plant.Case(sequences=3, tests=2, steps=60, seed=5)
+FREE = {"Fc": 0.0, "Fs": 0.0, "vs": 0.3, "b": 0.0, "eps": 0.1}
+
+
+def _run(case, *, scale=1.0, substeps=None, friction=True):
+    """All states of a case without process noise."""
+    p = plant.build(case)
+    p = p if friction else p._replace(friction=(FREE,) * p.dof)
+    p = p if substeps is None else p._replace(substeps=substeps)
+    return plant.simulate(p, plant.starts(case), scale * plant.torques(case), plant.clocks(case))
+
+
+def _acceleration(case, q, v, t=0.0):
+    """Acceleration without friction and input."""
+    p = plant.build(case)._replace(friction=(FREE,) * len(q))
+    x = np.zeros((1, p.size))
+    x[0, : p.dof], x[0, p.dof : 2 * p.dof] = q, v
+    return plant.rates(p, x, np.zeros(1), np.array([t]))[0, p.dof : 2 * p.dof]
+
+
+def _mass(q):
+    """Mass matrix of the declared acrobot, from the kinetic energy of its two rods (numerically)."""
+    p = plant.build(plant.Case())
+    energy = lambda v: plant.energy(p, np.array([[*q, *v]]), 0.0)[0] - plant.energy(p, np.array([[*q, 0, 0]]), 0.0)[0]  # noqa: E731
+    a, b, both = energy((1, 0)), energy((0, 1)), energy((1, 1))
+    return np.array([[2 * a, both - a - b], [both - a - b, 2 * b]])
+
+
+@pytest.mark.parametrize(
+    ("system", "effects"),
+    [("acrobot", ()), ("acrobot", plant.STRONG["payload"] + plant.STRONG["base_tilt"]), ("pendulum", ())],
+)
+def test_energy_is_kept_without_friction_and_input(system, effects):
+    case = SMALL._replace(system=system, effects=effects, steps=200)
+    p, x = plant.build(case), _run(case, scale=0.0, friction=False)
+    energy = np.stack([plant.energy(p, x[:, k], 0.0) for k in range(x.shape[1])])
+    assert np.ptp(x[..., 0]) > 2
+    np.testing.assert_allclose(energy, np.broadcast_to(energy[0], energy.shape), atol=1e-6)
+
+
+def test_energy_is_that_of_two_rods():
+    """Kinetic energy from the velocities of the centres of mass, by differences of their positions."""
+    q, v, h = np.array([0.7, -1.1]), np.array([2.0, -3.0]), 1e-6
+    d = plant.SYSTEMS["acrobot"].parameters
+
+    def centres(q):
+        elbow = d["l1"] * np.array([np.sin(q[0]), -np.cos(q[0])])
+        rod = np.array([np.sin(q.sum()), -np.cos(q.sum())])
+        return d["lc1"] / d["l1"] * elbow, elbow + d["lc2"] * rod
+
+    speeds = [(a - b) / (2 * h) for a, b in zip(centres(q + h * v), centres(q - h * v), strict=True)]
+    kinetic = sum(m * s @ s for m, s in zip((d["m1"], d["m2"]), speeds, strict=True)) / 2
+    kinetic += (d["I1"] * v[0] ** 2 + d["I2"] * v.sum() ** 2) / 2
+    height = sum(m * 9.81 * c[1] for m, c in zip((d["m1"], d["m2"]), centres(q), strict=True))
+    energy = plant.energy(plant.build(plant.Case()), np.array([[*q, *v]]), 0.0)[0]
+    assert energy == pytest.approx(kinetic + height, rel=1e-8)
+
+
+NOTHING = {
+    "torsional_spring": {"k": 0.0},
+    "base_tilt": {"angle": 0.0},
+    "payload": {"mass": 0.0},
+    "link_inertia": {"dI": 0.0},
+    "link_length": {"dl": 0.0},
+    "center_of_mass": {"dlc": 0.0},
+    "air_drag": {"c": 0.0},
+    "motor_gain": {"gain": 1.0},
+    "dead_zone": {"width": 0.0},
+    "saturation": {"limit": 9.0},
+    "input_delay": {"delay": 0.0},
+    "actuator_lag": {"tau": 0.0},
+    "cogging": {"amplitude": 0.0},
+    "torque_offset": {"value": 0.0},
+    "position_dependent_friction": {"depth": 0.0},
+    "friction_drift": {"change": 0.0},
+    "sensor_bias": {"bias": 0.0},
+    "sensor_scale": {"scale": 1.0},
+    "sensor_delay": {"delay": 0.0},
+    "sensor_quantization": {"step": 0.0},
+    "base_vibration": {"amplitude": 0.0},
+    "payload_step": {"mass": 0.0, "time": 0.2},
+    "hard_stop": {"upper": 99.0, "lower": -99.0},
+    "eddy_brake": {"c": 0.0},
+    "motor_back_emf": {"b": 0.0},
+}
+MOTORS = {"backlash", "joint_flexibility"}  # bring an inertia of their own
+
+
+def test_every_name_of_the_vocabulary_is_simulated(shared):
+    names = set(json.loads((shared / "vocabulary.json").read_text()))
+    assert set(plant.STRONG) == set(plant.WEAK) == names - {"asymmetric_friction", "unknown_function"}
+    assert set(NOTHING) == set(plant.STRONG) - MOTORS - {"presliding_friction"}
+
+
+@functools.cache
+def _read_without_effects():
+    return _read(())
+
+
+def _read(effects):
+    case = SMALL._replace(effects=effects, steps=30)
+    return plant.readings(plant.build(case), _run(case))
+
+
+@pytest.mark.parametrize("name", NOTHING)
+def test_an_effect_without_strength_is_none_and_a_strong_one_is_not(name):
+    none, strong = _read_without_effects(), plant.STRONG[name][0]
+    np.testing.assert_allclose(_read(({**strong, **NOTHING[name]},)), none, atol=1e-3 * (name == "hard_stop"))
+    seen = {"payload_step": {"time": 0.2}, "hard_stop": {"upper": 0.5, "lower": -0.5}, "friction_drift": {"tau": 0.2}}
+    strong = {**strong, **seen.get(name, {})}
+    assert np.abs(_read((strong,)) - none).max() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("effect", "force"),
+    [
+        ({"name": "torsional_spring", "joint": 2, "k": 0.06, "theta0": -0.2}, (0, -0.06 * 0.9)),
+        ({"name": "torsional_spring", "joint": 1, "k": 0.06, "k3": 2.0}, (-0.06 * (0.4 + 2 * 0.4**3), 0)),
+        ({"name": "air_drag", "joint": 1, "c": 0.01}, (-0.01 * 9, 0)),
+        ({"name": "air_drag", "joint": 2, "c": 0.01, "exponent": 1.8}, (0, 0.01 * 2**1.8)),
+        ({"name": "cogging", "joint": 2, "amplitude": 0.03, "k": 5, "phase": 0.5}, (0, 0.03 * np.sin(4.0))),
+        ({"name": "torque_offset", "joint": 1, "value": 0.03}, (0.03, 0)),
+        ({"name": "eddy_brake", "joint": 2, "c": 0.02, "center": 0.3}, (0, 0.04 * np.cos(0.4) ** 2)),
+        ({"name": "motor_back_emf", "joint": 2, "b": 0.01}, (0, 0.02)),
+        ({"name": "hard_stop", "joint": 2, "upper": 0.6, "lower": -0.6}, (0, -(40 * 0.1 - 0.3 * 2))),
+        ({"name": "unknown_function", "form": "coupling", "joint": 1, "amplitude": 0.1}, (0.1 * np.sin(1.5), 0)),
+        (
+            {"name": "unknown_function", "form": "bump", "joint": 2, "amplitude": 0.1, "center": 0.5, "width": 0.2},
+            (0, 0.1 * np.exp(-1.0)),
+        ),
+        (
+            {"name": "unknown_function", "form": "magnet", "joint": 2, "amplitude": 0.1, "center": 0.5, "width": 0.2},
+            (0, 0.1 * 0.2 / 4),
+        ),
+    ],
+    ids=lambda value: f"{value.get('form', value['name'])}-{value['joint']}" if isinstance(value, dict) else "",
+)
+def test_a_law_changes_the_force_by_its_formula(effect, force):
+    q, v = (0.4, 0.7), (3.0, -2.0)
+    change = _acceleration(plant.Case(effects=(effect,)), q, v) - _acceleration(plant.Case(), q, v)
+    np.testing.assert_allclose(_mass(q) @ change, force, atol=1e-10)
+
+
+def test_a_tilt_turns_gravity():
+    tilted = _acceleration(plant.Case(effects=plant.STRONG["base_tilt"]), (0.4, 0.7), (3.0, -2.0))
+    np.testing.assert_allclose(tilted, _acceleration(plant.Case(), (0.52, 0.7), (3.0, -2.0)), atol=1e-10)
+
+
+def test_a_shaking_base_is_gravity_turned_sideways():
+    """At the moment of amplitude a, weight points along (-a, -g): it is stronger and tilted by atan(a / g)."""
+    shaking = {"name": "base_vibration", "amplitude": 1.5, "frequency": 1.7, "phase": np.pi / 2}
+    g, tilt = np.hypot(9.81, 1.5), np.arctan2(1.5, 9.81)
+    p = plant.build(plant.Case(effects=({"name": "base_tilt", "angle": tilt},)))
+    p = p._replace(friction=(FREE,) * 2, parameters={**p.parameters, "g": g})
+    expected = plant.rates(p, np.array([[0.4, 0.7, 3.0, -2.0]]), np.zeros(1), np.zeros(1))[0, 2:]
+    np.testing.assert_allclose(
+        _acceleration(plant.Case(effects=(shaking,)), (0.4, 0.7), (3.0, -2.0)), expected, atol=1e-9
+    )
+
+
+def test_drag_at_the_tip_takes_its_power():
+    """Power of the drag is -c speed^3; an arm turning as one at joint 1 has the speed (l1 + l2) w."""
+    q, v = (0.4, 0.0), (3.0, 0.0)
+    drag = plant.STRONG["air_drag"]
+    change = _acceleration(plant.Case(effects=drag), q, v) - _acceleration(plant.Case(), q, v)
+    assert v @ _mass(q) @ change == pytest.approx(-drag[0]["c"] * (0.56 * 3) ** 3, rel=1e-9)
+
+
+def test_a_delay_of_whole_samples_shifts_the_input():
+    late = _run(SMALL._replace(effects=({"name": "input_delay", "joint": 2, "delay": 0.02},)))
+    u = plant.torques(SMALL)
+    shifted = np.concatenate([np.zeros((len(u), 2)), u[:, :-2]], axis=1)
+    x = plant.simulate(plant.build(SMALL), plant.starts(SMALL), shifted, plant.clocks(SMALL))
+    np.testing.assert_allclose(late, x, atol=1e-12)
+
+
+def test_a_delay_of_half_a_sample_switches_in_the_middle():
+    """The same as an input logged at twice the rate: half steps of the held values before and after."""
+    effect = {"name": "input_delay", "joint": 2, "delay": 0.015}
+    x, u = _run(SMALL._replace(effects=(effect,))), plant.torques(SMALL)
+    p, t = plant.build(SMALL), np.zeros(len(u))
+    for k in (5, 20):
+        half = plant._runge_kutta(p, x[:, k], u[:, k - 2], t, 0.005)
+        np.testing.assert_allclose(plant._runge_kutta(p, half, u[:, k - 1], t, 0.005), x[:, k + 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.015, 0.0003])
+def test_a_late_sensor_reads_the_state_of_then(delay):
+    """Against the trajectory itself: rows back for whole samples, else a Taylor expansion between two rows."""
+    case = SMALL._replace(effects=({"name": "sensor_delay", "channel": "all", "delay": delay},))
+    p, x = plant.build(case), _run(case)
+    y = plant.noise_free(p, x)[:, 10:]
+    back = round(delay / plant.DT)
+    q, v = x[:, 10 - back : x.shape[1] - back, 0], x[:, 10 - back : x.shape[1] - back, 2]
+    np.testing.assert_allclose(y[..., 0], q - v * (delay - back * plant.DT), atol=4e-3 if delay == 0.015 else 3e-5)
+    if delay == 0.02:
+        np.testing.assert_array_equal(y[..., 1], v)
+
+
+def test_a_lag_is_first_order():
+    """Analytic filter of the held input."""
+    p = plant.build(SMALL._replace(effects=plant.STRONG["actuator_lag"]))
+    u = plant.torques(SMALL)
+    x = plant.simulate(p, plant.starts(SMALL), u, plant.clocks(SMALL))
+    torque = np.zeros(len(u))
+    for k in range(30):
+        torque = u[:, k] + (torque - u[:, k]) * np.exp(-plant.DT / 0.05)
+    np.testing.assert_allclose(x[:, 30, 4], torque, rtol=1e-6)
+
+
+def test_a_bristle_at_steady_speed_is_the_static_map_and_a_spring_before():
+    effect = {"name": "presliding_friction", "joint": 2, "sigma0": 3.0}
+    p = plant.build(plant.Case(effects=(effect,), seed=1))
+    f = p.friction[1]
+    x, dx = np.zeros((1, p.size)), np.zeros((1, p.size))
+    x[0, 3] = 2.0
+    x[0, 4] = plant._stribeck_level(f, 2.0) / effect["sigma0"]
+    assert plant._friction(p, x, np.zeros(1), dx)[0, 1] == pytest.approx(plant.friction_torque("stribeck", f, 2.0))
+    assert dx[0, 4] == pytest.approx(0, abs=1e-12)
+    x[0, 3], x[0, 4] = 0.0, 0.001
+    assert plant._friction(p, x, np.zeros(1), dx)[0, 1] == pytest.approx(-0.003)
+
+
+def test_a_stiff_joint_is_a_rigid_one_with_the_motors_inertia():
+    """A stiff spring against the motor's inertia added to joint 2's relative motion."""
+    inertia = plant.MOTOR_INERTIA
+    q, v = np.array([0.4, 0.7]), np.array([1.0, -1.0])
+    p = plant.build(plant.Case(effects=({"name": "joint_flexibility", "joint": 2, "k": 2000.0},)))
+    p = p._replace(friction=(FREE,) * 2, substeps=400)
+    x = np.array([[*q, *v]]) @ plant.lift(p).T
+    u = np.array([-0.2])
+    moved = plant._runge_kutta(p, x, u, np.zeros(1), 0.05)
+    y, steps = np.array([*q, *v]), 200
+    for _ in range(steps):
+        mass = _mass(y[:2])
+        force = mass @ _acceleration(plant.Case(), y[:2], y[2:]) + [0, u[0] - 3e-4 * y[3]]
+        y = y + 0.05 / steps * np.array([*y[2:], *np.linalg.solve(mass + np.diag([0, inertia]), force)])
+    np.testing.assert_allclose(moved[0, :2], y[:2], atol=2e-3)
+    assert abs(moved[0, 1] - q[1]) > 0.05
+
+
+@pytest.mark.parametrize("name", ["backlash", "presliding_friction", "hard_stop", "joint_flexibility"])
+def test_stiff_effects_are_integrated_finely_enough(name):
+    case = SMALL._replace(effects=plant.STRONG[name], sequences=1, tests=1, steps=30)
+    coarse = _run(case)[:, -1]
+    np.testing.assert_allclose(coarse[:, :2], _run(case, substeps=60)[:, -1, :2], atol=2e-3)
+
+
+def test_the_play_of_a_backlash_is_free():
+    p = plant.build(plant.Case(effects=plant.STRONG["backlash"]))
+    torque = plant._play(plant.STRONG["backlash"][0], np.array([-0.1, -0.07, 0.0, 0.07, 0.1]), np.zeros(5))
+    np.testing.assert_allclose(torque, [-0.5, 0, 0, 0, 0.5], atol=1e-12)
+    assert p.size == 6
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        SMALL,
+        SMALL._replace(clock="session", missing=0.1, hidden=False, declare_noise=False),
+        SMALL._replace(system="pendulum"),
+        SMALL._replace(system="slide", noise=(0.001, 0.01)),
+    ],
+    ids=["acrobot", "session", "pendulum", "slide"],
+)
+def test_the_library_reads_the_folder(case, tmp_path):
+    """Without a warning: pytest turns them into errors."""
+    plant.write(case, tmp_path)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert rig.system == case.system and rig.clock == case.clock
+    assert bool(rig.noise_std) == case.declare_noise
+    for name, number in (("train", 3), ("test", 2)):
+        data = read_logs(tmp_path / name, rig).data
+        assert data.y.shape == (number, 61, len(plant.measured(case)))
+        assert np.isnan(np.asarray(data.y)).mean() == pytest.approx(case.missing, abs=0.06)
+    truth = json.loads((tmp_path / "truth" / "truth.json").read_text())
+    assert truth["effects"] == [] and len(truth["friction"]) == len(plant.SYSTEMS[case.system].friction)
+    assert len(list((tmp_path / "truth" / "test").glob("*.csv"))) == 2
+
+
+def test_the_clock_of_a_session_runs_on(tmp_path):
+    plant.write(SMALL._replace(clock="session"), tmp_path)
+    first = [plant.read(tmp_path / name)[0][:, 0] for name in ("train", "test")]
+    np.testing.assert_allclose(np.concatenate(first), 2.6 * np.arange(5), atol=1e-9)
+
+
+def test_a_step_of_the_payload_waits_for_its_time():
+    step = ({"name": "payload_step", "joint": 2, "mass": 0.05, "time": 5.4},)
+    case = SMALL._replace(clock="session", effects=step)
+    x, none = _run(case), _run(case._replace(effects=()))
+    loaded = _run(case._replace(effects=({"name": "payload", "joint": 2, "mass": 0.05},)))
+    np.testing.assert_array_equal(x[:2], none[:2])
+    np.testing.assert_allclose(x[3:], loaded[3:], atol=1e-10)
+    np.testing.assert_array_equal(x[2, :20], none[2, :20])
+    assert np.abs(x[2, -1] - none[2, -1]).max() > 0.01
+
+
+def test_a_case_writes_the_same_files_again(tmp_path):
+    case = SMALL._replace(effects=plant.STRONG["backlash"], steps=20)
+    for name in ("a", "b"):
+        plant.write(case, tmp_path / name)
+    plant.write(case._replace(seed=6), tmp_path / "c")
+    files = lambda name: {p.relative_to(tmp_path / name): p.read_bytes() for p in (tmp_path / name).rglob("*.*")}  # noqa: E731
+    assert files("a") == files("b")
+    assert len(files("a")) == 9
+    assert files("a") != files("c")
+
+
+@pytest.mark.parametrize(
+    "effects", [(), plant.STRONG["sensor_delay"] + plant.STRONG["actuator_lag"]], ids=["none", "late sensor and lag"]
+)
+def test_the_oracle_foretells_the_next_tenth_to_the_noise(effects, tmp_path):
+    """Noise .005 rad and .05 rad/s; 5 x 10 readings know their RMS to 1 / sqrt(100) = 10 %, so 1.5 is 5 deviations."""
+    case = plant.Case(effects=effects, sequences=1, tests=5, steps=75, seed=2, missing=0.02)
+    plant.write(case, tmp_path)
+    error = plant.oracle_errors(case, tmp_path, given=0.6, horizons=(0.1,))
+    assert 0.0035 < error["theta1"][0] < 0.0075
+    assert 0.035 < error["dtheta1"][0] < 0.075
+    if effects:
+        naive = plant.oracle_errors(case._replace(effects=()), tmp_path, given=0.6, horizons=(0.1,))
+        assert naive["theta1"][0] > 2 * error["theta1"][0]
+
+
+def test_the_filter_is_kalmans_on_a_slide(tmp_path: Path):
+    """Without friction the slide is linear: mean and likelihood against the textbook's matrices."""
+    case = plant.Case(system="slide", noise=(0.01, 0.1), process=0.05, seed=3)
+    p = plant.build(case)._replace(friction=(FREE,))
+    u, y = plant.torques(case)[:1, :30], np.random.default_rng(0).normal(0, 0.1, (1, 30, 1))
+    a, b, q = np.array([[1, 0.01], [0, 1]]), np.array([0.01**2 / 2, 0.01]), np.diag([1e-10, 1e-10 + 0.05**2])
+    m, c, total = np.zeros(2), np.diag([0.04, 0.01]), 0.0
+    mean, likelihood = plant.filtered(p, m[None], c[None], u, y, np.zeros(1))
+    for k in range(30):
+        if k:
+            m, c = a @ m + b * u[0, k - 1], a @ c @ a.T + q
+        s, e = c[0, 0] + 1e-4, y[0, k, 0] - m[0]
+        total -= (e**2 / s + np.log(2 * np.pi * s)) / 2
+        m, c = m + c[:, 0] * e / s, c - np.outer(c[:, 0], c[0]) / s
+    np.testing.assert_allclose(mean[0], m, atol=1e-9)
+    assert likelihood[0] == pytest.approx(total, rel=1e-9)

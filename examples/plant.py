@@ -206,7 +206,7 @@ def _play(p: Effect, ahead: Array, rate: Array) -> Array:
 
 TRANSMISSION: dict[str, Callable[[Effect, Array, Array], Array]] = {"joint_flexibility": _flexible, "backlash": _play}
 
-SUBSTEPS = {"backlash": 30, "joint_flexibility": 20, "presliding_friction": 20, "hard_stop": 20}
+SUBSTEPS = {"backlash": 20, "joint_flexibility": 20, "presliding_friction": 20, "hard_stop": 20}
 """Runge-Kutta steps per sample where ten are too few."""
 OTHERS = {
     *("base_tilt", "base_vibration", "payload", "payload_step", "link_inertia", "link_length", "center_of_mass"),
@@ -338,7 +338,7 @@ def _arm_lumps(p: dict[str, float]) -> tuple[float, ...]:
 
 
 def lumped(system: str, p: dict[str, float]) -> tuple[float, ...]:
-    """Inertias [kg m^2], then first moments of mass [kg m]; of a slide its mass."""
+    """Inertias [kg m^2], then first moments of mass [kg m]; of a slide its mass.  A pendulum's tip is at 2 lc."""
     if system == "acrobot":
         return _arm_lumps(p)
     if system == "pendulum":
@@ -822,7 +822,7 @@ _THIRDS: dict[str, dict[str, float]] = {
     "air_drag": {"c": 0.002},
     "motor_gain": {"gain": 0.9},
     "dead_zone": {"width": 0.013},
-    "saturation": {"limit": 0.22},
+    "saturation": {"limit": 0.18},
     "input_delay": {"delay": 0.01},
     "actuator_lag": {"tau": 0.017},
     "cogging": {"amplitude": 0.01},

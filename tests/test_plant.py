@@ -2,7 +2,6 @@
 
 import functools
 import json
-from pathlib import Path
 
 import numpy as np
 import plant
@@ -170,12 +169,33 @@ def test_a_shaking_base_is_gravity_turned_sideways():
     )
 
 
-def test_drag_at_the_tip_takes_its_power():
-    """Power of the drag is -c speed^3; an arm turning as one at joint 1 has the speed (l1 + l2) w."""
-    q, v = (0.4, 0.0), (3.0, 0.0)
-    drag = plant.STRONG["air_drag"]
+def _tip(q):
+    """Position and, by differences, Jacobian of the end of link 2."""
+
+    def place(q):
+        return 0.275 * np.array([np.sin(q[0]), -np.cos(q[0])]) + 0.285 * np.array([np.sin(q.sum()), -np.cos(q.sum())])
+
+    h = 1e-6
+    return place(q), np.stack([(place(q + d) - place(q - d)) / (2 * h) for d in h * np.eye(2)], axis=1)
+
+
+@pytest.mark.parametrize("exponent", [2.0, 1.8])
+def test_drag_at_the_tip_is_mapped_by_the_jacobian(exponent):
+    q, v = np.array([0.4, 0.7]), np.array([3.0, -2.0])
+    drag = ({**plant.STRONG["air_drag"][0], "exponent": exponent},)
     change = _acceleration(plant.Case(effects=drag), q, v) - _acceleration(plant.Case(), q, v)
-    assert v @ _mass(q) @ change == pytest.approx(-drag[0]["c"] * (0.56 * 3) ** 3, rel=1e-9)
+    jacobian = _tip(q)[1]
+    force = -0.006 * np.linalg.norm(jacobian @ v) ** (exponent - 1) * (jacobian @ v)
+    np.testing.assert_allclose(_mass(q) @ change, jacobian.T @ force, atol=1e-9)
+
+
+def test_a_payload_is_a_point_mass_at_the_tip():
+    q, v = np.array([0.4, 0.7]), np.array([3.0, -2.0])
+    x, loaded = np.array([[*q, *v]]), plant.Case(effects=plant.STRONG["payload"])
+    more = plant.energy(plant.build(loaded), x, 0.0)[0] - plant.energy(plant.build(plant.Case()), x, 0.0)[0]
+    place, jacobian = _tip(q)
+    speed = jacobian @ v
+    assert more == pytest.approx(0.04 * (speed @ speed / 2 + 9.81 * place[1]), rel=1e-8)
 
 
 def test_a_delay_of_whole_samples_shifts_the_input():
@@ -229,6 +249,9 @@ def test_a_bristle_at_steady_speed_is_the_static_map_and_a_spring_before():
     x[0, 4] = plant._stribeck_level(f, 2.0) / effect["sigma0"]
     assert plant._friction(p, x, np.zeros(1), dx)[0, 1] == pytest.approx(plant.friction_torque("stribeck", f, 2.0))
     assert dx[0, 4] == pytest.approx(0, abs=1e-12)
+    x[0, 4] = 0.0
+    plant._friction(p, x, np.zeros(1), dx)
+    assert dx[0, 4] == 2.0
     x[0, 3], x[0, 4] = 0.0, 0.001
     assert plant._friction(p, x, np.zeros(1), dx)[0, 1] == pytest.approx(-0.003)
 
@@ -281,6 +304,7 @@ def test_the_library_reads_the_folder(case, tmp_path):
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert rig.system == case.system and rig.clock == case.clock
     assert bool(rig.noise_std) == case.declare_noise
+    assert ("theta2" in rig.start) == (case.system == "acrobot" and case.hidden)
     for name, number in (("train", 3), ("test", 2)):
         data = read_logs(tmp_path / name, rig).data
         assert data.y.shape == (number, 61, len(plant.measured(case)))
@@ -333,9 +357,13 @@ def test_the_oracle_foretells_the_next_tenth_to_the_noise(effects, tmp_path):
         assert naive["theta1"][0] > 2 * error["theta1"][0]
 
 
-def test_the_filter_is_kalmans_on_a_slide(tmp_path: Path):
+def test_the_filter_is_kalmans_on_a_slide():
     """Without friction the slide is linear: mean and likelihood against the textbook's matrices."""
-    case = plant.Case(system="slide", noise=(0.01, 0.1), process=0.05, seed=3)
+    sensor = (
+        {"name": "sensor_scale", "channel": "x", "scale": 1.5},
+        {"name": "sensor_bias", "channel": "x", "bias": 0.2},
+    )
+    case = plant.Case(system="slide", effects=sensor, noise=(0.01, 0.1), process=0.05, seed=3)
     p = plant.build(case)._replace(friction=(FREE,))
     u, y = plant.torques(case)[:1, :30], np.random.default_rng(0).normal(0, 0.1, (1, 30, 1))
     a, b, q = np.array([[1, 0.01], [0, 1]]), np.array([0.01**2 / 2, 0.01]), np.diag([1e-10, 1e-10 + 0.05**2])
@@ -344,8 +372,8 @@ def test_the_filter_is_kalmans_on_a_slide(tmp_path: Path):
     for k in range(30):
         if k:
             m, c = a @ m + b * u[0, k - 1], a @ c @ a.T + q
-        s, e = c[0, 0] + 1e-4, y[0, k, 0] - m[0]
+        s, e = 1.5**2 * c[0, 0] + 1e-4, y[0, k, 0] - 1.5 * m[0] - 0.2
         total -= (e**2 / s + np.log(2 * np.pi * s)) / 2
-        m, c = m + c[:, 0] * e / s, c - np.outer(c[:, 0], c[0]) / s
+        m, c = m + 1.5 * c[:, 0] * e / s, c - 1.5**2 * np.outer(c[:, 0], c[0]) / s
     np.testing.assert_allclose(mean[0], m, atol=1e-9)
     assert likelihood[0] == pytest.approx(total, rel=1e-9)

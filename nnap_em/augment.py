@@ -13,6 +13,7 @@ from .data import Dataset
 from .effects import AbstractEffect, Around, Candidate, catalogue, fields
 from .gaussian import Gaussian
 from .model import StateSpaceModel, with_effects
+from .ode import integrate
 from .mstep import ParameterPrior, ScoringMStep
 from .rig import Rig
 from .smoother import StartBank
@@ -58,6 +59,26 @@ def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> A
     return jax.tree.map(combine, candidate.start, *candidate.probes)
 
 
+@eqx.filter_jit
+def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
+    """`path` of the model without its last effect, with the memory that this effect would have along it."""
+    size, width = model.effects[-1].memory, path.mean.shape[-1]
+    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
+
+    def one(mean, cov, seq):
+        def step(m, slices):
+            x, u = slices
+            rest = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
+            return integrate(rest, m, model.dt, model.steps), m
+
+        _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
+        wide = jnp.zeros((mean.shape[0], width + size, width + size), cov.dtype)
+        wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
+        return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
+
+    return jax.vmap(one)(path.mean, path.cov, data) if size else path
+
+
 def augment(
     model: StateSpaceModel, m_step: ScoringMStep, effect: AbstractEffect, candidate: Candidate
 ) -> tuple[StateSpaceModel, ScoringMStep]:
@@ -69,8 +90,8 @@ def augment(
     std = [getattr(candidate.spread, name) for name in fields(effect)]
     prior = ParameterPrior(
         m_step.prior.names + names,
-        jnp.concatenate([m_step.prior.mean, jnp.stack(mean)]),
-        jnp.concatenate([m_step.prior.std, jnp.stack(std)]),
+        jnp.concatenate([m_step.prior.mean, *map(jnp.ravel, mean)]),
+        jnp.concatenate([m_step.prior.std, *map(jnp.ravel, std)]),
     )
     full = with_effects(model, (*model.effects, effect))
     return full, eqx.tree_at(

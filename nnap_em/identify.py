@@ -83,7 +83,7 @@ def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[A
     [Immer, Korzepa & Bauer 2021, AISTATS].
     """
     weights = fitted.m_step.weights(fitted.model)
-    jac = weights.jacobian(fitted.model, weights.read(fitted.model))
+    jac = weights.jacobian(fitted.model.unknown, weights.read(fitted.model))
     unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
     factor = jnp.linalg.cholesky(fitted.state.hessian)
     return (jac @ jax.scipy.linalg.solve_triangular(factor.T, unit, lower=False)).T
@@ -109,7 +109,8 @@ def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
     prior = fitted.m_step.prior
     if not prior.names:
         return {}
-    cov = jnp.linalg.inv(fitted.state.hessian)[-len(prior.names) :, -len(prior.names) :]
+    cov = jnp.linalg.inv(fitted.state.hessian)[-prior.size :, -prior.size :]
     std = prior.std * jnp.sqrt(jnp.diag(cov))
     value = prior.mean + prior.std * prior.read(fitted.model)
-    return {n: (float(v), float(s)) for n, v, s in zip(prior.names, value, std, strict=True) if "." not in n}
+    declared = [name for name in prior.names if "." not in name]  # they stand first
+    return {n: (float(v), float(s)) for n, v, s in zip(declared, value, std, strict=False)}

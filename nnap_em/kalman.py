@@ -88,6 +88,9 @@ class Cubature(eqx.Module):
         return Affine(matrix, mean - matrix @ about.mean, noise)
 
 
+CUBATURE = Cubature()
+
+
 def linear_reading(model, x: Float[Array, " state"], u: Float[Array, " input"]) -> Reading:
     """The emission linearised at x."""
 

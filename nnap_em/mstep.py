@@ -17,6 +17,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
@@ -43,14 +44,22 @@ class ParameterPrior(eqx.Module):
         """The model's values as (value - mean) / std."""
         if not self.names:
             return self.mean
-        return (jnp.stack(self.places(model)) - self.mean) / self.std
+        return (jnp.concatenate([jnp.ravel(a) for a in self.places(model)]) - self.mean) / self.std
 
     def write(self, model, z: Float[Array, " param"]):
         """The model with values mean + std z."""
         if not self.names:
             return model
-        values = self.mean + self.std * z
-        return eqx.tree_at(self.places, model, list(values))
+        places = self.places(model)
+        cuts = np.cumsum([a.size for a in places])[:-1]
+        values = jnp.split(self.mean + self.std * z, cuts)
+        shaped = [v.reshape(a.shape) for v, a in zip(values, places, strict=True)]
+        return eqx.tree_at(self.places, model, shaped)
+
+    @property
+    def size(self) -> int:
+        """How many numbers are estimated."""
+        return self.mean.shape[0]
 
 
 class Quadratic(NamedTuple):
@@ -227,44 +236,50 @@ class Weights(eqx.Module):
         return jnp.concatenate([model.unknown.weights(), self.prior.read(model)])
 
     def write(self, model, w: Float[Array, " weight"]):
-        cut = w.shape[0] - len(self.prior.names)
+        cut = w.shape[0] - self.prior.size
         unknown = model.unknown.with_weights(w[:cut])
         return self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
 
-    def phi(self, model, w: Float[Array, " weight"]) -> Float[Array, " phi"]:
+    def phi(self, unknown, w: Float[Array, " weight"]) -> Float[Array, " phi"]:
         """The vector in which the likelihood is quadratic."""
-        cut = w.shape[0] - len(self.prior.names)
-        return jnp.concatenate([jax.vmap(model.unknown.with_weights(w[:cut]))(self.nodes.T).T.ravel(), w[cut:]])
+        cut = w.shape[0] - self.prior.size
+        return jnp.concatenate([jax.vmap(unknown.with_weights(w[:cut]))(self.nodes.T).T.ravel(), w[cut:]])
 
     def precision(self, w: Float[Array, " weight"]) -> Float[Array, " weight"]:
         """Prior precision of the weights."""
-        cut = w.shape[0] - len(self.prior.names)
+        cut = w.shape[0] - self.prior.size
         return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
 
     def middle(self) -> Float[Array, " weight"]:
         """Prior mean of the weights."""
-        return jnp.concatenate([self.centre, jnp.zeros(len(self.prior.names), self.centre.dtype)])
+        return jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
 
     def symmetry(self) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
         dof, count = self.nodes.shape
         even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1]) / math.sqrt(count)
         blocks = [even.T @ even / self.asymmetry[j] ** 2 for j in range(dof)]
-        return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((len(self.prior.names),) * 2))
+        return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
-    def jacobian(self, model, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
+    def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
         """Sensitivity of phi to the weights."""
-        return jax.jacfwd(lambda w: self.phi(model, w))(w)
+        return jax.jacfwd(lambda w: self.phi(unknown, w))(w)
 
-    def hessian(self, model, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
+    def hessian(self, unknown, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
         """Posterior precision of the weights, and the sensitivity of phi to them."""
-        jac = self.jacobian(model, w)
+        jac = self.jacobian(unknown, w)
         return jac.T @ information @ jac + jnp.diag(self.precision(w)), jac
 
-    def fit(self, model, score: Float[Array, " phi"], information: Float[Array, "phi phi"], iterations: int):
+    def fit(
+        self,
+        unknown,
+        w0: Float[Array, " weight"],
+        score: Float[Array, " phi"],
+        information: Float[Array, "phi phi"],
+        iterations: int,
+    ) -> Float[Array, " weight"]:
         """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3]."""
-        w0 = self.read(model)
-        phi0 = self.phi(model, w0)
+        phi0 = self.phi(unknown, w0)
         precision = self.precision(w0)
         middle = self.middle()
         symmetry = self.symmetry()
@@ -272,7 +287,7 @@ class Weights(eqx.Module):
         information = information + symmetry
 
         def loss(w):
-            d = self.phi(model, w) - phi0
+            d = self.phi(unknown, w) - phi0
             return -score @ d + 0.5 * d @ information @ d + 0.5 * jnp.sum(precision * (w - middle) ** 2)
 
         def going(carry):
@@ -281,8 +296,8 @@ class Weights(eqx.Module):
 
         def body(carry):
             w, value, damping, count, gain = carry
-            hessian, jac = self.hessian(model, w, information)
-            gradient = jac.T @ (information @ (self.phi(model, w) - phi0) - score) + precision * (w - middle)
+            hessian, jac = self.hessian(unknown, w, information)
+            gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
             factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.diag(jnp.diag(hessian)))
             trial = w - jax.scipy.linalg.cho_solve(factor, gradient)
             new = loss(trial)
@@ -303,6 +318,17 @@ class MStepInfo(NamedTuple):
     """Posterior precision of the weights, at those of the model that was given (zero for M-steps that know none)."""
     used: Bool[Array, " seq"]
     """Sequences that took part."""
+
+
+class Core(NamedTuple):
+    """What an M-step changes, whatever else the model is made of."""
+
+    unknown: eqx.Module
+    w: Float[Array, " weight"]
+    """Network weights, then parameters in units of their prior."""
+    log_q: Float[Array, " state"]
+    log_r: Float[Array, " obs"]
+    start: Gaussian
 
 
 class AbstractMStep(eqx.Module):
@@ -371,15 +397,23 @@ class ScoringMStep(AbstractMStep):
         used = used & jnp.all(jnp.isfinite(each.information), axis=(1, 2)) & jnp.all(jnp.isfinite(each.noise_score), 1)
         pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
         total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
-        w = weights.fit(model, total.score, total.information, self.iterations)
-        hessian, _ = weights.hessian(model, weights.read(model), total.information + weights.symmetry())
-        fitted = weights.write(model, w)
-        log_q, log_r = self._noise(model, total, weights.nodes.shape[0])
-        start = self._start(model.start, jax.tree.map(lambda a: pick(a[:, 0]), posterior.state), used)
-        fitted = eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, (log_q, log_r, start))
+        first = jax.tree.map(lambda a: pick(a[:, 0]), posterior.state)
+        core = Core(model.unknown, weights.read(model), model.log_q, model.log_r, model.start)
+        core, hessian = self.advance(core, weights, total, first, used)
+        fitted = weights.write(model, core.w)
+        fitted = eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
         return fitted, MStepInfo(hessian, used)
 
-    def _noise(self, model, total: Quadratic, dof: int):
+    def advance(
+        self, core: "Core", weights: Weights, total: Quadratic, first: Gaussian, used: Bool[Array, " seq"]
+    ) -> tuple["Core", Float[Array, "weight weight"]]:
+        """The step itself, of what every structure of a model has; and the posterior precision where it began."""
+        w = weights.fit(core.unknown, core.w, total.score, total.information, self.iterations)
+        hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
+        log_q, log_r = self._noise(core, total, weights.nodes.shape[0])
+        return Core(core.unknown, w, log_q, log_r, self._start(core.start, first, used)), hessian
+
+    def _noise(self, model: "Core", total: Quadratic, dof: int):
         info = total.noise_information
         learn = jnp.asarray([i < 2 * dof for i in range(model.log_q.shape[0])] + list(self.learn_r))
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
@@ -400,7 +434,7 @@ class ScoringMStep(AbstractMStep):
 
     def _start(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
         """EM's own update of the entries that nobody declared [paper, eq. 11]."""
-        learn = jnp.asarray(self.learn_start)
+        learn = jnp.asarray(self.learn_start + (False,) * (start.mean.shape[0] - len(self.learn_start)))
         count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)
         mean = jnp.where(learn, jnp.sum(first.mean, axis=0) / count, start.mean)
         square = jnp.where(used[:, None], (first.mean - mean[None]) ** 2, 0.0)

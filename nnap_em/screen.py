@@ -1,7 +1,7 @@
 """Score test of everything that the fitted model may lack, all candidates in one pass.
 
-Every candidate is a column: how the whitened readings would move if it were there.  Friction maps, uncertain parameters and
-effects already in the model are projected out, so that only what they cannot explain counts
+Every candidate is a column: how the whitened readings would move if it were there.  Friction maps, uncertain
+parameters and effects already in the model are projected out, so that only what they cannot explain counts
 [Rao 1948, Proc. Camb. Phil. Soc. 44; the columns by the sensitivity equations of the Kalman filter].
 """
 
@@ -15,13 +15,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .data import Dataset, fill_missing
-from .effects import AbstractEffect, Candidate
+from .effects import AbstractEffect, Candidate, Scene
 from .gaussian import Gaussian
 from .kalman import TANGENT, kalman_filter
-from .model import StateSpaceModel, with_effects
-from .mstep import Weights, friction_columns, local, whitened_sensitivities
+from .model import StateSpaceModel
+from .mstep import Local, ParameterPrior, Weights, friction_columns, local, whitened_sensitivities
 from .ode import integrate
 from .smoother import active_steps
+
+
+class Track(NamedTuple):
+    """What candidates see of a fitted model along the smoothed path of a sequence, whatever its structure."""
+
+    local: Local
+    middle: Float[Array, "*time state"]
+    """State (q, v) in the middle of every step."""
+    acceleration: Float[Array, "*time dof"]
+    """In the middle of every step [rad/s^2]."""
+    rate: Float[Array, "*time state"]
+    """Time derivative of (q, v) in every row."""
+    u: Float[Array, "*time input"]
+    """What reaches the joints."""
 
 
 class Columns(NamedTuple):
@@ -54,29 +68,63 @@ class Verdict(NamedTuple):
     """Multiples of the probes."""
 
 
-def columns(null: StateSpaceModel, effect: AbstractEffect, path: Float[Array, "time state"], seq: Dataset) -> Columns:
-    """Force and reading that `effect` adds to `null` along a path, as the middle of every step sees it."""
+@eqx.filter_jit
+def tracks(null: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Track:
+    """The local models along the paths of all sequences."""
     dof = len(null.system.coordinates)
-    full = with_effects(null, (*null.effects, effect))
-    u, v = null.inputs(seq), full.inputs(seq)
-    still = jnp.zeros(dof, path.dtype)
-    middle = path + 0.5 * null.dt * jax.vmap(lambda x, u: null.rate(x, u, still))(path, u)
-    memory = jnp.zeros((path.shape[0], effect.memory), path.dtype)
+    still = jnp.zeros(dof, path.mean.dtype)
+
+    def one(path: Gaussian, seq: Dataset):
+        u = null.inputs(seq)
+        rate = jax.vmap(lambda x, u: null.rate(x, u, still))
+        now = rate(path.mean, u)
+        middle = path.mean + 0.5 * null.dt * now
+        acceleration = rate(middle, u)[:, dof : 2 * dof]
+        here = local(null, prior, path, seq, TANGENT)
+        return Track(here, middle[:, : 2 * dof], acceleration, now[:, : 2 * dof], u[:, : seq.u.shape[-1]])
+
+    return jax.vmap(one)(path, data)
+
+
+def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene, x, seq: Dataset) -> Columns:
+    """What `effect` adds, by its own hooks, to the machine `base` along a track."""
+    system, substeps = base.system, max(effect.substeps, base.substeps)
+    u = track.u
+    if effect.joint in system.joints:
+        i = system.joints.index(effect.joint)
+        u = u.at[:, i].set(effect.input(u[:, i], base.dt))
+    drive = jax.vmap(system.drive)(u)
+    driven = scenes._replace(drive=drive)
+
+    def remember(m, scene):
+        return integrate(lambda m: effect.drift(_scene(base, scene), m), m, base.dt, substeps), m
+
+    memory = jnp.zeros((x.shape[0], effect.memory), x.dtype)
     if effect.memory:
+        _, memory = jax.lax.scan(remember, memory[0], driven)
 
-        def step(m, slices):
-            x, u = slices
-            rest = lambda m: full.rate(jnp.concatenate([x, m]), u, still)[x.shape[0] :]  # noqa: E731
-            return integrate(rest, m, null.dt, full.steps), m
+    def one(scene, memory, acceleration):
+        scene = _scene(base, scene)
+        true = effect.physics(system, scene.time)
+        body = system.bias(scene.q, scene.v) - true.bias(scene.q, scene.v)
+        body = body + (system.mass(scene.q) - true.mass(scene.q)) @ acceleration
+        return body + effect.force(scene, memory) + effect.friction(scene.friction, scene) - scene.friction
 
-        _, memory = jax.lax.scan(step, memory[0], (middle, v))
+    force = jax.vmap(one)(driven, memory, track.acceleration) + drive - scenes.drive
 
-    def one(x, m, now, u, v):
-        change = (full.rate(jnp.concatenate([x, m]), v, still) - jnp.pad(null.rate(x, u, still), (0, m.shape[0])))
-        read = full.emission(jnp.concatenate([now, m]), v) - null.emission(now, u)
-        return Columns(null.system.mass(x[:dof]) @ change[dof : 2 * dof], read)
+    def read(x, rate):
+        out = [jnp.zeros((), x.dtype)] * x.shape[0]
+        for i, name in enumerate(system.coordinates + system.rates):
+            if effect.channel in (name, "all"):
+                out[i] = effect.reading(x[i], lambda delay, i=i: x[i] - delay * rate[i]) - x[i]
+        return jnp.stack([out[i] for i in base.measured])
 
-    return jax.vmap(one)(middle, memory, path, u, v)
+    return Columns(force, jax.vmap(read)(x, track.rate))
+
+
+def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
+    """A scene whose numbers came through a batch."""
+    return numbers._replace(system=base.system, map=base.unknown)
 
 
 def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractEffect]]:
@@ -89,43 +137,62 @@ def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractE
 
 
 @eqx.filter_jit
-def _sheet(null: StateSpaceModel, weights: Weights, stacks, path: Gaussian, data: Dataset):
-    dof = len(null.system.coordinates)
+def _all_columns(base: StateSpaceModel, stacks, track: Track, path: Gaussian, data: Dataset) -> Columns:
+    """Columns of all probes: the same program whatever the model has learned meanwhile."""
+    dof = len(base.system.coordinates)
 
-    def one(path: Gaussian, seq: Dataset):
+    def one(track: Track, path: Gaussian, seq: Dataset):
+        q, v = track.middle[:, :dof], track.middle[:, dof:]
+        drive, friction = jax.vmap(base.system.drive)(track.u), jax.vmap(base.unknown)(v)
+        scenes = Scene(None, q, v, drive, jnp.asarray(seq.t) + 0.5 * base.dt, friction, None)  # type: ignore[arg-type]
+        x = path.mean[:, : 2 * dof]
+        found = [jax.vmap(lambda e: _columns(base, e, track, scenes, x, seq))(stack) for stack in stacks]
+        return jax.tree.map(lambda *a: jnp.concatenate(a), *found)
+
+    return jax.vmap(one)(track, path, data)
+
+
+@eqx.filter_jit
+def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, path: Gaussian, data: Dataset):
+    dof = nodes.shape[0]
+
+    def one(args):
+        track, found, path, seq = args
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
         active = active_steps(jnp.asarray(seq.valid))
-        here = local(null, weights.prior, path, seq, TANGENT)
-        filtered = kalman_filter(
-            null.log_q, null.log_r, null.start, here.affine, here.reading, y, observed, active
-        )
-        found = [jax.vmap(lambda e: columns(null, e, path.mean, seq))(stack) for stack in stacks]
-        force = jnp.concatenate([f.force for f in found])
-        reading = jnp.concatenate([f.reading for f in found])
-        moved = jnp.einsum("tsd,ctd->tsc", here.by_force, force)
-        speed = 0.5 * (path.mean[1:] + path.mean[:-1])[:, dof : 2 * dof]
-        speed = jnp.concatenate([speed, speed[-1:]])
-        torque, _ = jax.vmap(lambda v, b: friction_columns(weights.nodes, v[None], b))(speed, here.by_force)
+        here = track.local
+        filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
+        moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+        torque, _ = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(track.middle[:, dof:], here.by_force)
         of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
         states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
         readings = jnp.concatenate(
-            [of_torque, here.reading_by_parameter, jnp.moveaxis(reading, 0, -1)], axis=-1
+            [of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1
         )
         states = jnp.where(active[:, None, None], states, 0.0)
         jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
         return jac.T @ filtered.innovation.ravel(), jac.T @ jac
 
-    return jax.lax.map(lambda args: one(*args), (path, data))
+    return jax.lax.map(one, (track, found, path, data))
 
 
 def sheet(
-    null: StateSpaceModel, weights: Weights, candidates: Sequence[Candidate], path: Gaussian, data: Dataset
+    base: StateSpaceModel,
+    null: StateSpaceModel,
+    weights: Weights,
+    candidates: Sequence[Candidate],
+    path: Gaussian,
+    data: Dataset,
 ) -> Sheet:
-    """Columns of all probes of all candidates, along the smoothed path of `null`."""
+    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects."""
     probes = [probe for candidate in candidates for probe in candidate.probes]
     groups = _groups(probes)
-    score, information = (np.asarray(a) for a in _sheet(null, weights, [g for _, g in groups], path, data))
+    track = tracks(null, weights.prior, path, data)
+    base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
+    found = _all_columns(base, [g for _, g in groups], track, path, data)
+    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, track, found, path, data)
+    score, information = (np.asarray(a) for a in outcome)
     nuisance = score.shape[1] - len(probes)
     order = np.argsort([i for index, _ in groups for i in index])
     take = np.concatenate([np.arange(nuisance), nuisance + order])
@@ -139,30 +206,41 @@ def _smooth_prior(weights: Weights) -> np.ndarray:
     size = 10 * np.asarray(weights.asymmetry)
     bend = np.diff(np.eye(count), 2, axis=0)
     blocks = [np.eye(count) / s**2 + bend.T @ bend / (0.3 * s) ** 2 for s in size]
-    out = np.eye(dof * count + len(weights.prior.names))
+    out = np.eye(dof * count + weights.prior.size)
     for j, block in enumerate(blocks):
         out[j * count : (j + 1) * count, j * count : (j + 1) * count] = block
     return out
 
 
-def judge(sheet: Sheet, candidates: Sequence[Candidate], used: Float[np.ndarray, " seq"]) -> list[Verdict]:
-    """The score test of every candidate over the sequences with weight `used`."""
+class Projected(NamedTuple):
+    """Score and information of the candidate columns once the nuisance has taken what it can."""
+
+    score: Float[np.ndarray, " column"]
+    information: Float[np.ndarray, "column column"]
+
+
+def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
+    """Sum over sequences with weight `used`, and project."""
     score = np.einsum("s,sc->c", used, sheet.score)
     information = np.einsum("s,scd->cd", used, sheet.information)
     n = sheet.nuisance
     factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
     half = np.linalg.solve(factor, information[:n, n:])
     left = np.linalg.solve(factor, score[:n])
-    score = score[n:] - half.T @ left
-    information = information[n:, n:] - half.T @ half
+    return Projected(score[n:] - half.T @ left, information[n:, n:] - half.T @ half)
+
+
+def judge(projected: Projected, candidates: Sequence[Candidate]) -> list[Verdict]:
+    """The score test of every candidate."""
     out, place = [], 0
     for candidate in candidates:
         here = slice(place, place + len(candidate.probes))
         place = here.stop
-        values, vectors = np.linalg.eigh(information[here, here])
+        values, vectors = np.linalg.eigh(projected.information[here, here])
         # a unit of a probe is a typical strength: what a few of them would not show is not seen
         seen = values > max(1e-6 * values[-1], 1e-3)
-        along = vectors[:, seen].T @ score[here]
+        along = vectors[:, seen].T @ projected.score[here]
         weight = values[seen] + 0.01
-        out.append(Verdict(float(0.5 * np.sum(along**2 / weight)), int(seen.sum()), vectors[:, seen] @ (along / weight)))
+        gain = float(0.5 * np.sum(along**2 / weight))
+        out.append(Verdict(gain, int(seen.sum()), vectors[:, seen] @ (along / weight)))
     return out

@@ -252,9 +252,9 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
     weights = Weights(MASS, nodes, 1.0, middle, jnp.asarray([0.3]))
     target, information = _quadratic(0, nodes, 1)
     w0 = weights.read(model)
-    phi0 = weights.phi(model, w0)
+    phi0 = weights.phi(model.unknown, w0)
     score = information @ (target - phi0)
-    w = weights.fit(model, score, information, 500)
+    w = weights.fit(model.unknown, w0, score, information, 500)
 
     @jax.jit
     def loss(w):
@@ -270,7 +270,7 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
     # the loop ends when its smoothed gain is below 1e-3 nats a step; what is left must not matter (a nat = 1 std)
     assert float(loss(w)) - better.fun < 0.1
     gradient = jax.grad(loss)(w)
-    hessian, _ = weights.hessian(model, w, information + weights.symmetry())
+    hessian, _ = weights.hessian(model.unknown, w, information + weights.symmetry())
     assert 0.5 * float(gradient @ jnp.linalg.solve(hessian, gradient)) < 0.01  # Newton decrement [nats]
 
 
@@ -281,7 +281,7 @@ def test_fit_of_parameters_alone_is_ridge_regression():
     information = jnp.diag(jnp.asarray([3.0, 3.0, 50.0]))
     score = jnp.asarray([1.0, -2.0, 40.0])
     w0 = weights.read(model)
-    w = weights.fit(model, score, information, 200)
+    w = weights.fit(model.unknown, w0, score, information, 200)
     # maximum of 40 (w - w0) - 25 (w - w0)^2 - w^2 / 2; the loop stops within 1e-3 nats, of curvature 51
     np.testing.assert_allclose(w, (40 + 50 * w0) / 51, atol=np.sqrt(2 * 1e-3 / 51))
     written = weights.write(model, w)

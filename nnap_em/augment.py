@@ -39,6 +39,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
         rig.dt,
         (float(clock.min()), float(clock.max())),
+        rig.clock == "session",
         rig.friction,
     )
 

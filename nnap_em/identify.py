@@ -3,15 +3,17 @@
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from .build import Problem, build
+from .build import build
 from .data import Dataset
+from .effects import AbstractEffect
 from .em import SCHEDULE, EMState, Schedule, fit, start_state
-from .model import StateSpaceModel
+from .model import StateSpaceModel, with_effects
 from .mstep import ScoringMStep
 from .rig import Rig
 from .smoother import AbstractSmoother, CubatureSmoother, StartBank
@@ -49,11 +51,14 @@ class FrictionTable(NamedTuple):
         return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
 
 
-def begin(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Identified:
-    """The problem before the first epoch."""
+def begin(rig: Rig, data: Dataset, *, key: PRNGKeyArray, effects: tuple[AbstractEffect, ...] = ()) -> Identified:
+    """The problem before the first epoch; `effects` join the model as they are."""
     key_build, key_fit = jax.random.split(key)
-    problem: Problem = build(rig, data, key=key_build)
-    return Identified(rig, start_state(problem.model, problem.mstep, key=key_fit), problem.mstep, problem.bank)
+    model, rule, bank = build(rig, data, key=key_build)
+    full = with_effects(model, effects)
+    rule = eqx.tree_at(lambda m: m.shape, rule, full.log_q)
+    bank = bank.padded(full.log_q.shape[0])
+    return Identified(rig, start_state(full, rule, key=key_fit), rule, bank)
 
 
 def identify(

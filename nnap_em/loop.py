@@ -13,18 +13,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .augment import augment, extended, proposals, seeded, surroundings
 from .data import Dataset, horizon
 from .effects import AbstractEffect, Candidate, fields
 from .em import EMState, Schedule, fit, start_state
 from .gaussian import Gaussian
-from .identify import Identified
-from .model import StateSpaceModel, with_effects
-from .mstep import ParameterPrior, ScoringMStep, kept
+from .identify import Identified, identify
+from .model import StateSpaceModel
+from .mstep import ScoringMStep, kept
 from .refit import Trial, refit
-from .screen import Sheet, Verdict, judge, project, sheet
+from .rig import Rig
+from .screen import Verdict, judge, project, sheet
 from .smoother import CubatureSmoother
 
 Say = Callable[[str], None]
@@ -35,9 +36,9 @@ Key = tuple[str, int | None, str | None, tuple[str, ...]]
 class Rules(NamedTuple):
     """When an effect is believed."""
 
-    shortlist: int = 6
+    shortlist: int = 5
     """Candidates that are refitted."""
-    near: float = 0.3
+    near: float = 0.4
     """Share of the best expected gain below which a candidate is not refitted."""
     passes: int = 5
     """Passes of a refit."""
@@ -226,7 +227,11 @@ def look(
         values = {n: float(f"{float(v):.4g}") for n, v in entry.effect.values().items()}
         say(f"  tried {_text(key_of(entry.effect))} {values}: expected {verdict.gain:.0f}, refit {gain:.0f} nat")
     outcome = tuple((key_of(e.effect), e.net) for e in sorted(tried, key=lambda e: -e.net))
-    sound = [e for e in tried if e.effect.possible() and e.net > rules.margin and _significance(e.candidate, e.trial) > rules.certain]
+    sound = [
+        e
+        for e in tried
+        if e.effect.possible() and e.net > rules.margin and _significance(e.candidate, e.trial) > rules.certain
+    ]
     if not sound:
         return now, Step(length, screened, outcome, None), None
     winner = max(sound, key=lambda e: e.net)
@@ -274,6 +279,8 @@ def close(
     state: EMState | None = None
     last = 0
     for length in dict.fromkeys(lengths):
+        if now.found and length < longest:
+            continue  # EM grows to the whole length by itself
         if not now.found:
             own = stages[length][0].best if length in stages else before.model
             now = now._replace(model=own if length < longest else before.model)
@@ -284,7 +291,7 @@ def close(
         if length <= 128:
             part = jax.tree.map(lambda a, n=length: a[:, :n], part)
         while len(now.found) < rules.most:
-            path, _, used = _smoothed(now.model, part, CubatureSmoother(_bank(before, now.model)))
+            path, _, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
             used = np.asarray(used)
             say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
             now, step, trial = look(now, before, path, part, used, rules, say)
@@ -299,16 +306,8 @@ def close(
         return Closed(before, before, (), tuple(steps))
     if state is None:
         state = _grow(now, data, before, longest, longest, say)
-    after = Identified(before.rig, state, now.m_step, _bank(before, now.model))
+    after = Identified(before.rig, state, now.m_step, before.bank.padded(now.model.log_q.shape[0]))
     return Closed(before, after, now.found, tuple(steps))
-
-
-def _bank(before: Identified, model: StateSpaceModel):
-    """The hypotheses of the start, with none for the memory of effects."""
-    extra = model.start.mean.shape[0] - before.bank.offsets.shape[1]
-    wide = jnp.pad(before.bank.offsets, ((0, 0), (0, extra)))
-    narrow = jnp.pad(before.bank.shrink, (0, extra), constant_values=1.0)
-    return eqx.tree_at(lambda b: (b.offsets, b.shrink), before.bank, (wide, narrow))
 
 
 def _grow(now: _Now, data: Dataset, before: Identified, first: int, length: int, say: Say) -> EMState:
@@ -317,7 +316,31 @@ def _grow(now: _Now, data: Dataset, before: Identified, first: int, length: int,
     part = horizon(data, length)
     state = start_state(now.model, now.m_step, key=before.state.key)._replace(epoch=1)
     growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0
-    smoother = CubatureSmoother(_bank(before, now.model))
+    smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
     state = fit(state, part, smoother, now.m_step, epochs=growing + 7, schedule=schedule)
-    say(f"  fitted over {length * before.rig.dt:.2f} s in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
+    say(
+        f"  fitted over {length * before.rig.dt:.2f} s in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence"
+    )
     return state
+
+
+def close_the_loop(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    rules: Rules = RULES,
+    say: Say = lambda text: None,
+) -> Closed:
+    """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
+
+    Raises FitError when no sequence can be followed.
+    """
+    stages: dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]] = {}
+
+    def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
+        stages[seen] = (state, used)
+        say(f"epoch {state.epoch}, horizon {seen * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+
+    before = identify(rig, data, key=key, watch=watch)
+    return close(before, stages, data, rules=rules, say=say)

@@ -53,9 +53,7 @@ def _pass(rule: ScoringMStep, core: Core, here: Local, path: Gaussian, data: Dat
         affine = jax.tree.map(lambda a: a[:-1, None], here.affine)
         kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
         endless = jnp.full_like(filtered.loglik, jnp.inf)
-        posterior = Posterior(
-            smoothed.state, prev, following, kick, here.affine.noise[:-1], filtered.loglik, endless
-        )
+        posterior = Posterior(smoothed.state, prev, following, kick, here.affine.noise[:-1], filtered.loglik, endless)
         nodes = jnp.concatenate([prev, following[-1:]])
         read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
         about = quadratic(core.log_q, core.log_r, core.start, here, weights.nodes, posterior, read, seq)
@@ -68,9 +66,7 @@ def _pass(rule: ScoringMStep, core: Core, here: Local, path: Gaussian, data: Dat
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
     first = jax.tree.map(lambda a: pick(a[:, 0]), state)
     following, hessian = rule.advance(core, weights, total, first, fine)
-    steady = jax.tree.map(
-        lambda new, old: jnp.where(fine.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path
-    )
+    steady = jax.tree.map(lambda new, old: jnp.where(fine.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path)
     return following, steady, loglik, hessian
 
 

@@ -167,9 +167,7 @@ def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, path: Gauss
         torque, _ = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(track.middle[:, dof:], here.by_force)
         of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
         states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-        readings = jnp.concatenate(
-            [of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1
-        )
+        readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
         states = jnp.where(active[:, None, None], states, 0.0)
         jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
         return jac.T @ filtered.innovation.ravel(), jac.T @ jac

@@ -60,6 +60,13 @@ class StartBank(eqx.Module):
         self.offsets = jnp.stack([a.ravel() for a in jnp.meshgrid(*lines, indexing="ij")], axis=-1)
         self.shrink = jnp.asarray([1.2 * reach / (n - 1) if n > 1 else 1.0 for n in counts], dtype)
 
+    def padded(self, states: int) -> "StartBank":
+        """This bank for a state with more entries, which it leaves as they are."""
+        extra = states - self.shrink.shape[0]
+        wide = jnp.pad(self.offsets, ((0, 0), (0, extra)))
+        narrow = jnp.pad(self.shrink, (0, extra), constant_values=1.0)
+        return eqx.tree_at(lambda b: (b.offsets, b.shrink), self, (wide, narrow))
+
     def hypotheses(self, start: Gaussian) -> tuple[Gaussian, Float[Array, " hypothesis"]]:
         """The hypotheses and their log weights, unnormalised."""
         spread = jnp.sqrt(jnp.diag(start.cov))

@@ -20,6 +20,7 @@ import numpy as np
 
 from . import __version__
 from .data import Dataset
+from .effects import catalogue, parts
 from .identify import Identified, begin
 from .rig import Declared, Rig
 from .systems import systems
@@ -79,6 +80,7 @@ def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mappin
         "format": FORMAT,
         "version": __version__,
         "rig": dataclasses.asdict(fitted.rig),
+        "effects": [_sketch(effect) for effect in fitted.model.effects],
         "leaves": leaves,
         "settings": settings,
         "fingerprint": fingerprint,
@@ -216,12 +218,44 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
             differs(place, "a setting that only one of the two has")
         return _tuples(settings[place]) if place in settings else value
 
-    blank = begin(rig, _blank(rig), key=jax.random.key(0))
+    effects = tuple(_drawn(path, sketch) for sketch in header.get("effects", []))
+    blank = begin(rig, _blank(rig), key=jax.random.key(0), effects=effects)
     tree = _rebuild(_tree(blank), "", leaf, setting)
     for place in (*leaves, *settings):
         if place not in seen:
             differs(place, "unknown here")
     return Identified(rig=rig, **tree)
+
+
+def _sketch(node: Any) -> Any:
+    """The structure of an effect as JSON: modules by name, arrays by their number of axes."""
+    if isinstance(node, eqx.Module):
+        kind = type(node)
+        parts = {f.name: _sketch(getattr(node, f.name)) for f in dataclasses.fields(node)}
+        return {"module": kind.__module__.rpartition(".")[2], "kind": kind.__name__, "parts": parts}
+    if isinstance(node, tuple) and not _plain(node):
+        return {"items": [_sketch(item) for item in node]}
+    return {"axes": np.ndim(node)} if eqx.is_array(node) else {"plain": node}
+
+
+def _drawn(path: Path, sketch: Mapping[str, Any]) -> Any:
+    """An effect of that structure, to put the numbers in."""
+    if "kind" in sketch:
+        places = {**catalogue, **{kind.__name__: kind for kind in parts}}
+        found = [k for k in places.values() if k.__name__ == sketch["kind"] and _module(k) == sketch["module"]]
+        if not found:
+            _refuse(path, f"its effect {sketch['kind']!r} is not in the catalogue here", "install what adds it")
+        made = object.__new__(found[0])
+        for name, part in sketch["parts"].items():
+            object.__setattr__(made, name, _drawn(path, part))
+        return made
+    if "items" in sketch:
+        return tuple(_drawn(path, item) for item in sketch["items"])
+    return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else _tuples(sketch["plain"])
+
+
+def _module(kind: type) -> str:
+    return kind.__module__.rpartition(".")[2]
 
 
 def _tuples(value: Any) -> Any:

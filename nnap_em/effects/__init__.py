@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 
 from .base import AbstractEffect, Around, Candidate, Scene, fields
+from .function import Axis
 
 
 def _leaves(kind: type[AbstractEffect]) -> list[type[AbstractEffect]]:
@@ -15,5 +16,7 @@ for _module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
 
 catalogue: dict[str, type[AbstractEffect]] = {kind.name: kind for kind in _leaves(AbstractEffect)}
 """Effects by the name of the vocabulary."""
+parts: tuple[type, ...] = (Axis,)
+"""What effects are made of besides numbers."""
 
-__all__ = ["AbstractEffect", "Around", "Candidate", "Scene", "catalogue", "fields"]
+__all__ = ["AbstractEffect", "Around", "Candidate", "Scene", "catalogue", "fields", "parts"]

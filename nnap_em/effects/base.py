@@ -51,6 +51,8 @@ class Around(NamedTuple):
     dt: float
     duration: tuple[float, float]
     """First and last time on the clock [s]."""
+    session: bool
+    """True where the clock runs on over all sequences."""
     learned: bool
     """True where a friction map is learned."""
 
@@ -131,9 +133,9 @@ class AbstractEffect(eqx.Module):
         return value
 
 
-def fields(effect: AbstractEffect | type[AbstractEffect]) -> tuple[str, ...]:
+def fields(effect: AbstractEffect) -> tuple[str, ...]:
     """Names of the parameters, in the order of a fit."""
-    return tuple(f.name for f in dataclasses.fields(effect) if not f.metadata.get("static", False))
+    return tuple(f.name for f in dataclasses.fields(effect) if eqx.is_array(getattr(effect, f.name)))
 
 
 def at_joint(joint: int | None, value: Scalar, scene: Scene) -> Float[Array, " dof"]:

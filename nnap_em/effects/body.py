@@ -95,6 +95,8 @@ class PayloadStep(AbstractEffect):
 
     @classmethod
     def candidates(cls, around):
+        if not around.session:
+            return []
         first, last = around.duration
         out = []
         for j, size in varieties(around, "payload"):

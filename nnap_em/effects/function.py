@@ -40,7 +40,7 @@ class UnknownFunction(AbstractEffect):
 
     name: ClassVar[str] = "unknown_function"
     weights: Float[Array, " basis"]
-    axes: tuple[Axis, ...] = eqx.field(static=True)
+    axes: tuple[Axis, ...]
     joint: int | None = eqx.field(static=True)
     channel: str | None = eqx.field(static=True, default=None)
 

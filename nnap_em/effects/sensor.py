@@ -61,7 +61,8 @@ class SensorDelay(AbstractEffect):
     def candidates(cls, around):
         names = (*around.measured, *(("all",) if len(around.measured) > 1 else ()))
         return [
-            Candidate(cls(a(0.0), name), (cls(a(0.5 * around.dt), name),), cls(a(3 * around.dt), name)) for name in names
+            Candidate(cls(a(0.0), name), (cls(a(0.5 * around.dt), name),), cls(a(3 * around.dt), name))
+            for name in names
         ]
 
     def possible(self):

@@ -1,22 +1,20 @@
 """A model with more effects: what the fit then has to estimate, and where it starts."""
 
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .build import measure_scales
 from .data import Dataset
 from .effects import AbstractEffect, Around, Candidate, catalogue, fields
 from .gaussian import Gaussian
 from .model import StateSpaceModel, with_effects
-from .ode import integrate
 from .mstep import ParameterPrior, ScoringMStep
+from .ode import integrate
 from .rig import Rig
-from .smoother import StartBank
 
 
 def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian) -> Around:

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
 from .augment import augment, extended, proposals, seeded, surroundings
 from .data import Dataset, horizon
@@ -40,7 +40,7 @@ class Rules(NamedTuple):
     """Candidates that are refitted."""
     near: float = 0.4
     """Share of the best expected gain below which a candidate is not refitted."""
-    passes: int = 5
+    passes: int = 8
     """Passes of a refit."""
     margin: float = 12.0
     """Log-likelihood [nat] that must be left of a gain after paying half of log(readings) for every parameter."""
@@ -50,6 +50,8 @@ class Rules(NamedTuple):
     """Effects at most."""
     named: float = 0.6
     """Share of the gain of an unnamed law that a named one must reach to be preferred."""
+    rivals: float = 0.6
+    """Share of the winner's gain from which on another one is followed further too."""
     even: float = 5.0
     """Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 
@@ -84,8 +86,7 @@ class Found(NamedTuple):
     p_value: float
     """Of the likelihood ratio, times the number of candidates tried."""
     horizon: int
-    rivals: tuple[tuple[Key, float], ...]
-    """Refitted alternatives and how much less they gained [nat]."""
+    """Rows of each sequence on which it was found."""
 
 
 class Step(NamedTuple):
@@ -96,6 +97,8 @@ class Step(NamedTuple):
     """Best of every kind with its net expected gain [nat]."""
     refitted: tuple[tuple[Key, float], ...]
     accepted: Key | None
+    tried: int
+    """Candidates screened."""
 
 
 class Closed(NamedTuple):
@@ -113,9 +116,9 @@ def key_of(effect: AbstractEffect) -> Key:
 
 
 @eqx.filter_jit
-def _smoothed(model, data: Dataset, smoother) -> tuple[Gaussian, Float[Array, " seq"], Bool[Array, " seq"]]:
+def _smoothed(model, data: Dataset, smoother) -> tuple[Gaussian, Bool[Array, " seq"]]:
     posterior = jax.vmap(lambda seq: smoother(model, seq))(data)
-    return posterior.state, posterior.loglik, kept(posterior, data)
+    return posterior.state, kept(posterior, data)
 
 
 class _Now(NamedTuple):
@@ -190,9 +193,7 @@ def _held_out(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) ->
             refit(t.model, t.m_step, t.path, data, mask, passes=passes).loglik[used & ~mask] for t in (null, full)
         ]
         gains.append(logliks[1] - logliks[0])
-    gain = np.sort(np.nan_to_num(np.concatenate(gains), nan=-1e3))
-    cut = gain.size // 6
-    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+    return _trimmed(np.concatenate(gains))
 
 
 def _chi2_tail(x: float, df: int) -> float:
@@ -202,8 +203,8 @@ def _chi2_tail(x: float, df: int) -> float:
 
 def look(
     now: _Now, before: Identified, path: Gaussian, data: Dataset, used, rules: Rules, say: Say
-) -> tuple[_Now, Step, Trial | None]:
-    """One look at one horizon: at most one effect more."""
+) -> tuple[Step, list[Refitted], Trial | None]:
+    """One look at one horizon: everything screened, the best few refitted; those that hold, best first."""
     length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     around = surroundings(before.rig, now.model, data, path)
     candidates = proposals(around)
@@ -213,9 +214,9 @@ def look(
     ranked = _best_of_kind(candidates, verdicts, data)
     present = {key_of(effect) for effect in now.model.effects}
     entries = _shortlist(ranked, present, rules)
-    screened = tuple((key_of(c.start), net) for net, c, _ in ranked)
+    step = Step(length, tuple((key_of(c.start), net) for net, c, _ in ranked), (), None, len(candidates))
     if not entries:
-        return now, Step(length, screened, (), None), None
+        return step, [], None
     null = refit(now.model, now.m_step.early(), path, data, used, passes=rules.passes)
     tried = []
     for candidate, verdict in entries:
@@ -226,28 +227,49 @@ def look(
         tried.append(entry)
         values = {n: float(f"{float(v):.4g}") for n, v in entry.effect.values().items()}
         say(f"  tried {_text(key_of(entry.effect))} {values}: expected {verdict.gain:.0f}, refit {gain:.0f} nat")
-    outcome = tuple((key_of(e.effect), e.net) for e in sorted(tried, key=lambda e: -e.net))
+    tried.sort(key=lambda e: -e.net)
+    step = step._replace(refitted=tuple((key_of(e.effect), e.net) for e in tried))
     sound = [
         e
         for e in tried
         if e.effect.possible() and e.net > rules.margin and _significance(e.candidate, e.trial) > rules.certain
     ]
-    if not sound:
-        return now, Step(length, screened, outcome, None), None
-    winner = max(sound, key=lambda e: e.net)
     named = [e for e in sound if e.effect.name != "unknown_function"]
-    if winner.effect.name == "unknown_function" and named:
-        best = max(named, key=lambda e: e.net)
-        winner = best if best.net > rules.named * winner.net else winner
-    held_out = _held_out(null, winner.trial, data, used)
-    say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} on sequences not fitted to")
-    if held_out < rules.margin / 2:
-        return now, Step(length, screened, outcome, None), None
-    p_value = min(1.0, _chi2_tail(2 * winner.gain, len(fields(winner.candidate.start))) * len(candidates))
-    rivals = tuple((key_of(e.effect), winner.gain - e.gain) for e in tried if e is not winner)
-    found = Found(winner.candidate, winner.gain, held_out, p_value, length, rivals)
-    model, rule = winner.trial.model, now_rule(now.m_step, winner.trial.m_step)
-    return _Now(model, rule, (*now.found, found)), Step(length, screened, outcome, key_of(winner.effect)), winner.trial
+    if sound and named and sound[0] not in named and named[0].net > rules.named * sound[0].net:
+        sound = named
+    return step, sound, null
+
+
+def _settle(
+    now: _Now, before: Identified, data: Dataset, length: int, sound: list[Refitted], rules: Rules, say: Say
+) -> tuple[Refitted, EMState | None]:
+    """The winner; where the next ones are near, each is followed to a longer horizon, where the wrong ones fail."""
+    rivals = [e for e in sound if e.net > rules.rivals * sound[0].net][:3]
+    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    if len(rivals) == 1 or length == longest:
+        return sound[0], None
+    further = min(longest, round(2.5 * length))
+    say(f"  {len(rivals)} of them are near: followed to {further * before.rig.dt:.2f} s")
+    states = [_grow(_taken(now, e), data, before, length, further, say) for e in rivals]
+    tops = np.stack([np.nan_to_num(s.top, nan=-1e3) for s in states])
+    best = tops[0]
+    index = 0
+    for i in range(1, len(rivals)):
+        if _trimmed(tops[i] - best) > 0:
+            best, index = tops[i], i
+    return rivals[index], states[index]
+
+
+def _trimmed(gain) -> float:
+    """Sum of gains with a sixth at either end replaced by the mean of the others."""
+    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
+    cut = gain.size // 6
+    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+
+
+def _taken(now: _Now, entry: Refitted) -> _Now:
+    """The search with a candidate in the model."""
+    return _Now(entry.trial.model, now_rule(now.m_step, entry.trial.m_step), now.found)
 
 
 def now_rule(old: ScoringMStep, new: ScoringMStep) -> ScoringMStep:
@@ -272,55 +294,78 @@ def close(
     """Search for what `before` lacks; `stages` holds the state of its fit at the end of each horizon."""
     data = Dataset(*map(jnp.asarray, data))
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    lengths = sorted({h for h in stages if h >= 90} | {longest})
-    lengths = [lengths[0], *([h for h in lengths[1:-1]][1:2]), lengths[-1]] if len(lengths) > 1 else lengths
-    now = _Now(before.model, before.m_step, ())
-    steps: list[Step] = []
+    now, steps = _Now(before.model, before.m_step, ()), []
     state: EMState | None = None
-    last = 0
-    for length in dict.fromkeys(lengths):
+    for length in _lengths(stages, longest):
         if now.found and length < longest:
             continue  # EM grows to the whole length by itself
-        if not now.found:
-            own = stages[length][0].best if length in stages else before.model
-            now = now._replace(model=own if length < longest else before.model)
-        else:
-            state = _grow(now, data, before, last, length, say)
-            now = now._replace(model=state.best)
-        part = horizon(data, length)
-        if length <= 128:
-            part = jax.tree.map(lambda a, n=length: a[:, :n], part)
+        if now.found and state is None:
+            state = _grow(now, data, before, steps[-1].horizon, length, say)
+        now = now._replace(model=state.best if state else stages[length][0].best if length < longest else before.model)
+        part = _part(data, length)
         while len(now.found) < rules.most:
-            path, _, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
+            path, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
             used = np.asarray(used)
             say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
-            now, step, trial = look(now, before, path, part, used, rules, say)
+            step, sound, null = look(now, before, path, part, used, rules, say)
             steps.append(step)
-            if trial is None:
+            if not sound:
                 break
-            say(f"  added {_text(step.accepted)}")  # type: ignore[arg-type]
+            winner, further = _settle(now, before, data, length, sound, rules, say)
+            held_out = _held_out(null, winner.trial, part, used)
+            say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} held out")
+            if held_out < rules.margin / 2:
+                break
+            count = len(fields(winner.candidate.start))
+            p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
+            found = Found(winner.candidate, winner.gain, held_out, p_value, length)
+            now = _taken(now, winner)._replace(found=(*now.found, found))
+            steps[-1] = step._replace(accepted=key_of(winner.effect))
+            say(f"  added {_text(key_of(winner.effect))}")
             state = None
-            last = length
-        last = length
+            if length < longest:
+                state = _grow(now, data, before, length, longest, say, further)
+                break
     if not now.found:
         return Closed(before, before, (), tuple(steps))
     if state is None:
         state = _grow(now, data, before, longest, longest, say)
-    after = Identified(before.rig, state, now.m_step, before.bank.padded(now.model.log_q.shape[0]))
+    after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
     return Closed(before, after, now.found, tuple(steps))
 
 
-def _grow(now: _Now, data: Dataset, before: Identified, first: int, length: int, say: Say) -> EMState:
-    """EM of the model as it stands, from the horizon where it was found to a longer one."""
-    schedule = Schedule(first=min(first, length), growth=1.6, hold=1)
+SHORT = 128
+"""Rows to which short horizons are cut, so that they share their programs."""
+
+
+def _lengths(stages, longest: int) -> list[int]:
+    """Horizons at which to look: the first two, one in the middle, the whole."""
+    short = [h for h in sorted(stages) if h < longest]
+    chosen = [h for h in short if h <= SHORT][:2] + [h for h in short if longest / 3 < h < 0.7 * longest][:1]
+    return [*chosen, longest]
+
+
+def _part(data: Dataset, length: int) -> Dataset:
+    """The first `length` rows."""
     part = horizon(data, length)
+    return jax.tree.map(lambda a: a[:, :SHORT], part) if length <= SHORT else part
+
+
+def _grow(
+    now: _Now, data: Dataset, before: Identified, first: int, length: int, say: Say, state: EMState | None = None
+) -> EMState:
+    """EM of the model as it stands, from the horizon where it was found (or from `state`) to a longer one."""
+    part = horizon(data, length)
+    if state is not None:
+        now, first = now._replace(model=state.best), min(length, round(2.5 * first))
+    schedule = Schedule(first=min(first, length), growth=1.6, hold=1)
     state = start_state(now.model, now.m_step, key=before.state.key)._replace(epoch=1)
     growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0
     smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
-    state = fit(state, part, smoother, now.m_step, epochs=growing + 7, schedule=schedule)
-    say(
-        f"  fitted over {length * before.rig.dt:.2f} s in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence"
-    )
+    whole = length == int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    state = fit(state, part, smoother, now.m_step, epochs=growing + (8 if whole else 3), schedule=schedule)
+    reach = f"{length * before.rig.dt:.2f} s"
+    say(f"  fitted over {reach} in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
     return state
 
 

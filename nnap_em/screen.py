@@ -153,11 +153,11 @@ def _all_columns(base: StateSpaceModel, stacks, track: Track, path: Gaussian, da
 
 
 @eqx.filter_jit
-def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, path: Gaussian, data: Dataset):
+def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, data: Dataset):
     dof = nodes.shape[0]
 
     def one(args):
-        track, found, path, seq = args
+        track, found, seq = args
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
         active = active_steps(jnp.asarray(seq.valid))
@@ -172,7 +172,7 @@ def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, path: Gauss
         jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
         return jac.T @ filtered.innovation.ravel(), jac.T @ jac
 
-    return jax.lax.map(one, (track, found, path, data))
+    return jax.lax.map(one, (track, found, data))
 
 
 def sheet(
@@ -189,7 +189,7 @@ def sheet(
     track = tracks(null, weights.prior, path, data)
     base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
     found = _all_columns(base, [g for _, g in groups], track, path, data)
-    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, track, found, path, data)
+    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, track, found, data)
     score, information = (np.asarray(a) for a in outcome)
     nuisance = score.shape[1] - len(probes)
     order = np.argsort([i for index, _ in groups for i in index])

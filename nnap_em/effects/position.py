@@ -84,7 +84,7 @@ class Cogging(AbstractEffect):
             if not around.system.angles[j - 1]:
                 continue
             size = float(around.torque[j - 1])
-            spread = cls(a(0.5 * size), a(0.5 * size), a(0.5), j)
+            spread = cls(a(0.5 * size), a(0.5 * size), a(0.2), j)
             for k in (*range(1, 13), 14, 16, 18, 20, 24):
                 start = cls(a(0.0), a(0.0), a(float(k)), j)
                 probes = (cls(a(0.05 * size), a(0.0), a(float(k)), j), cls(a(0.0), a(0.05 * size), a(float(k)), j))
@@ -94,6 +94,9 @@ class Cogging(AbstractEffect):
     def values(self):
         amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
+
+    def possible(self):
+        return float(self.k) > 0.7
 
     def force(self, scene, memory):
         assert self.joint is not None

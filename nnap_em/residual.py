@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from .data import Dataset, fill_missing
 from .identify import Identified
+from .model import StateSpaceModel, with_effects
 from .mstep import kept
 from .smoother import CubatureSmoother, GaussianSmoother, Posterior, pair_nodes
 
@@ -102,8 +103,13 @@ def names_of(fitted: Identified) -> Names:
 
 
 @eqx.filter_jit
-def _residual(model, data: Dataset, smoother: GaussianSmoother):
+def _residual(model: StateSpaceModel, data: Dataset, smoother: GaussianSmoother, add_back: bool):
     dof, drives = len(model.system.coordinates), len(model.system.joints)
+    plain = with_effects(model, ())
+
+    def given(x, u, command):
+        """Change of the rates over one sample that the effects make."""
+        return (model.transition(x, u)[: 2 * dof] - plain.transition(x[: 2 * dof], command))[dof:]
 
     def one(seq):
         filtered, smoothed = smoother.path(model, seq)
@@ -114,14 +120,17 @@ def _residual(model, data: Dataset, smoother: GaussianSmoother):
         kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
         inputs = model.inputs(seq)
 
-        def force(x, kick, u):
-            system = model.system
-            for effect in model.effects:
-                system = effect.physics(system, u[drives])
-            nodes = kick[:, dof : 2 * dof] @ system.mass(x[:dof]).T / model.dt
+        def force(x, kick, u, command):
+            system, change = model.system, kick[:, dof : 2 * dof]
+            if add_back:
+                change = change + given(x, u, command)[None]
+            else:
+                for effect in model.effects:
+                    system = effect.physics(system, u[drives])
+            nodes = change @ system.mass(x[:dof]).T / model.dt
             return jnp.mean(nodes, axis=0), jnp.std(nodes, axis=0)
 
-        mean, std = jax.vmap(force)(smoothed.state.mean[:-1], kick, inputs[:-1])
+        mean, std = jax.vmap(force)(smoothed.state.mean[:-1], kick, inputs[:-1], plain.inputs(seq)[:-1])
         inside = seq.valid[1:, None]
         last = jnp.full((1, dof), jnp.nan, mean.dtype)
         mean, std = (jnp.concatenate([jnp.where(inside, a, jnp.nan), last]) for a in (mean, std))
@@ -134,18 +143,22 @@ def _residual(model, data: Dataset, smoother: GaussianSmoother):
     return arrays, kept(posterior, data)
 
 
-def residual(fitted: Identified, data: Dataset) -> Residual:
+def residual(fitted: Identified, data: Dataset, *, add_back: bool = False) -> Residual:
     """Innovations, and the generalised force that the model lacks, by the cubature smoother.
 
         r_k = M(q_k) (v_{k+1} - v(x_k, u_k)) / dt,  its mean and standard deviation given all readings [N m, or N]
 
     v(x, u) is the model's own rate one sample later.  The smoother draws r towards 0 as far as the process noise is
     small: a slow force comes out whole, single kicks do not.
+
+    With `add_back`, v(x, u) is the rate without the effects of the model, on the paths that it finds with them: the
+    force of the effects and what is left beside it, the component-plus-residual of a regression.  Paths of a model
+    that lacks much are wrong themselves; these show what it lacked.  [Larsen & McCleary 1972, Technometrics 14, 781]
     """
     data = Dataset(*map(jnp.asarray, data))
     smoother = CubatureSmoother(fitted.bank, inflations=(1.0, 10.0, 100.0))
     (innovation, force, std, state, predicted, u), used = jax.tree.map(
-        np.asarray, _residual(fitted.model, data, smoother)
+        np.asarray, _residual(fitted.model, data, smoother, add_back)
     )
     used = used & np.isfinite(np.where(np.asarray(data.valid)[..., None], state, 0.0)).all((1, 2))
     return Residual(innovation, force, std, state, predicted, u, np.asarray(data.t), np.asarray(data.valid), used)
@@ -207,7 +220,7 @@ def autocorrelation(
 def normality(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
     """Jarque & Bera's test: statistic, p-value, excess kurtosis (0 if normal, above 0 with outliers).
 
-        JB = N (skewness^2 / 6 + kurtosis^2 / 24) ~ chi^2_2      [Jarque & Bera 1987]
+    JB = N (skewness^2 / 6 + kurtosis^2 / 24) ~ chi^2_2      [Jarque & Bera 1987]
     """
     x = e[np.isfinite(e)]
     z = (x - x.mean()) / x.std()

@@ -1,6 +1,5 @@
 """A model with more effects: what the fit then has to estimate, and where it starts."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -76,6 +75,29 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
         return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
 
     return jax.vmap(one)(path.mean, path.cov, data) if size else path
+
+
+def without(
+    model: StateSpaceModel, m_step: ScoringMStep, place: int, sizes: Sequence[int]
+) -> tuple[StateSpaceModel, ScoringMStep]:
+    """`model` without the effect at `place`, and its rule; `sizes` are the numbers of parameters of all effects."""
+    prior = m_step.prior
+    first = prior.size - sum(sizes)
+    start = first + sum(sizes[:place])
+    keep = np.r_[0:start, start + sizes[place] : prior.size]
+    names = []
+    for name in prior.names:
+        at, _, rest = name.rpartition(".")
+        if at != str(place):
+            names.append(f"{int(at) - (int(at) > place)}.{rest}" if at else name)
+    bare = with_effects(model, tuple(e for i, e in enumerate(model.effects) if i != place))
+    rule = eqx.tree_at(
+        lambda m: (m.prior, m.shape),
+        m_step,
+        (ParameterPrior(tuple(names), prior.mean[keep], prior.std[keep]), bare.log_q),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    return bare, rule
 
 
 def augment(

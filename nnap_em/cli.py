@@ -14,6 +14,7 @@ _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
+  nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
 
@@ -35,6 +36,14 @@ examples:
 
 OUT gets model.npz, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
 test/ serves for the reported prediction error only, never for the fit.
+"""
+_DIAGNOSE = """\
+example:
+  nnap-em diagnose bench --out found
+
+Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
+report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
+test/ serves for the reported errors only.
 """
 _PREDICT = """\
 examples:
@@ -91,6 +100,12 @@ def parser() -> argparse.ArgumentParser:
     identify.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
     identify.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.npz")
     identify.add_argument("--quiet", action="store_true", help="no lines of progress")
+
+    diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
+    diagnose.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+    diagnose.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    diagnose.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    diagnose.add_argument("--quiet", action="store_true", help="no lines of progress")
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)

@@ -2,7 +2,6 @@
 
 import argparse
 import io
-import json
 import math
 import os
 import platform
@@ -24,18 +23,21 @@ from jaxtyping import Bool, Float
 
 from . import __version__
 from .data import DataError, DataWarning, Logs, check_split, read_logs, write_csv
+from .diagnose import findings
 from .em import EMState, FitError
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
 from .law import PARAMETERS, UNITS, describe, fit_law
+from .loop import close_the_loop
 from .model import StateSpaceModel
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
-from .rig import Declared, Rig, RigError, nearest, read_rig, replace_text, write_rig
-from .rig import _unit as unit
+from .report import write_diagnosis
+from .rig import Declared, Rig, RigError, nearest, parameter_unit, read_rig, write_rig
 from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
 from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
 from .systems import specs
+from .tables import state_unit, visited_nodes, write_friction, write_json
 
 MISTAKES = (RigError, DataError, StoreError, FitError)
 GIVEN = 1.0  # s, of the reported error
@@ -96,7 +98,7 @@ def run_simulate(args: argparse.Namespace, say: Say) -> None:
             readings, truth = _sequence(experiment, i, rig, states)
             write_csv(part / group / f"{number:03d}.csv", readings)
             write_csv(part / "truth" / group / f"{number:03d}.csv", truth)
-        _write_friction(part / "truth" / "friction.csv", *_true_friction(model, np.asarray(experiment.x)))
+        write_friction(part / "truth" / "friction.csv", *_true_friction(model, np.asarray(experiment.x)))
         part.chmod(0o755)
         os.replace(part, args.out)
         say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
@@ -139,6 +141,25 @@ def run_identify(args: argparse.Namespace, say: Say) -> None:
         _report(args, fitted, train, test, history, began, say)
 
 
+def run_diagnose(args: argparse.Namespace, say: Say) -> None:
+    """Find what the declared model lacks, and report it; the test logs serve for the reported errors alone."""
+    began = time.perf_counter()
+    rig = read_rig(args.folder / "rig.toml", specs)
+    train = read_logs(args.folder / "train", rig)
+    test = read_logs(args.folder / "test", rig) if any(args.folder.glob("test/*.csv")) else None
+    if test:
+        check_split(train, test)
+    mark = fingerprint(train.data)
+    with _folder(args.out):
+        count, rows = train.data.valid.shape
+        say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
+        closed = close_the_loop(rig, train.data, key=jax.random.key(args.seed), say=say)
+        found = findings(closed, train.data)
+        for name, fitted in (("before", closed.before), ("after", closed.after)):
+            save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes={"settings": {"seed": args.seed}})
+        write_diagnosis(args.out, closed, found, train, test, seed=args.seed, began=began, say=say)
+
+
 def run_predict(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after the readings up to the given time."""
     fitted = read(_model_file(args.model)).fitted
@@ -161,6 +182,7 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
 commands: dict[str, Callable[[argparse.Namespace, Say], None]] = {
     "simulate": run_simulate,
     "identify": run_identify,
+    "diagnose": run_diagnose,
     "predict": run_predict,
     "smooth": run_smooth,
 }
@@ -225,7 +247,7 @@ def _sequence(experiment: Experiment, i: int, rig: Rig, states) -> tuple[dict[st
 
 
 def _true_friction(model: StateSpaceModel, x: Float[np.ndarray, "seq time state"]):
-    velocity = _visited(x[..., x.shape[-1] // 2 :].reshape(-1, x.shape[-1] // 2))
+    velocity = visited_nodes(x[..., x.shape[-1] // 2 :].reshape(-1, x.shape[-1] // 2))
     torque = np.asarray(jax.vmap(model.unknown)(jnp.asarray(velocity.T)).T)
     return velocity, torque, np.zeros_like(torque)
 
@@ -326,9 +348,9 @@ def _report(
     states, laws = specs[fitted.rig.system].states, None
     if fitted.rig.friction:
         visited = _velocities(fitted, train, history)
-        table = friction_table(fitted, jnp.asarray(_visited(visited)))
+        table = friction_table(fitted, jnp.asarray(visited_nodes(visited)))
         laws = _laws(fitted, table, say)
-        _write_friction(args.out / "friction.csv", *(np.asarray(a) for a in (table.velocity, table.torque, table.std)))
+        write_friction(args.out / "friction.csv", *(np.asarray(a) for a in (table.velocity, table.torque, table.std)))
         _draw(args.out / "friction.png", fitted, table, visited)
     error = None
     if test:
@@ -339,10 +361,10 @@ def _report(
             say(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
     times = {"given_s": GIVEN, "horizons_s": list(HORIZONS)}
     noise = {n: {"std": math.exp(0.5 * r), "estimated": n not in fitted.rig.noise_std} for n, r in _readings(fitted)}
-    parameters = {n: {"value": v, "std": s, "unit": unit(n)} for n, (v, s) in parameter_table(fitted).items()}
+    parameters = {n: {"value": v, "std": s, "unit": parameter_unit(n)} for n, (v, s) in parameter_table(fitted).items()}
     for name, entry in parameters.items():
         say(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
-    kicks = np.exp(0.5 * np.asarray(fitted.model.log_q)).tolist()
+    kicks, system = np.exp(0.5 * np.asarray(fitted.model.log_q)).tolist(), fitted.model.system
     document = {
         "format": 1,
         "rig": fitted.rig.name,
@@ -351,9 +373,12 @@ def _report(
         "error": error and {**times, "fit": error},
         "error_note": None if error else "no test sequences (FOLDER/test/*.csv), so no prediction error",
         "noise": {
-            "measurement": {name: {**entry, "unit": _state_unit(fitted, name)} for name, entry in noise.items()},
+            "measurement": {
+                name: {**entry, "unit": state_unit(fitted.model.system, name)} for name, entry in noise.items()
+            },
             "process_per_step": {
-                name: {"std": std, "unit": _state_unit(fitted, name)} for name, std in zip(states, kicks, strict=True)
+                name: {"std": std, "unit": state_unit(fitted.model.system, name)}
+                for name, std in zip(states, kicks, strict=True)
             },
         },
         "parameters": parameters,
@@ -372,19 +397,6 @@ def _report(
     say(f"wrote {args.out / REPORT}" + ("" if error else f" ({document['error_note']})"))
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all; what is no finite number becomes null."""
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: clean(item) for name, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [clean(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-
-
 def _velocities(fitted: Identified, train: Logs, history: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:
     """Smoothed velocities of the training sequences that took part."""
     mean = np.asarray(smooth(fitted, train.data).state.mean)
@@ -392,19 +404,6 @@ def _velocities(fitted: Identified, train: Logs, history: list[dict[str, Any]]) 
     valid[history[-1]["left_out"]] = False
     inside = valid & np.isfinite(mean).all(axis=-1)
     return mean[inside][:, mean.shape[-1] // 2 :]
-
-
-def _visited(velocity: Float[np.ndarray, "sample dof"], nodes: int = 101) -> Float[np.ndarray, "dof node"]:
-    """Velocities from the 0.5th to the 99.5th percentile of each joint, dense near rest, where friction bends."""
-    low, high = np.percentile(velocity, [0.5, 99.5], axis=0)
-    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
-    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), nodes))).T
-
-
-def _write_friction(path: Path, velocity, torque, std) -> None:
-    joint = np.repeat(1 + np.arange(velocity.shape[0]), velocity.shape[1])
-    columns = {"velocity": velocity, "torque": torque, "torque_std": std}
-    write_csv(path, {"joint": joint} | {name: np.asarray(values).ravel() for name, values in columns.items()})
 
 
 def _laws(fitted: Identified, table: FrictionTable, say: Say) -> list[dict[str, Any]]:
@@ -428,13 +427,6 @@ def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[n
     image = io.BytesIO()
     figure.savefig(image, format="png")
     replace_bytes(path, image.getvalue())
-
-
-def _state_unit(fitted: Identified, name: str) -> str:
-    system = fitted.model.system
-    place = (system.coordinates + system.rates).index(name)
-    angle, rate = system.angles[place % len(system.coordinates)], place >= len(system.coordinates)
-    return ("rad" if angle else "m") + ("/s" if rate else "")
 
 
 # --- predict and smooth

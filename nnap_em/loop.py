@@ -15,10 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from .augment import augment, extended, proposals, seeded, surroundings
+from .augment import augment, extended, proposals, seeded, surroundings, without
 from .data import Dataset, horizon
 from .effects import AbstractEffect, Candidate, fields
+from .effects.sensor import SensorQuantization, grid_step
 from .em import EMState, Schedule, fit, start_state
+from .equivalence import standings
 from .gaussian import Gaussian
 from .identify import Identified, identify
 from .model import StateSpaceModel
@@ -119,6 +121,11 @@ def key_of(effect: AbstractEffect) -> Key:
 def _smoothed(model, data: Dataset, smoother) -> tuple[Gaussian, Bool[Array, " seq"]]:
     posterior = jax.vmap(lambda seq: smoother(model, seq))(data)
     return posterior.state, kept(posterior, data)
+
+
+def smoothed(fitted: Identified, data: Dataset) -> tuple[Gaussian, Bool[Array, " seq"]]:
+    """Smoothed states of all sequences, and which of them are followed."""
+    return _smoothed(fitted.model, data, CubatureSmoother(fitted.bank))
 
 
 class _Now(NamedTuple):
@@ -296,20 +303,20 @@ def close(
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     now, steps = _Now(before.model, before.m_step, ()), []
     state: EMState | None = None
+    last = 0
     for length in _lengths(stages, longest):
-        if now.found and length < longest:
-            continue  # EM grows to the whole length by itself
-        if now.found and state is None:
-            state = _grow(now, data, before, steps[-1].horizon, length, say)
-        now = now._replace(model=state.best if state else stages[length][0].best if length < longest else before.model)
-        part = _part(data, length)
+        if now.found and (state is None or last < length):
+            state = _grow(now, data, before, last, length, say, state)
+        own = stages[length][0].best if length < longest else before.model
+        now = now._replace(model=state.best if state else own)
+        part, last = _part(data, length), length
         while len(now.found) < rules.most:
             path, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
             used = np.asarray(used)
             say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
             step, sound, null = look(now, before, path, part, used, rules, say)
             steps.append(step)
-            if not sound:
+            if not sound or null is None:
                 break
             winner, further = _settle(now, before, data, length, sound, rules, say)
             held_out = _held_out(null, winner.trial, part, used)
@@ -322,16 +329,60 @@ def close(
             now = _taken(now, winner)._replace(found=(*now.found, found))
             steps[-1] = step._replace(accepted=key_of(winner.effect))
             say(f"  added {_text(key_of(winner.effect))}")
-            state = None
-            if length < longest:
-                state = _grow(now, data, before, length, longest, say, further)
+            state = further
+            if further is not None:
+                last = round(2.5 * length)
                 break
-    if not now.found:
-        return Closed(before, before, (), tuple(steps))
-    if state is None:
+    if now.found and state is None:
         state = _grow(now, data, before, longest, longest, say)
+    now, state = _needed(now, state, before, data, rules, say)
+    now, state = _quantised(now, state, before, data, rules, say)
+    if state is None:
+        return Closed(before, before, (), tuple(steps))
     after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
     return Closed(before, after, now.found, tuple(steps))
+
+
+def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
+    """The search without the effects that later ones made needless."""
+    while state is not None and len(now.found) > 1:
+        after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
+        path, used = smoothed(after, data)
+        chosen = tuple(f.candidate for f in now.found)
+        losses = [s.alone for s in standings(before, after, chosen, path, data, np.asarray(used))]
+        least = int(np.argmin(losses))
+        if losses[least] > rules.margin:
+            break
+        say(f"  {_text(key_of(now.found[least].candidate.start))} is needless now: {losses[least]:.0f} nat")
+        sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in after.model.effects]
+        model, rule = without(after.model, now.m_step, least, sizes)
+        now = _Now(model, rule, tuple(f for i, f in enumerate(now.found) if i != least))
+        state = _grow(now, data, before, int(data.t.shape[1]), int(data.t.shape[1]), say)
+    return now, state
+
+
+def _quantised(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
+    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise."""
+    rig = before.rig
+    for i, channel in enumerate(rig.measured):
+        y = np.asarray(data.y)[..., i]
+        step = grid_step(y.ravel())
+        model = state.best if state else now.model
+        told, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
+        share = step**2 / 12 / (told**2 if told else max(now_r - step**2 / 12, 0.25 * now_r))
+        gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
+        if gain < rules.margin or share < 0.1:
+            continue
+        say(f"  {channel} comes in steps of {step:.4g}")
+        effect = SensorQuantization(jnp.asarray(step), channel)
+        candidate = Candidate(effect, (effect,), SensorQuantization(jnp.asarray(1e-3 * step), channel))
+        full, rule = augment(model, now.m_step, effect, candidate)
+        if told:
+            log_r = full.log_r.at[i].set(math.log(told**2 + step**2 / 12))
+            full = eqx.tree_at(lambda m: m.log_r, full, log_r)
+        now = _Now(full, rule, (*now.found, Found(candidate, float(gain), float(gain), 0.0, data.t.shape[1])))
+        state = _grow(now, data, before, int(data.t.shape[1]), int(data.t.shape[1]), say)
+    return now, state
 
 
 SHORT = 128
@@ -357,7 +408,7 @@ def _grow(
     """EM of the model as it stands, from the horizon where it was found (or from `state`) to a longer one."""
     part = horizon(data, length)
     if state is not None:
-        now, first = now._replace(model=state.best), min(length, round(2.5 * first))
+        now = now._replace(model=state.best)
     schedule = Schedule(first=min(first, length), growth=1.6, hold=1)
     state = start_state(now.model, now.m_step, key=before.state.key)._replace(epoch=1)
     growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0

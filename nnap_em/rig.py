@@ -235,7 +235,9 @@ def _parameter(model: _Table, key: str) -> Declared:
     if key.startswith("m") and value.mean <= 0:
         model.refuse(key, mend="write a mass above 0 [kg]")
     if (key.startswith("l") or key == "g") and value.mean < 0:
-        model.refuse(key, mend=f"write 0 or more [{_unit(key)}]: directions are in the equations, not in the signs")
+        model.refuse(
+            key, mend=f"write 0 or more [{parameter_unit(key)}]: directions are in the equations, not in the signs"
+        )
     return value
 
 
@@ -273,7 +275,7 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
     return columns, {column: noise.positive(column) for column in noise.items}
 
 
-def _unit(name: str) -> str:
+def parameter_unit(name: str) -> str:
     """The SI unit of a parameter or state, by the first letters of its name."""
     exact = {"g": "m/s^2", "gr": "-", "x": "m", "dx": "m/s"}
     first = {"theta": "rad", "dtheta": "rad/s", "m": "kg", "l": "m", "I": "kg m^2"}
@@ -281,7 +283,7 @@ def _unit(name: str) -> str:
 
 
 def _lines(values: Mapping[str, str]) -> list[str]:
-    return [f"{name} = {value}    # {_unit(name)}" for name, value in values.items()]
+    return [f"{name} = {value}    # {parameter_unit(name)}" for name, value in values.items()]
 
 
 def _pair(value: Declared) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em import cli, commands, rig
+from nnap_em import cli, commands, rig, tables
 from nnap_em.rig import read_rig
 from nnap_em.simulate import examples
 from nnap_em.store import load, read
@@ -367,7 +367,7 @@ def test_test_sequences_do_not_change_the_fit(bench, fit, tmp_path):
 
 
 def test_json_has_null_for_what_is_no_number(tmp_path):
-    commands.write_json(tmp_path / "x.json", {"a": [1.0, float("nan")], "b": {"c": float("inf"), "d": "é"}})
+    tables.write_json(tmp_path / "x.json", {"a": [1.0, float("nan")], "b": {"c": float("inf"), "d": "é"}})
     found = json.loads((tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
     assert found == {"a": [1.0, None], "b": {"c": None, "d": "é"}}
 

@@ -19,6 +19,7 @@ class MotorGain(AbstractEffect):
     """gain u."""
 
     name: ClassVar[str] = "motor_gain"
+    confirm: ClassVar[str] = "Block the joint and measure its torque at one command."
     units: ClassVar[dict[str, str]] = {"gain": "-"}
     excess: Scalar
     """gain - 1."""
@@ -40,6 +41,7 @@ class DeadZone(AbstractEffect):
     """Nothing below width, sign(u) (|u| - width) beyond."""
 
     name: ClassVar[str] = "dead_zone"
+    confirm: ClassVar[str] = "Raise the command slowly from zero until the joint moves, both ways."
     units: ClassVar[dict[str, str]] = {"width": "N m"}
     linear: ClassVar[bool] = False
     width: Scalar
@@ -66,6 +68,9 @@ class Saturation(AbstractEffect):
     """Limited to +-limit."""
 
     name: ClassVar[str] = "saturation"
+    confirm: ClassVar[str] = (
+        "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
+    )
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
     linear: ClassVar[bool] = False
     limit: Scalar
@@ -92,6 +97,7 @@ class InputDelay(AbstractEffect):
     """u acts later by any time; before the first row it was 0."""
 
     name: ClassVar[str] = "input_delay"
+    confirm: ClassVar[str] = "Log command and motor current on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     linear: ClassVar[bool] = False
     delay: Scalar
@@ -123,6 +129,7 @@ class ActuatorLag(AbstractEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
 
     name: ClassVar[str] = "actuator_lag"
+    confirm: ClassVar[str] = "Log command and motor current on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}
     linear: ClassVar[bool] = False
     tau: Scalar
@@ -199,6 +206,7 @@ class JointFlexibility(Transmission):
     """An elastic transmission of stiffness k."""
 
     name: ClassVar[str] = "joint_flexibility"
+    confirm: ClassVar[str] = "Block the link and twist the motor: the angle per torque."
     units: ClassVar[dict[str, str]] = {"k": "N m/rad"}
     substeps: ClassVar[int] = 5
     log_k: Scalar
@@ -230,6 +238,7 @@ class Backlash(Transmission):
     """Play of width gap, with a stiff contact at either side."""
 
     name: ClassVar[str] = "backlash"
+    confirm: ClassVar[str] = "Block the motor and wiggle the link."
     units: ClassVar[dict[str, str]] = {"gap": "rad"}
     substeps: ClassVar[int] = 10
     gap: Scalar

@@ -73,6 +73,8 @@ class AbstractEffect(eqx.Module):
 
     name: ClassVar[str]
     """Key of the vocabulary."""
+    confirm: ClassVar[str] = ""
+    """What to look at on the machine to be sure."""
     units: ClassVar[dict[str, str]] = {}
     """Reported parameters and their units on a rotary joint."""
     memory: ClassVar[int] = 0

@@ -18,6 +18,7 @@ class Payload(AbstractEffect):
     """A point mass at the tip."""
 
     name: ClassVar[str] = "payload"
+    confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg"}
     mass: Scalar
     joint: int | None = eqx.field(static=True)
@@ -35,6 +36,7 @@ class LinkInertia(AbstractEffect):
     """A moment of inertia off by dI."""
 
     name: ClassVar[str] = "link_inertia"
+    confirm: ClassVar[str] = "Swing the link alone about a known axis and time it."
     units: ClassVar[dict[str, str]] = {"dI": "kg m^2"}
     dI: Scalar
     joint: int | None = eqx.field(static=True)
@@ -52,6 +54,7 @@ class LinkLength(AbstractEffect):
     """A length off by dl."""
 
     name: ClassVar[str] = "link_length"
+    confirm: ClassVar[str] = "Measure the distance between the joints."
     units: ClassVar[dict[str, str]] = {"dl": "m"}
     dl: Scalar
     joint: int | None = eqx.field(static=True)
@@ -69,6 +72,7 @@ class CenterOfMass(AbstractEffect):
     """A centre of mass off by dlc along the link."""
 
     name: ClassVar[str] = "center_of_mass"
+    confirm: ClassVar[str] = "Balance the link on an edge."
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
     dlc: Scalar
     joint: int | None = eqx.field(static=True)
@@ -86,6 +90,7 @@ class PayloadStep(AbstractEffect):
     """A payload that comes on at a moment of the clock; the edge is some samples wide, so that a fit can move it."""
 
     name: ClassVar[str] = "payload_step"
+    confirm: ClassVar[str] = "Ask what was mounted or lost at that moment."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "time": "s"}
     mass: Scalar
     time: Scalar

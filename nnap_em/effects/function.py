@@ -39,6 +39,7 @@ class UnknownFunction(AbstractEffect):
     """A torque sum_i w_i phi_i(inputs) at one joint [Broomhead & Lowe 1988]."""
 
     name: ClassVar[str] = "unknown_function"
+    confirm: ClassVar[str] = "Repeat the motion with what stands under suspicion taken off."
     weights: Float[Array, " basis"]
     axes: tuple[Axis, ...]
     joint: int | None = eqx.field(static=True)

@@ -1,5 +1,6 @@
 """Forces that depend on the position: springs, tilt, cogging, stops, magnets of a brake."""
 
+import itertools
 from typing import ClassVar
 
 import equinox as eqx
@@ -18,6 +19,9 @@ class TorsionalSpring(AbstractEffect):
     """-k (theta_j - theta0)."""
 
     name: ClassVar[str] = "torsional_spring"
+    confirm: ClassVar[str] = (
+        "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
+    )
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
     k: Scalar
     moment: Scalar
@@ -50,6 +54,7 @@ class BaseTilt(AbstractEffect):
     """Gravity acts on theta1 + angle."""
 
     name: ClassVar[str] = "base_tilt"
+    confirm: ClassVar[str] = "Put a level on the base, and let the machine hang at rest: where does it read zero?"
     units: ClassVar[dict[str, str]] = {"angle": "rad"}
     angle: Scalar
     joint: int | None = eqx.field(static=True, default=None)
@@ -70,6 +75,7 @@ class Cogging(AbstractEffect):
     """amplitude sin(k theta_j + phase)."""
 
     name: ClassVar[str] = "cogging"
+    confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
     sine: Scalar
     cosine: Scalar
@@ -84,7 +90,7 @@ class Cogging(AbstractEffect):
             if not around.system.angles[j - 1]:
                 continue
             size = float(around.torque[j - 1])
-            spread = cls(a(0.5 * size), a(0.5 * size), a(0.2), j)
+            spread = cls(a(0.5 * size), a(0.5 * size), a(0.05), j)
             for k in (*range(1, 13), 14, 16, 18, 20, 24):
                 start = cls(a(0.0), a(0.0), a(float(k)), j)
                 probes = (cls(a(0.05 * size), a(0.0), a(float(k)), j), cls(a(0.0), a(0.05 * size), a(float(k)), j))
@@ -96,7 +102,8 @@ class Cogging(AbstractEffect):
         return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
 
     def possible(self):
-        return float(self.k) > 0.7
+        k = float(self.k)
+        return k > 0.7 and abs(k - round(k)) < 0.2  # a joint that goes round meets the same magnets again
 
     def force(self, scene, memory):
         assert self.joint is not None
@@ -108,6 +115,7 @@ class TorqueOffset(AbstractEffect):
     """A constant torque; a learned friction map holds it."""
 
     name: ClassVar[str] = "torque_offset"
+    confirm: ClassVar[str] = "Let the unpowered joint settle from both sides and compare."
     units: ClassVar[dict[str, str]] = {"value": "N m"}
     value: Scalar
     joint: int | None = eqx.field(static=True)
@@ -129,6 +137,7 @@ class HardStop(AbstractEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
     name: ClassVar[str] = "hard_stop"
+    confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
     substeps: ClassVar[int] = 4
     linear: ClassVar[bool] = False
@@ -149,9 +158,10 @@ class HardStop(AbstractEffect):
             k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
             middle = 0.5 * (low + high)
             spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), j)
-            for share in (0.5, 0.65, 0.8, 0.9, 0.97):
-                up, down = middle + share * size, middle - share * size
-                start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j)
+            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j)
+            shares = (0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
+            for above, below in itertools.product(shares, shares):
+                up, down = middle + above * size, middle - below * size
                 probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), j)
                 out.append(Candidate(start, (probe,), spread))
         return out
@@ -169,6 +179,7 @@ class EddyBrake(AbstractEffect):
     """-c cos^2(theta_j - center) w_j."""
 
     name: ClassVar[str] = "eddy_brake"
+    confirm: ClassVar[str] = "Let the joint coast through a turn at one speed and look where it slows."
     units: ClassVar[dict[str, str]] = {"c": "N m s/rad", "center": "rad"}
     even: Scalar
     """c cos(2 center)."""

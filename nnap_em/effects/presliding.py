@@ -17,6 +17,7 @@ class PreslidingFriction(AbstractEffect):
     """
 
     name: ClassVar[str] = "presliding_friction"
+    confirm: ClassVar[str] = "Push the joint at rest with a small torque and see whether it springs back."
     units: ClassVar[dict[str, str]] = {"sigma0": "N m/rad"}
     memory: ClassVar[int] = 1
     linear: ClassVar[bool] = False

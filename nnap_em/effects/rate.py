@@ -14,6 +14,7 @@ class AirDrag(AbstractEffect):
     """-c |w| w at a joint, or the drag of a point at the tip (joint None)."""
 
     name: ClassVar[str] = "air_drag"
+    confirm: ClassVar[str] = "Swing once with the tip shrouded, or once slow and once fast."
     units: ClassVar[dict[str, str]] = {"c": "N m s^2/rad^2"}
     c: Scalar
     joint: int | None = eqx.field(static=True)
@@ -46,6 +47,7 @@ class BackEmf(AbstractEffect):
     """The motor's torque falls by b w; a learned friction map holds it."""
 
     name: ClassVar[str] = "motor_back_emf"
+    confirm: ClassVar[str] = "Log the motor current beside the command."
     units: ClassVar[dict[str, str]] = {"b": "N m s/rad"}
     b: Scalar
     joint: int | None = eqx.field(static=True)
@@ -68,6 +70,7 @@ class PositionDependentFriction(AbstractEffect):
     """tau_f (1 + depth cos(n theta_j + phase))."""
 
     name: ClassVar[str] = "position_dependent_friction"
+    confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
     cosine: Scalar
     sine: Scalar
@@ -102,6 +105,7 @@ class FrictionDrift(AbstractEffect):
     """tau_f (1 + change (1 - exp(-t / tau)))."""
 
     name: ClassVar[str] = "friction_drift"
+    confirm: ClassVar[str] = "Run the same motion cold and warm."
     units: ClassVar[dict[str, str]] = {"change": "-", "tau": "s"}
     change: Scalar
     pace: Scalar
@@ -134,6 +138,7 @@ class BaseVibration(AbstractEffect):
     """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
 
     name: ClassVar[str] = "base_vibration"
+    confirm: ClassVar[str] = "Put an accelerometer on the base."
     units: ClassVar[dict[str, str]] = {"amplitude": "m/s^2", "frequency": "Hz", "phase": "rad"}
     sine: Scalar
     cosine: Scalar

@@ -3,6 +3,8 @@
 from typing import ClassVar
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Float
 
 from .base import AbstractEffect, Candidate, Scalar, a
 
@@ -11,6 +13,7 @@ class SensorBias(AbstractEffect):
     """value + bias."""
 
     name: ClassVar[str] = "sensor_bias"
+    confirm: ClassVar[str] = "Bring the joint to a known position and read the sensor."
     units: ClassVar[dict[str, str]] = {"bias": "unit of the channel"}
     bias: Scalar
     channel: str | None = eqx.field(static=True)
@@ -31,6 +34,7 @@ class SensorScale(AbstractEffect):
     """scale value."""
 
     name: ClassVar[str] = "sensor_scale"
+    confirm: ClassVar[str] = "Move the joint by a known angle and compare."
     units: ClassVar[dict[str, str]] = {"scale": "-"}
     excess: Scalar
     """scale - 1."""
@@ -52,6 +56,7 @@ class SensorDelay(AbstractEffect):
     """The value some time ago."""
 
     name: ClassVar[str] = "sensor_delay"
+    confirm: ClassVar[str] = "Tap the link and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     delay: Scalar
     channel: str | None = eqx.field(static=True)
@@ -70,3 +75,29 @@ class SensorDelay(AbstractEffect):
 
     def reading(self, value, past):
         return past(self.delay)
+
+
+class SensorQuantization(AbstractEffect):
+    """The value rounded to a multiple of step: as noise, of variance step^2 / 12.
+
+    The score test cannot see it; `grid_step` reads it off the numbers themselves.
+    """
+
+    name: ClassVar[str] = "sensor_quantization"
+    confirm: ClassVar[str] = "Look up the counts per turn of the encoder."
+    units: ClassVar[dict[str, str]] = {"step": "unit of the channel"}
+    step: Scalar
+    channel: str | None = eqx.field(static=True)
+    joint: int | None = eqx.field(static=True, default=None)
+
+
+def grid_step(values: Float[np.ndarray, " sample"]) -> float:
+    """The step of a signal that takes only multiples of it; 0 for any other."""
+    known = np.unique(values[np.isfinite(values)])
+    if known.size < 3 or known.size > 0.3 * values.size:
+        return 0.0
+    gaps = np.diff(known)
+    step = float(np.median(gaps[gaps < 1.5 * gaps[gaps > 1e-9 * np.ptp(known)].min()]))
+    off = values[np.isfinite(values)] / step
+    off = np.abs(off - np.round(off - np.median(off - np.round(off))) - np.median(off - np.round(off)))
+    return step if np.mean(off < 0.1) > 0.99 else 0.0

@@ -1,0 +1,249 @@
+"""The outcome of the loop in words and numbers: what was found, how sure, and what it is worth."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .data import Dataset
+from .effects import AbstractEffect, catalogue, fields
+from .effects.function import UnknownFunction
+from .equivalence import Standing, standings
+from .identify import Identified, friction_table
+from .loop import RULES, Closed, Key, Rules, key_of, smoothed
+from .systems import AbstractSystem
+from .tables import state_unit
+
+
+class Estimate(NamedTuple):
+    """A reported parameter."""
+
+    value: float
+    std: float
+    unit: str
+
+
+def blocks(fitted: Identified) -> list[slice]:
+    """Where the parameters of every effect stand among all that are estimated."""
+    sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in fitted.model.effects]
+    ends = np.cumsum(sizes) + fitted.m_step.prior.size - sum(sizes)
+    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
+
+
+def covariance(fitted: Identified) -> Float[np.ndarray, "param param"]:
+    """Of all estimated parameters, friction integrated out (Laplace)."""
+    prior = fitted.m_step.prior
+    cov = np.linalg.inv(np.asarray(fitted.state.hessian))
+    cut = cov.shape[0] - prior.size
+    std = np.asarray(prior.std)
+    return cov[cut:, cut:] * np.outer(std, std)
+
+
+def estimates(fitted: Identified) -> list[dict[str, Estimate]]:
+    """The reported parameters of every effect, in its order, with standard deviations by the delta method."""
+    cov = covariance(fitted)
+    out = []
+    for effect, here in zip(fitted.model.effects, blocks(fitted), strict=True):
+        own = cov[here, here]
+
+        def reported(flat: Float[Array, " param"], effect=effect) -> dict[str, Float[Array, ""]]:
+            return _filled(effect, flat).values()
+
+        flat = jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
+        values, slopes = reported(flat), jax.jacfwd(reported)(flat)
+        unit = units(effect, fitted.model.system)
+        out.append(
+            {
+                name: Estimate(
+                    float(values[name]),
+                    float(np.sqrt(max(0.0, np.asarray(slopes[name]) @ own @ np.asarray(slopes[name])))),
+                    unit[name],
+                )
+                for name in values
+            }
+        )
+    return out
+
+
+def _filled(effect: AbstractEffect, flat: Float[Array, " param"]) -> AbstractEffect:
+    names = fields(effect)
+    cuts = np.cumsum([np.size(getattr(effect, n)) for n in names])[:-1]
+    made = object.__new__(type(effect))
+    for name in effect.__dataclass_fields__:
+        object.__setattr__(made, name, getattr(effect, name))
+    for name, part in zip(names, jnp.split(flat, cuts), strict=True):
+        object.__setattr__(made, name, part.reshape(jnp.shape(getattr(effect, name))))
+    return made
+
+
+def units(effect: AbstractEffect, system: AbstractSystem) -> dict[str, str]:
+    """Units of the reported parameters on this machine and channel."""
+    straight = effect.joint is not None and not system.angles[effect.joint - 1]
+    out = {}
+    for name, unit in effect.units.items():
+        if unit == "unit of the channel":
+            unit = state_unit(system, effect.channel or "")
+        if effect.name == "air_drag" and effect.joint is None:
+            unit = "N s^2/m^2"
+        out[name] = unit.replace("N m", "N").replace("rad", "m") if straight else unit
+    return out
+
+
+def words(key: Key) -> str:
+    """An effect as a reader would call it."""
+    name, joint, channel, inputs = key
+    text = name.replace("_", " ")
+    if inputs:
+        text += f" of {' and '.join(inputs)}"
+    return text + (f" at joint {joint}" if joint else "") + (f" on {channel}" if channel else "")
+
+
+class Curve(NamedTuple):
+    """A learned function along one signal, its mean taken away."""
+
+    label: str
+    x: Float[np.ndarray, " node"]
+    mean: Float[np.ndarray, " node"]
+    """[N m]"""
+    std: Float[np.ndarray, " node"]
+
+
+def curve(fitted: Identified, place: int, nodes: int = 121) -> Curve | None:
+    """The learned function of one signal; None for one of several."""
+    effect = fitted.model.effects[place]
+    if not isinstance(effect, UnknownFunction) or len(effect.axes) != 1:
+        return None
+    axis = effect.axes[0]
+    x = np.linspace(axis.low, axis.high, nodes)
+    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+    basis = basis - basis.mean(axis=0)
+    cov = covariance(fitted)[blocks(fitted)[place], blocks(fitted)[place]]
+    std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
+    return Curve(" + ".join(axis.names), x, basis @ np.asarray(effect.weights), std)
+
+
+def shape(found: Curve, turns: bool) -> str:
+    """A learned function in words: a period, a bump, or a slope."""
+    y = found.mean
+    size = f"{np.ptp(y):.2g} N m from trough to peak"
+    if turns:
+        power = np.abs(np.fft.rfft(y[:-1])) ** 2
+        n = int(np.argmax(power[1:])) + 1
+        if power[n] > 0.8 * power[1:].sum():
+            return f"period {n} in {found.label}, {size}"
+    line = np.polyfit(found.x, y, 1)
+    if np.var(y - np.polyval(line, found.x)) < 0.15 * np.var(y):
+        return f"nearly a straight line in {found.label}, slope {line[0]:.2g}"
+    level = np.median(y)
+    peak = int(np.argmax(np.abs(y - level)))
+    inside = np.abs(y - level) > 0.5 * abs(y[peak] - level)
+    width = inside.mean() * np.ptp(found.x)
+    kind = "bump" if y[peak] > level else "dip"
+    if width < 0.4 * np.ptp(found.x):
+        return (
+            f"a {kind} at {found.label} = {found.x[peak]:.2f}, about {width:.2f} wide, {y[peak] - level:.2g} N m high"
+        )
+    return f"a smooth function of {found.label}, largest at {found.x[int(np.argmax(y))]:.2f}, {size}"
+
+
+class Finding(NamedTuple):
+    """One effect as it is reported."""
+
+    effect: AbstractEffect
+    parameters: dict[str, Estimate]
+    evidence: dict[str, float]
+    equivalent: tuple[Key, ...]
+    sentence: str
+
+
+def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Finding]:
+    """All that was found, with what cannot be told from it."""
+    if not closed.found:
+        return []
+    data = Dataset(*map(jnp.asarray, data))
+    path, used = smoothed(closed.after, data)
+    chosen = tuple(f.candidate for f in closed.found)
+    firm: Sequence[Standing] = standings(closed.before, closed.after, chosen, path, data, np.asarray(used))
+    out = []
+    for i, (found, standing) in enumerate(zip(closed.found, firm, strict=True)):
+        effect, parameters = closed.after.model.effects[i], estimates(closed.after)[i]
+        same = tuple(key_of(c.start) for c, loss in standing.instead if loss < rules.even)
+        same = same if standing.alone > 2 * rules.even else ()
+        numbers = ", ".join(f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items())
+        drawn = curve(closed.after, i)
+        told = shape(drawn, effect.axes[0].turns) if drawn and isinstance(effect, UnknownFunction) else numbers
+        evidence = {
+            "log_likelihood_gain": found.gain,
+            "p_value": found.p_value,
+            "held_out_gain": found.held_out,
+            "loss_without_it": standing.alone,
+        }
+        sentence = f"{words(key_of(effect))}: {told}" if told else words(key_of(effect))
+        out.append(Finding(effect, parameters, evidence, same, sentence))
+    return out
+
+
+def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None) -> str:
+    """The outcome in one sentence."""
+    if not found:
+        return "Nothing is missing that these data could show: the declared model explains them."
+    names = " and ".join(words(key_of(f.effect)) for f in found)
+    text = f"The model lacks {names}"
+    if not error:
+        return text + "."
+    at = error["horizons_s"].index(1.0)
+    ratios = [
+        (c, error["before"][c][at], error["after"][c][at])
+        for c in error["before"]
+        if error["after"][c][at] and math.isfinite(error["before"][c][at])
+    ]
+    if not ratios:
+        return text + "."
+    column, before, after = ratios[0]
+    return f"{text}; with it the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g} on test data."
+
+
+def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:
+    """How far the missing effect had bent the learned friction."""
+    if not (closed.found and closed.before.rig.friction):
+        return None
+    first, second = (np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (closed.before, closed.after))
+    size = np.sqrt(np.mean(second**2, axis=1))
+    share = np.sqrt(np.mean((first - second) ** 2, axis=1)) / np.maximum(size, 1e-12)
+    parts = [f"joint {j + 1} by {100 * s:.0f} %" for j, s in enumerate(share)]
+    return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
+
+
+def advice(found: Sequence[Finding], error: Mapping[str, Any] | None) -> list[str]:
+    """What to look at next."""
+    out = []
+    for finding in found:
+        if finding.effect.confirm:
+            out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
+        for key in finding.equivalent:
+            out.append(f"To tell it from {words(key)}: {catalogue[key[0]].confirm}")
+    if not found:
+        out.append(
+            "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
+        )
+    return out
+
+
+def entry(finding: Finding) -> dict[str, Any]:
+    """A finding as the report has it."""
+    name, joint, channel, inputs = key_of(finding.effect)
+    return {
+        "name": name,
+        "joint": joint,
+        "channel": channel,
+        "inputs": list(inputs),
+        "parameters": {n: p._asdict() for n, p in finding.parameters.items()},
+        "evidence": finding.evidence,
+        "equivalent": [{"name": k[0], "joint": k[1], "channel": k[2]} for k in finding.equivalent],
+        "description": finding.sentence,
+        "confirm": finding.effect.confirm,
+    }

@@ -1,5 +1,7 @@
 """A model with more effects: what the fit then has to estimate, and where it starts."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

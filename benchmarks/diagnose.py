@@ -1,0 +1,227 @@
+"""How often the loop names the right effect: simulated rigs of a simulator that shares nothing with the catalogue.
+
+    python benchmarks/diagnose.py --out out/diagnose                    # everything: hours on a laptop
+    python benchmarks/diagnose.py --out out/diagnose --only strong:*:hidden --jobs 2
+    python benchmarks/diagnose.py --out out/diagnose --table docs/diagnose_table.md     # the table of what is there
+
+A case is group:effect:view:seed.  Each leaves one JSON file in --out; a case that has one is not run again.
+"""
+
+import argparse
+import fnmatch
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
+import plant
+
+OUTSIDE: dict[str, tuple[dict[str, Any], ...]] = {
+    "bump": ({"name": "unknown_function", "form": "bump", "joint": 2, "amplitude": 0.05, "center": 1.1, "width": 0.4},),
+    "magnet": (
+        {"name": "unknown_function", "form": "magnet", "joint": 2, "amplitude": 0.4, "center": 0.5, "width": 0.4},
+    ),
+    "coupling": ({"name": "unknown_function", "form": "coupling", "joint": 1, "amplitude": 0.08},),
+}
+INPUTS = {"bump": {"theta2"}, "magnet": {"theta2"}, "coupling": {"theta1", "theta2"}}
+VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
+    "hardening_spring": ({"name": "torsional_spring", "joint": 2, "k": 0.04, "theta0": 0.0, "k3": 0.1},),
+    "drag_exponent_1.8": ({"name": "air_drag", "joint": None, "c": 0.008, "exponent": 1.8},),
+    "cogging_two_harmonics": (
+        {"name": "cogging", "joint": 2, "amplitude": 0.03, "k": 4.0, "phase": 0.5, "amplitude2": 0.012, "phase2": 1.0},
+    ),
+}
+PAIRS: dict[str, tuple[dict[str, Any], ...]] = {
+    "spring+gain": (*plant.STRONG["torsional_spring"], *plant.WEAK["motor_gain"]),
+    "payload+delay": (*plant.STRONG["payload"], *plant.WEAK["input_delay"]),
+    "tilt+cogging": (*plant.WEAK["base_tilt"], *plant.STRONG["cogging"]),
+}
+NOISES = {"low": (0.002, 0.02), "middle": (0.005, 0.05), "high": (0.01, 0.1)}
+GROUPS = {"strong": plant.STRONG, "weak": plant.WEAK, "outside": OUTSIDE, "variant": VARIANTS, "pair": PAIRS}
+SILENT = {"torque_offset", "motor_back_emf"}
+"""What a learned friction map holds: naming nothing is right."""
+SAME = {
+    ("base_tilt", None, None): {("sensor_bias", None, "theta1")},
+    ("input_delay", 2, None): {("sensor_delay", None, "all")},
+    ("sensor_bias", None, "theta1"): {("base_tilt", None, None)},
+}
+"""Models that are the same for the data."""
+
+
+def all_cases(clean: int = 60) -> list[str]:
+    """Names of every case."""
+    out = []
+    for group, effects in GROUPS.items():
+        for i, name in enumerate(effects):
+            views = ("hidden", "shown") if group in ("strong", "weak") else ("hidden",)
+            out += [f"{group}:{name}:{view}:{11 + i}" for view in views]
+    out += [f"clean:{noise}:hidden:{100 + i}" for i in range(clean // 3) for noise in NOISES]
+    return out
+
+
+def case_of(name: str) -> plant.Case:
+    """The rig of a case."""
+    group, effect, view, seed = name.split(":")
+    session = effect in plant.SESSION
+    return plant.Case(
+        effects=() if group == "clean" else GROUPS[group][effect],
+        hidden=view == "hidden",
+        noise=NOISES[effect] if group == "clean" else (0.005, 0.05),
+        clock="session" if session else "sequence",
+        friction_shape="other" if group == "variant" else "stribeck",
+        seed=int(seed),
+    )
+
+
+def run(name: str, out: Path) -> None:
+    """One case through the command line, as a user would."""
+    case = case_of(name)
+    with tempfile.TemporaryDirectory() as folder:
+        rig, found = Path(folder) / "rig", Path(folder) / "found"
+        plant.write(case, rig)
+        began = time.perf_counter()
+        command = [sys.executable, "-m", "nnap_em.cli", "diagnose", str(rig), "--out", str(found)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        seconds = time.perf_counter() - began
+        record: dict[str, Any] = {"case": name, "truth": list(case.effects), "seconds": seconds}
+        record["log"] = done.stderr.splitlines()
+        if done.returncode == 0:
+            report = json.loads((found / "report.json").read_text())
+            record |= {"effects": report["effects"], "error": report["error"]}
+            record["oracle"] = plant.oracle_errors(case, rig)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{name.replace(':', '_')}.json").write_text(json.dumps(record))
+
+
+def judged(record: dict[str, Any]) -> dict[str, Any]:
+    """What a case is worth: named right, extras, parameters within 15 %, truth inside two standard deviations."""
+    group, effect, *_ = record["case"].split(":")
+    named = record.get("effects", [])
+    truth = [] if effect in SILENT else record["truth"]
+    left, hits, near, inside = list(named), 0, [], []
+    for true in truth:
+        place = (true["name"], true.get("joint"), true.get("channel"))
+        for entry in left:
+            here = (entry["name"], entry["joint"], entry["channel"])
+            same = here == place or here in SAME.get(place, ())
+            if true["name"] == "unknown_function":
+                same = entry["name"] == "unknown_function" and set(entry["inputs"]) == INPUTS[effect]
+            if same:
+                hits += 1
+                left.remove(entry)
+                for key, estimate in entry["parameters"].items():
+                    if key in true and here == place and group != "variant":
+                        error = abs(estimate["value"] - true[key])
+                        if key in ("phase", "center"):
+                            turn = 2 * math.pi if key == "phase" else math.pi
+                            error = min(error % turn, turn - error % turn)
+                        near.append(error <= 0.15 * abs(true[key]))
+                        inside.append(error <= 2 * estimate["std"])
+                break
+    at = lambda side: record["error"][side]["theta1"][3]  # noqa: E731
+    oracle = record["oracle"]["theta1"][3] if "oracle" in record else math.nan
+    before, after = (at("before"), at("after")) if "error" in record else (math.nan, math.nan)
+    return {
+        "right": hits == len(truth) and not (not truth and left),
+        "extras": len(left) if truth else 0,
+        "false": bool(left) and not truth,
+        "near": near,
+        "inside": inside,
+        "before": before,
+        "after": after,
+        "oracle": oracle,
+        "share": math.log(before / after) / math.log(before / oracle) if before > 1.05 * oracle else math.nan,
+    }
+
+
+def table(out: Path) -> str:
+    """What the files in `out` say, as Markdown."""
+    rows = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
+    lines = [
+        "| case | found | parameters (truth) | right | error before / after / with the true effect [rad, 1 s] | s |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for record in rows:
+        score = judged(record)
+        group, effect, view, _ = record["case"].split(":")
+        level = group
+        if group == "weak" and not 3 <= score["before"] / score["oracle"] <= 9:
+            level = "weak, other ratio"
+        groups.setdefault(f"{level} {view}", []).append(score | {"seconds": record["seconds"]})
+        if group == "clean" and not score["false"]:
+            continue
+        entries = record.get("effects", [])
+        found = "; ".join(_name(e) for e in entries) or "nothing"
+        values = "; ".join(
+            f"{k} {v['value']:.3g} ± {v['std']:.1g}" for e in entries for k, v in e["parameters"].items()
+        )
+        true = ", ".join(f"{k} {v}" for t in record["truth"] for k, v in t.items() if isinstance(v, float))
+        mark = "yes" if score["right"] and not score["extras"] else "with extras" if score["right"] else "**no**"
+        lines.append(
+            f"| {group} {effect} {view} | {found} | {values} ({true}) | {mark} | "
+            f"{score['before']:.3g} / {score['after']:.3g} / {score['oracle']:.3g} | {record['seconds']:.0f} |"
+        )
+    summary = [
+        "| group | cases | named right | false or extra | within 15 % | inside 2 std | median log ratio | after / true: "
+        "median, 90th | median s |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for group, scores in groups.items():
+        near, inside = (sum((s[k] for s in scores), []) for k in ("near", "inside"))
+        ratio = sorted(s["after"] / s["oracle"] for s in scores)
+        share = sorted(s["share"] for s in scores if math.isfinite(s["share"]))
+        bad = sum(s["false"] or s["extras"] > 0 for s in scores)
+        summary.append(
+            f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} | {_share(inside)} | "
+            f"{_middle(share):.2f} | {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
+            f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
+        )
+    head = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}."
+    return "\n".join([head, "", *summary, "", *lines, ""])
+
+
+def _name(entry: dict[str, Any]) -> str:
+    where = f" {entry['joint']}" if entry["joint"] else f" {entry['channel']}" if entry["channel"] else ""
+    return entry["name"] + where + (f" of {', '.join(entry['inputs'])}" if entry["inputs"] else "")
+
+
+def _share(flags: list[bool]) -> str:
+    return f"{sum(flags)} of {len(flags)}"
+
+
+def _middle(values: list[float]) -> float:
+    return values[len(values) // 2] if values else math.nan
+
+
+def main() -> None:
+    """Run what is asked for and missing, or print the table."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--out", type=Path, default=Path("out/diagnose"))
+    arguments.add_argument("--only", default="*", help="pattern of case names")
+    arguments.add_argument("--table", type=Path, help="write the table here and do nothing else")
+    arguments.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th, for several processes")
+    args = arguments.parse_args()
+    if args.table:
+        args.table.write_text(table(args.out))
+        return
+    first, step = map(int, args.share.split("/"))
+    names = [n for n in all_cases() if fnmatch.fnmatch(n, args.only if ":" in args.only else args.only + "*")]
+    for name in names[first::step]:
+        if (args.out / f"{name.replace(':', '_')}.json").exists():
+            continue
+        began = time.perf_counter()
+        run(name, args.out)
+        print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -110,44 +110,29 @@ def residual_figure(
 
     A panel is headed by the share of the residual's variance that its cause accounts for.
     """
-    sides = [(_followed(residual), BEFORE, "declared model")]
-    if after is not None:
-        sides.append((_followed(after), AFTER, "with what was found"))
+    sides = _sides(residual, after)
     first = sides[0][0]
     dof, kinds = first.force.shape[-1], list(_causes(first, names))
     columns = min(4, len(kinds))
     deep = -(-len(kinds) // columns)
     figure = Figure(figsize=(2.45 * columns + 0.3, 1.75 * deep * dof + 0.75), layout="constrained")
     grid = figure.subplots(deep * dof, columns, squeeze=False)
+    drawn: list[list[tuple[Axes, list[_Bins]]]] = []
     for j in range(dof):
         panels = grid[deep * j : deep * (j + 1)].ravel()
-        drawn: list[tuple[Axes, list[_Bins]]] = []
-        for c, ax in enumerate(panels):
-            if c >= len(kinds):
-                ax.set_axis_off()
-                continue
-            kind, edges, wrap = _scale(kinds[c], first.force[..., j], bins)
-            curves = []
-            for found, colour, label in sides:
-                cause = list(_causes(found, names))[c]
-                binned = _binned((cause.wrapped() if wrap else cause).values, found.force[..., j], edges)
-                ax.fill_between(binned.centre, binned.low, binned.high, color=colour, alpha=0.13, lw=0)
-                band = binned.mean - binned.half, binned.mean + binned.half
-                ax.fill_between(binned.centre, *band, color=colour, alpha=0.4, lw=0)
-                ax.plot(binned.centre, binned.mean, color=colour, label=label, lw=1.4)
-                curves.append(binned)
-            ax.axhline(0, color="#777777", lw=0.7, zorder=0)
-            ax.set(xlabel=kind.label, xlim=(edges[0], edges[-1]))
-            if kind.turn or wrap:
-                _turn_ticks(ax, edges)
-            drawn.append((ax, curves))
-        reach = _reach([b for _, curves in drawn for b in curves])
-        best = max(curves[0].share for _, curves in drawn)
-        for c, (ax, curves) in enumerate(drawn):
+        drawn.append([(ax, _panel(ax, sides, names, j, c, bins)) for c, ax in enumerate(panels[: len(kinds)])])
+        for ax in panels[len(kinds) :]:
+            ax.set_axis_off()
+    reaches = [_reach([b for _, curves in row for b in curves]) for row in drawn]
+    for j, row in enumerate(drawn):
+        alike = [r for k, r in enumerate(reaches) if names.rotary[k] == names.rotary[j]]
+        reach = max(reaches[j], 0.3 * max(alike))  # what matters little should look little
+        best = max(curves[0].share for _, curves in row)
+        for c, (ax, curves) in enumerate(row):
             ax.set_ylim(-reach, reach)
-            share = curves[0].share
+            share = max(curves[0].share, 0.0)
             heavy = {"color": "#222222", "weight": "bold"} if share == best > 0.1 else {"color": "#777777"}
-            ax.set_title(f"{share:.0%}" if share > 0.02 else "none", fontsize=8, loc="right", pad=2, **heavy)
+            ax.set_title(f"{100 * share:.0f} %", fontsize=8, loc="right", pad=2, **heavy)
             if c % columns:
                 ax.tick_params(labelleft=False)
             else:
@@ -156,10 +141,75 @@ def residual_figure(
     return figure
 
 
+@_styled
+def cause_figure(
+    residual: Residual,
+    names: Names,
+    after: Residual | None = None,
+    *,
+    bins: int = 30,
+    title: str | None = None,
+) -> Figure:
+    """The one panel of `residual_figure` in which the residual goes most with its cause."""
+    sides = _sides(residual, after)
+    first = sides[0][0]
+    places = [(j, c) for j in range(first.force.shape[-1]) for c in range(len(list(_causes(first, names))))]
+    sizes = [float(np.nanstd(first.force[..., j])) for j in range(first.force.shape[-1])]
+    figure = Figure(figsize=(5.4, 3.5), layout="constrained")
+    ax = figure.subplots()
+
+    def weight(place: tuple[int, int]) -> float:
+        """Share of the variation, less where the force is small beside that at another joint of the kind."""
+        j, c = place
+        alike = max(s for s, turns in zip(sizes, names.rotary, strict=True) if turns == names.rotary[j])
+        kind, edges, _ = _scale(list(_causes(first, names))[c], first.force[..., j], bins)
+        return _binned(kind.values, first.force[..., j], edges).share * sizes[j] / max(alike, 1e-300)
+
+    j, c = max(places, key=weight)
+    curves = _panel(ax, sides, names, j, c, bins)
+    reach = _reach(curves)
+    ax.set_ylim(-reach, reach)
+    ax.set_ylabel(_force_label(j, names).replace("\n", ": "))
+    _head(figure, title or f"Missing {_kind(j, names)} against its likeliest cause", [ax])
+    return figure
+
+
+_Side = tuple[Residual, str, str]
+"""What was left, its colour and its name."""
+
+
+def _sides(residual: Residual, after: Residual | None) -> list[_Side]:
+    sides = [(_followed(residual), BEFORE, "declared model")]
+    return sides if after is None else [*sides, (_followed(after), AFTER, "with what was found")]
+
+
+def _panel(ax: Axes, sides: Sequence[_Side], names: Names, joint: int, place: int, bins: int) -> list[_Bins]:
+    """The force at one joint against one cause; what was drawn, for the limits."""
+    first = sides[0][0]
+    kind, edges, wrap = _scale(list(_causes(first, names))[place], first.force[..., joint], bins)
+    curves = []
+    for found, colour, label in sides:
+        cause = list(_causes(found, names))[place]
+        binned = _binned((cause.wrapped() if wrap else cause).values, found.force[..., joint], edges)
+        ax.fill_between(binned.centre, binned.low, binned.high, color=colour, alpha=0.13, lw=0)
+        band = binned.mean - binned.half, binned.mean + binned.half
+        ax.fill_between(binned.centre, *band, color=colour, alpha=0.4, lw=0)
+        ax.plot(binned.centre, binned.mean, color=colour, label=label, lw=1.4)
+        curves.append(binned)
+    ax.axhline(0, color="#777777", lw=0.7, zorder=0)
+    ax.set(xlabel=kind.label, xlim=(edges[0], edges[-1]))
+    if kind.turn or wrap:
+        _turn_ticks(ax, edges)
+    return curves
+
+
+def _kind(joint: int, names: Names) -> str:
+    return "torque" if names.rotary[joint] else "force"
+
+
 def _force_label(joint: int, names: Names) -> str:
-    kind = "torque" if names.rotary[joint] else "force"
     where = f"joint {joint + 1}\n" if len(names.coordinates) > 1 else ""
-    return f"{where}missing {kind} [{names.force_unit(joint)}]"
+    return f"{where}missing {_kind(joint, names)} [{names.force_unit(joint)}]"
 
 
 def _reach(curves: Sequence[_Bins]) -> float:

@@ -103,8 +103,8 @@ def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
     parts = [
         _head(document),
         _section("What was found, and how sure", _found(effects) + drawn("found")),
-        _section("Before and after", _before_after(document) + drawn("error")),
-        _section("The force that the declared model lacks", drawn("residual")),
+        _section("Before and after" if effects else "Prediction error", _before_after(document) + drawn("error")),
+        _section("What the declared model leaves unexplained", drawn("residual")),
         _section("What could not be told apart", _alike(effects)),
         _section("What to measure next", _list(document.get("next") or [])),
         _section("Details", _details(document, drawn("details"))),
@@ -127,7 +127,7 @@ def label(effect: Mapping[str, Any]) -> str:
     if effect.get("joint"):
         text += f" at joint {effect['joint']}"
     if effect.get("channel"):
-        text += " of all sensors" if effect["channel"] == "all" else f" of sensor {effect['channel']}"
+        text += " on all sensors" if effect["channel"] == "all" else f" on {effect['channel']}"
     return text
 
 
@@ -167,7 +167,11 @@ def _power(mantissa: float, exponent: int, decimals: int) -> str:
 
 
 def _exponent(exponent: int) -> str:
-    return " × 10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f" × 10{_raised(exponent)}"
+
+
+def _raised(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def _chance(p: Any) -> str:
@@ -175,7 +179,13 @@ def _chance(p: Any) -> str:
         return ""
     if p < 1e-12:
         return "less than one in a million million"
-    return f"about one in {number(1 / p, 1)}" if p < 0.1 else number(p, 2)
+    if p < 1e-3:
+        return f"about one in 10{_raised(round(-math.log10(p)))}"
+    return f"about one in {1 / p:.0f}" if p < 0.1 else number(p, 2)
+
+
+def _p_value(p: Any) -> str:
+    return f"&lt; 10{_raised(-300)}" if p == 0 else number(p, 2)
 
 
 def _ratio(before: Any, after: Any) -> str:
@@ -184,7 +194,7 @@ def _ratio(before: Any, after: Any) -> str:
     ratio = before / after
     if 0.95 < ratio < 1.05:
         return "same"
-    return f"{number(ratio, 2)} × smaller" if ratio > 1 else f"{number(1 / ratio, 2)} × larger"
+    return f"{number(ratio, 2)} ×" if ratio > 1 else f"{number(1 / ratio, 2)} × larger"
 
 
 def _finite(value: Any) -> bool:
@@ -223,17 +233,17 @@ def _figures_of_merit(document: Mapping[str, Any]) -> str:
     tiles = []
     error = document.get("error") or {}
     horizons = error.get("horizons_s") or []
-    if horizons and document.get("effects"):
+    if horizons:
         at = min(range(len(horizons)), key=lambda i: abs(horizons[i] - 1.0))
-        for column, before in list((error.get("before") or {}).items())[:2]:
-            after = _at((error.get("after") or {}).get(column), at)
-            tiles.append(
-                (
-                    f"error of {column}, {horizons[at]:g} s ahead",
-                    f"{number(_at(before, at), 2)} → {number(after, 2)} {_unit(column)}",
-                    _ratio(_at(before, at), after),
-                )
-            )
+        for column, values in list((error.get("before") or {}).items())[:2]:
+            before, after = _at(values, at), _at((error.get("after") or {}).get(column), at)
+            title = f"error of {column}, {horizons[at]:g} s ahead"
+            if document.get("effects"):
+                ratio = _ratio(before, after)
+                change = f"{number(before, 2)} → {number(after, 2)} {_unit(column)}"
+                tiles.append((title, change, f"{ratio} smaller" if ratio.endswith("×") else ratio))
+            else:
+                tiles.append((title, f"{number(before, 2)} {_unit(column)}", "on test sequences"))
     failed = _failures(document.get("tests"))
     if failed:
         (first, last), total = failed, len((document.get("tests") or {}).get("before") or [])
@@ -264,7 +274,11 @@ def _found(effects: Sequence[Mapping[str, Any]]) -> str:
             "<p>No effect of the catalogue, and no unknown force, improves the model by more than chance would. "
             "Weaker effects than these data can show are not excluded.</p>"
         )
-    return f'<div class="cards">{"".join(_card(e) for e in effects)}</div>'
+    note = (
+        '<p class="evidence">nat: the unit of log-likelihood; every 2.3 nat make the data ten times as likely. '
+        "±: one standard deviation.</p>"
+    )
+    return f'<div class="cards">{"".join(_card(e) for e in effects)}</div>{note}'
 
 
 def _card(effect: Mapping[str, Any]) -> str:
@@ -331,17 +345,20 @@ def _before_after(document: Mapping[str, Any]) -> str:
             "The error is the root mean square of prediction minus reading, up to the time ahead. "
             "Test sequences had no part in any choice.</p>"
         )
+        changed = bool(document.get("effects"))
+        names = ("before", "after", "smaller by") if changed else ("error",)
         head = '<th rowspan="2">time ahead</th>' + "".join(
-            f'<th colspan="3" class="group">{escape(c)} [{_unit(c)}]</th>' for c in columns
+            f'<th colspan="{len(names)}" class="group">{escape(c)} [{_unit(c)}]</th>' for c in columns
         )
-        second = '<th class="group">before</th><th>after</th><th></th>' * len(columns)
+        second = "".join(f'<th class="{"group" if n == names[0] else ""}">{n}</th>' for _ in columns for n in names)
         rows = []
         for i, horizon in enumerate(horizons):
             cells = [f'<th scope="row">{number(horizon, 2)} s</th>']
             for c in columns:
                 before, after = (_at((error.get(s) or {}).get(c), i) for s in ("before", "after"))
-                cells.append(f'<td class="group">{number(before)}</td><td><b>{number(after)}</b></td>')
-                cells.append(f'<td class="ratio">{_ratio(before, after)}</td>')
+                cells.append(f'<td class="group">{number(before)}</td>')
+                if changed:
+                    cells.append(f'<td><b>{number(after)}</b></td><td class="ratio">{_ratio(before, after)}</td>')
             rows.append(f"<tr>{''.join(cells)}</tr>")
         parts.append(_box(f"<thead><tr>{head}</tr><tr>{second}</tr></thead><tbody>{''.join(rows)}</tbody>"))
     failed = _failures(document.get("tests"))
@@ -413,7 +430,7 @@ def _tests(tests: Mapping[str, Any]) -> str:
             cells.append(
                 f'<tr class="{"bad" if bad else "good"}"><td>{"✗ fails" if bad else "✓ passes"}</td>'
                 f"<td>{escape(str(t.get('channel') or ''))}</td><td>{escape(str(t.get('name') or ''))}</td>"
-                f"<td>{number(t.get('size'), 2)}</td><td>{number(p, 2)}</td>"
+                f"<td>{number(t.get('size'), 2)}</td><td>{_p_value(p)}</td>"
                 f'<td class="words">{escape(str(t.get("meaning") or ""))}</td></tr>'
             )
         if cells:
@@ -536,7 +553,8 @@ ul{padding-left:1.2em}
 li{margin-bottom:6px}
 .tiles{list-style:none;padding:0;margin:20px 0 0;max-width:none;display:grid;gap:12px;
 grid-template-columns:repeat(auto-fit,minmax(230px,1fr))}
-.tiles li{background:var(--tint);border-radius:8px;padding:12px 14px;margin:0;display:flex;flex-direction:column}
+.tiles li{background:var(--tint);border-radius:8px;padding:12px 14px;margin:0;max-width:400px;
+display:flex;flex-direction:column}
 .tiles span{color:var(--soft);font-size:.9rem}
 .tiles strong{font-size:1.25rem;font-variant-numeric:tabular-nums}
 .cards{display:grid;gap:14px;grid-template-columns:repeat(auto-fit,minmax(min(100%,340px),1fr));margin-bottom:16px}
@@ -555,7 +573,7 @@ dd dl{margin:0}
 table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.94rem}
 th,td{padding:5px 10px;text-align:right;white-space:nowrap;border-bottom:1px solid var(--line);vertical-align:top}
 thead th{color:var(--soft);font-weight:500;vertical-align:bottom}
-th:first-child,td:first-child{text-align:left;padding-left:2px}
+tr>:first-child:not(.group){text-align:left;padding-left:2px}
 tbody th{font-weight:500}
 .group{border-left:1px solid var(--line);padding-left:16px}
 thead .group[colspan]{text-align:center}

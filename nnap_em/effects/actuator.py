@@ -117,7 +117,7 @@ class InputDelay(AbstractEffect):
         return float(self.delay) > 0
 
     def input(self, u, dt):
-        late = jnp.arange(u.shape[0]) - jnp.maximum(self.delay, 0.0) / dt
+        late = jnp.arange(u.shape[0], dtype=u.dtype) - jnp.maximum(self.delay, 0.0) / dt
         whole = jnp.floor(late)
         share = late - whole
         padded = jnp.concatenate([jnp.zeros_like(u[:1]), u])

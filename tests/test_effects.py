@@ -1,0 +1,204 @@
+"""The catalogue against an independent simulator: each effect moves the machine as the other code says."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plant
+import pytest
+
+from nnap_em.data import Dataset
+from nnap_em.effects import catalogue, fields
+from nnap_em.effects.function import Axis, UnknownFunction
+from nnap_em.friction import FixedFriction
+from nnap_em.gaussian import Gaussian
+from nnap_em.law import StribeckLaw
+from nnap_em.model import StateSpaceModel, with_effects
+from nnap_em.systems import systems
+
+STEPS = 60
+
+
+def _a(value):
+    return jnp.asarray(value, float)
+
+
+def _spring(e):
+    return catalogue["torsional_spring"](_a(e["k"]), _a(e["k"] * e["theta0"]), e["joint"])
+
+
+def _cogging(e):
+    sine, cosine = (_a(e["amplitude"] * f(e["phase"])) for f in (np.cos, np.sin))
+    return catalogue["cogging"](sine, cosine, _a(e["k"]), e["joint"])
+
+
+def _eddy(e):
+    even, odd = (_a(e["c"] * f(2 * e["center"])) for f in (np.cos, np.sin))
+    return catalogue["eddy_brake"](even, odd, e["joint"])
+
+
+def _depth(e):
+    cosine, sine = _a(e["depth"] * np.cos(e["phase"])), _a(-e["depth"] * np.sin(e["phase"]))
+    return catalogue["position_dependent_friction"](cosine, sine, _a(e["n"]), e["joint"])
+
+
+def _shake(e):
+    sine, cosine = (_a(e["amplitude"] * f(e["phase"])) for f in (np.cos, np.sin))
+    return catalogue["base_vibration"](sine, cosine, _a(e["frequency"]))
+
+
+def _flexible(e):
+    damping = 0.2 * np.sqrt(e["k"] * plant.MOTOR_INERTIA)
+    return catalogue["joint_flexibility"](_a(np.log(e["k"])), _a(np.log(plant.MOTOR_INERTIA)), _a(np.log(damping)), 2)
+
+
+MAKE = {
+    "torsional_spring": _spring,
+    "base_tilt": lambda e: catalogue["base_tilt"](_a(e["angle"])),
+    "payload": lambda e: catalogue["payload"](_a(e["mass"]), e["joint"]),
+    "link_inertia": lambda e: catalogue["link_inertia"](_a(e["dI"]), e["joint"]),
+    "link_length": lambda e: catalogue["link_length"](_a(e["dl"]), e["joint"]),
+    "center_of_mass": lambda e: catalogue["center_of_mass"](_a(e["dlc"]), e["joint"]),
+    "air_drag": lambda e: catalogue["air_drag"](_a(e["c"]), e["joint"]),
+    "motor_gain": lambda e: catalogue["motor_gain"](_a(e["gain"] - 1), e["joint"]),
+    "dead_zone": lambda e: catalogue["dead_zone"](_a(e["width"]), e["joint"]),
+    "saturation": lambda e: catalogue["saturation"](_a(e["limit"]), e["joint"]),
+    "input_delay": lambda e: catalogue["input_delay"](_a(e["delay"]), e["joint"]),
+    "actuator_lag": lambda e: catalogue["actuator_lag"](_a(e["tau"]), e["joint"]),
+    "cogging": _cogging,
+    "torque_offset": lambda e: catalogue["torque_offset"](_a(e["value"]), e["joint"]),
+    "position_dependent_friction": _depth,
+    "friction_drift": lambda e: catalogue["friction_drift"](_a(e["change"]), _a(np.log(e["tau"])), e["joint"]),
+    "sensor_bias": lambda e: catalogue["sensor_bias"](_a(e["bias"]), e["channel"]),
+    "sensor_scale": lambda e: catalogue["sensor_scale"](_a(e["scale"] - 1), e["channel"]),
+    "sensor_delay": lambda e: catalogue["sensor_delay"](_a(e["delay"]), e["channel"]),
+    "base_vibration": _shake,
+    "payload_step": lambda e: catalogue["payload_step"](_a(e["mass"]), _a(e["time"]), e["joint"], 0.003),
+    "eddy_brake": _eddy,
+    "joint_flexibility": _flexible,
+    "motor_back_emf": lambda e: catalogue["motor_back_emf"](_a(e["b"]), e["joint"]),
+}
+"""The catalogue's effect of a simulator's one."""
+CRUDE = {"payload_step": 0.02, "sensor_delay": 0.02, "joint_flexibility": 0.03}
+"""Share of the effect that may be missed where the model is approximate on purpose; .01 elsewhere."""
+
+
+def _model(case: plant.Case) -> StateSpaceModel:
+    """The declared model of a case, with its true friction."""
+    kind = systems[case.system]
+    values = {**kind.optional, **plant.SYSTEMS[case.system].parameters}
+    system = kind(**{n: _a(v) for n, v in values.items()}, joints=(plant.SYSTEMS[case.system].driven,))
+    law = plant.drawn_friction(case)
+    if any(e["name"] == "joint_flexibility" for e in case.effects):
+        law[1]["b"] += 3e-4  # the simulator's motor has a drag of its own, which the joint feels
+    column = lambda n: jnp.asarray([f[n] for f in law])  # noqa: E731
+    friction = StribeckLaw(*(column(n) for n in ("Fc", "Fs", "vs", "b", "eps")))
+    n = 2 * len(kind.coordinates)
+    states = kind.coordinates + kind.rates
+    return StateSpaceModel(
+        system,
+        FixedFriction(friction, jnp.ones(n // 2)),
+        Gaussian(jnp.zeros(n), jnp.eye(n)),
+        jnp.zeros(n),
+        jnp.zeros(len(plant.measured(case))),
+        tuple(states.index(c) for c in plant.measured(case)),
+        plant.DT,
+        10,
+    )
+
+
+@jax.jit
+def _roll(model, start, seq):
+    u = model.inputs(seq)
+
+    def step(x, u):
+        return model.transition(x, u), (x, model.emission(x, u))
+
+    return jax.lax.scan(step, start, u)[1]
+
+
+def _both(case: plant.Case, effects):
+    """Noise-free readings of the simulator, of the model with the effects and of the model without."""
+    rig = plant.build(case)
+    u, t = plant.torques(case)[:3], plant.clocks(case)[:3]
+    start = plant.starts(case)[:3]
+    if case.effects and case.effects[0]["name"] == "payload_step":
+        t = t + case.effects[0]["time"] - 0.3
+    told = plant.noise_free(rig, plant.simulate(rig, start, u, t))
+    out = []
+    for model in (with_effects(_model(case), effects), _model(case)):
+        rows = []
+        for i in range(3):
+            memory = model.start.mean.shape[0] - start.shape[1]
+            clock = t[i] + plant.DT * np.arange(u.shape[1])
+            seq = Dataset(*map(jnp.asarray, (clock, u[i][:, None], told[i], np.ones(u.shape[1], bool))))
+            rows.append(np.asarray(_roll(model, jnp.pad(jnp.asarray(start[i]), (0, memory)), seq)[1]))
+        out.append(np.stack(rows))
+    return told, *out
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_moves_as_the_independent_simulator_says(name):
+    case = plant.Case(effects=plant.STRONG[name], steps=STEPS, hidden=False, seed=3)
+    told, mine, without = _both(case, (MAKE[name](plant.STRONG[name][0]),))
+    rows = slice(6, None)  # a late sensor reads the start until the delay is over; one step backward knows no start
+    effect = np.sqrt(np.mean((told - without)[:, rows] ** 2, axis=(0, 1)))
+    missed = np.sqrt(np.mean((told - mine)[:, rows] ** 2, axis=(0, 1)))
+    moved = effect > 1e-9
+    assert moved.any()
+    assert np.all(missed[moved] < CRUDE.get(name, 0.01) * effect.max() + 1e-4), (missed, effect)
+
+
+def test_slide_and_pendulum_know_their_effects():
+    for system, effects in (("slide", "torsional_spring"), ("pendulum", "base_tilt")):
+        effect = {"name": effects, "joint": 1, "k": 2.0, "theta0": 0.1, "angle": 0.2}
+        case = plant.Case(system=system, effects=(effect,), steps=STEPS, hidden=False, seed=3)
+        told, mine, without = _both(case, (MAKE[effects](effect),))
+        assert np.abs(told - mine).max() < 0.01 * np.abs(told - without).max() + 1e-5
+
+
+def test_the_vocabulary_is_covered(shared):
+    names = set(json.loads((shared / "vocabulary.json").read_text()))
+    assert names - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
+    assert set(catalogue) <= names
+    parameters = json.loads((shared / "vocabulary.json").read_text())
+    for name, kind in catalogue.items():
+        assert set(kind.units) == set(parameters[name]["parameters"]), name
+        assert kind.confirm, name
+
+
+def test_basis_functions_of_an_angle_go_round():
+    axis = Axis(("theta2",), -np.pi, np.pi, True, 14)
+    np.testing.assert_allclose(axis.basis(_a(0.3)), axis.basis(_a(0.3 + 2 * np.pi)), atol=1e-12)
+    ones = UnknownFunction(jnp.ones(14), (axis,), 2)
+    values = [float(ones.torque({"theta2": _a(v)})) for v in np.linspace(-3, 3, 41)]
+    assert np.ptp(values) < 1e-3 * np.mean(values)  # enough overlap for a constant
+
+
+def test_absent_strength_is_no_effect():
+    """A linear effect with strength zero leaves the transition and the reading to the last bit or nearly so."""
+    from nnap_em.effects import Around
+
+    case = plant.Case(steps=20, hidden=False)
+    model = _model(case)
+    around = Around(
+        model.system, np.ones(2), 10 * np.ones(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
+        ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), True, True,
+    )  # fmt: skip
+    x = jnp.asarray([0.3, -0.5, 2.0, -3.0])
+    row = jnp.asarray([0.2, 1.0, 0.1])
+    seen = set()
+    for kind in catalogue.values():
+        for candidate in kind.candidates(around):
+            start = candidate.start
+            if not start.linear or start.name in seen or start.memory:
+                continue
+            seen.add(start.name)
+            full = with_effects(model, (start,))
+            np.testing.assert_allclose(
+                full.transition(x, row), model.transition(x, row[:1]), atol=1e-9, err_msg=start.name
+            )
+            np.testing.assert_allclose(full.emission(x, row), x, atol=1e-12)
+            assert fields(start)
+    assert len(seen) > 15

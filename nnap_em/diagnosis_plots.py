@@ -131,8 +131,9 @@ def residual_figure(
         for c, (ax, curves) in enumerate(row):
             ax.set_ylim(-reach, reach)
             share = max(curves[0].share, 0.0)
-            heavy = {"color": "#222222", "weight": "bold"} if share == best > 0.1 else {"color": "#777777"}
-            ax.set_title(f"{100 * share:.0f} %", fontsize=8, loc="right", pad=2, **heavy)
+            told = ax.set_title(f"{100 * share:.0f} %", fontsize=8, loc="right", pad=2, color="#777777")
+            if share == best > 0.1:
+                told.set(color="#222222", weight="bold")
             if c % columns:
                 ax.tick_params(labelleft=False)
             else:

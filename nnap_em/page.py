@@ -84,12 +84,12 @@ class Picture(NamedTuple):
     """Section: "found", "error", "residual" or "details"."""
 
 
-Figures = Sequence[Picture | tuple[str, str, bytes] | tuple[str, str, bytes, str]]
+Figures = Sequence[Picture | tuple[str, str, bytes]]
 
 
 def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
     """The whole page; raises ValueError where an image is neither PNG nor SVG."""
-    pictures = [Picture(*figure) for figure in figures]
+    pictures = [figure if isinstance(figure, Picture) else Picture(*figure) for figure in figures]
     for picture in pictures:
         if picture.place not in ("found", "error", "residual", "details"):
             raise ValueError(
@@ -315,7 +315,7 @@ def _evidence(effect: Mapping[str, Any]) -> str:
     gain, held, p = (evidence.get(k) for k in ("log_likelihood_gain", "held_out_gain", "p_value"))
     lines = []
     decisive = held if _finite(held) else gain
-    if _finite(decisive):
+    if decisive is not None and _finite(decisive):
         steps = ((100, "beyond doubt"), (30, "very sure"), (10, "sure"), (3, "likely"))
         word = next((w for least, w in steps if decisive >= least), "a hint only")
         lines.append(f'<span class="sure">{escape(word[0].upper() + word[1:])}.</span>')
@@ -508,7 +508,8 @@ def _box(table: str, kind: str = "") -> str:
 def _figure(picture: Picture) -> str:
     kind, width = _image(picture)
     data = base64.b64encode(picture.image).decode("ascii")
-    small = f' style="min-width:{round(0.72 * width)}px;max-width:{round(1.1 * width)}px"'
+    least = round(0.72 * width) if width > 560 else 0  # wider ones scroll inside their box on a phone
+    small = f' style="min-width:{least}px;max-width:{round(1.1 * width)}px"'
     return (
         f'<figure><div class="box" tabindex="0" role="region" aria-label="{escape(picture.title)}">'
         f'<img src="data:{kind};base64,{data}" alt="{escape(picture.title)}"{small if width else ""}></div>'
@@ -561,6 +562,7 @@ display:flex;flex-direction:column}
 article{border:1px solid var(--line);border-top:4px solid var(--blue);border-radius:8px;padding:14px 16px;min-width:0}
 article p{margin-bottom:10px}
 .evidence{color:var(--soft);font-size:.93rem;margin:0}
+.cards+.evidence{margin-bottom:20px}
 .sure{color:var(--ink);font-weight:650}
 dl{display:grid;grid-template-columns:minmax(8em,auto) 1fr;gap:2px 18px;margin:0 0 12px;max-width:46rem}
 dt{color:var(--soft)}

@@ -27,7 +27,8 @@ LEVEL = 0.05
 """Corrected p-value below which a test counts as failed."""
 SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
 """Sizes below which a failed test is called small."""
-_GROUPS = 20
+_GROUPS, _GROUP = 20, 50
+"""Groups at least, readings in a group at least where these are enough."""
 
 
 class Names(NamedTuple):
@@ -177,12 +178,12 @@ def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
     return out
 
 
-def chi2_tail(x: float, df: float) -> float:
+def chi2_tail(x: float, df: int) -> float:
     """P(chi^2_df > x)."""
     return float(jax.scipy.special.gammaincc(jnp.asarray(0.5 * df, float), jnp.asarray(0.5 * max(x, 0.0), float)))
 
 
-def t_tails(t: float, df: float) -> float:
+def t_tails(t: float, df: int) -> float:
     """P(|Student's t_df| > |t|)."""
     at = jnp.asarray(df / (df + t * t), float)
     return float(jax.scipy.special.betainc(jnp.asarray(0.5 * df, float), jnp.asarray(0.5, float), at))
@@ -243,8 +244,9 @@ def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
 def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
     """Correlation of innovations with a cause known before them: Student's t, p-value, correlation.
 
-    The sums over sequences (or parts of them, 20 in all) of their product are independent and of mean 0 but of unlike
-    variance; the t-test of them is conservative then [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453].
+    The sums of their product over sequences, cut in parts of some 50 readings, are of mean 0, as good as independent,
+    and of unlike variance; the t-test of them is conservative then, and holds where errors follow each other over
+    some samples.  [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453]
     """
     seen = np.isfinite(e) & np.isfinite(cause)
     x, g = (np.where(seen, a - np.mean(a, where=seen), 0.0) for a in (e, cause))
@@ -263,10 +265,10 @@ def bias(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
 
 
 def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "seq time"]):
-    """Sums over groups of about equally many readings: sequences, cut in parts where these are few."""
+    """Sums over groups of about equally many readings: parts of sequences."""
     active = seen.any(1)
     values, seen = values[active], seen[active]
-    parts = max(1, -(-_GROUPS // max(len(values), 1)))
+    parts = max(1, -(-_GROUPS // max(len(values), 1)), int(np.median(seen.sum(1)) // _GROUP) if len(seen) else 1)
     sums = []
     for row, known in zip(values, seen, strict=True):
         sums += [piece.sum() for piece in np.array_split(row[known], parts) if piece.size]
@@ -322,8 +324,8 @@ def _meaning(name: str, channel: str, p: float, size: float) -> str:
     kind = name.split()[0]
     if kind == "correlation":
         cause = name.removeprefix("correlation with ")
-        passed = f"What the model misses in {channel} has nothing to do with {cause}."
-        failed = f"What the model misses in {channel} changes with {cause} (correlation {size:.2g})."
+        passed = f"Errors in {channel} show no link with {cause}."
+        failed = f"Errors in {channel} change with {cause} (correlation {size:.2g})."
     else:
         passed, failed = {
             "whiteness": (

@@ -1,0 +1,184 @@
+"""The page is sound HTML that fetches nothing, whatever of the report is there."""
+
+import re
+import struct
+from html.parser import HTMLParser
+
+import pytest
+
+from nnap_em.page import LEVEL, Picture, label, number, page, with_std
+
+PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
+SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+
+EFFECT = {
+    "name": "torsional_spring",
+    "joint": 2,
+    "channel": None,
+    "inputs": [],
+    "parameters": {"k": {"value": 0.05995, "std": 0.00037, "unit": "N m/rad"}},
+    "evidence": {"log_likelihood_gain": 1142.0, "held_out_gain": 1182.0, "p_value": 0.0},
+    "equivalent": [{"name": "hard_stop", "joint": 1}],
+    "description": "torsional spring at joint 2",
+}
+TEST = {"name": "whiteness", "channel": "theta1", "statistic": 50.0, "p_value": 1e-4, "size": 0.2, "meaning": "Errors."}
+WHOLE = {
+    "format": 1,
+    "rig": "arm",
+    "system": "acrobot",
+    "verdict": "The model lacks a spring.",
+    "effects": [EFFECT],
+    "error": {
+        "given_s": 1.0,
+        "horizons_s": [0.5, 1.0],
+        "before": {"theta1": [0.2, 0.807], "dtheta1": [1.0, None]},
+        "after": {"theta1": [0.3, 0.0058], "dtheta1": [1.0, float("nan")]},
+    },
+    "models": {"before": "before.npz", "after": "after.npz"},
+    "friction_change": "Friction was bent.",
+    "tests": {"before": [TEST, TEST | {"p_value": None}], "after": [TEST | {"p_value": LEVEL}]},
+    "parameters": {"before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}}, "after": {"m1": [1.1, 0.1]}},
+    "noise": {"before": {"theta1": {"value": 0.005, "unit": "rad"}}, "after": {"theta1": 0.005}},
+    "looks": [
+        {
+            "horizon_s": 1.0,
+            "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}],
+            "refitted": [],
+            "accepted": {"name": "torsional_spring", "joint": 2},
+        },
+        {"horizon_s": 5.0, "screened": None, "refitted": None, "accepted": None},
+    ],
+    "next": ["Unhook the cable."],
+    "seconds": 172.0,
+    "versions": {"jax": "0.10.2"},
+}
+
+
+class _Balance(HTMLParser):
+    """Fails where a tag is not closed, or closed twice; keeps addresses, ids and text."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.addresses, self.text, self.tags = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "action", "data", "srcset")]
+        assert not any(k.startswith("on") for k, _ in attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def _parsed(html):
+    parser = _Balance()
+    parser.feed(html)
+    parser.close()
+    assert parser.open == []
+    assert html.startswith("<!DOCTYPE html>")
+    return parser
+
+
+FIGURES = (("Errors", "A caption.", PNG), Picture("Learned", "", SVG, "found"), Picture("More", "", PNG, "details"))
+
+
+@pytest.mark.parametrize("missing", [None, *WHOLE])
+def test_page_is_whole_whatever_is_missing(missing):
+    for document in (
+        {k: v for k, v in WHOLE.items() if k != missing},
+        WHOLE | ({} if missing is None else {missing: None}),
+    ):
+        html = page(document, FIGURES)
+        parsed = _parsed(html)
+        assert "None" not in "".join(parsed.text) and "nan" not in "".join(parsed.text)
+        assert "script" not in parsed.tags
+        assert not re.search(r"https?://|url\(|@import", html)
+        assert all(a.startswith("data:image/") for a in parsed.addresses)
+
+
+def test_page_of_nothing():
+    parsed = _parsed(page({}))
+    assert "Nothing is missing" in " ".join(parsed.text)
+
+
+def test_clean_rig_has_one_column_of_errors_and_no_effect():
+    text = " ".join(_parsed(page(WHOLE | {"effects": [], "verdict": None})).text)
+    assert "Nothing is missing" in text and "smaller by" not in text and "could not be told apart" not in text
+
+
+def test_page_says_what_was_found_in_order():
+    text = " ".join(_parsed(page(WHOLE, FIGURES)).text)
+    told = (
+        "The model lacks a spring.",
+        "0.81 → 0.0058 rad",
+        "139 ×",
+        "What was found",
+        "0.05995 ± 0.00037 N m/rad",
+        "Beyond doubt",
+        "Before and after",
+        "1.5 × larger",
+        "1 failed before and none fails after",
+        "Friction was bent.",
+        "hard stop at joint 1",
+        "Unhook the cable.",
+        "Details",
+        "✗ fails",
+        "cogging at joint 1",
+        "172 s",
+    )
+    places = [text.find(part) for part in told]
+    assert min(places) >= 0, [part for part, place in zip(told, places, strict=True) if place < 0]
+    assert places == sorted(places)
+
+
+def test_all_text_is_escaped():
+    evil = '<script>alert("1")</script>&'
+
+    def spoil(value):
+        if isinstance(value, dict):
+            return {evil + k if k in ("theta1", "k", "m1", "jax") else k: spoil(v) for k, v in value.items()}
+        if isinstance(value, list):
+            return [spoil(v) for v in value]
+        return evil if isinstance(value, str) else value
+
+    html = page(spoil(WHOLE), [Picture(evil, evil, PNG)])
+    assert "<script" not in html and evil not in html
+    assert evil in "".join(_parsed(html).text)
+
+
+def test_images_are_told_apart_and_others_refused():
+    html = page({}, FIGURES)
+    assert html.count("data:image/png;base64,") == 2 and html.count("data:image/svg+xml;base64,") == 1
+    with pytest.raises(ValueError, match="PNG nor SVG"):
+        page({}, [("A", "", b"GIF89a")])
+    with pytest.raises(ValueError, match="place"):
+        page({}, [Picture("A", "", PNG, "top")])
+
+
+def test_numbers_as_a_reader_writes_them():
+    assert [number(v) for v in (0.00585, 1234.5, -2.0, 0, None, float("nan"))] == [
+        "0.00585",
+        "1234",
+        "−2.00",
+        "0",
+        "–",
+        "–",
+    ]
+    assert number(1.5e-9) == "1.50 × 10⁻⁹"
+    assert with_std(0.059951, 0.00037) == "0.05995 ± 0.00037"
+    assert with_std(12.3456, 3.21) == "12.3 ± 3.2"
+    assert with_std(1.5e-6, 2e-7) == "(1.50 ± 0.20) × 10⁻⁶"
+    assert with_std(3.0, None) == "3.000"
+
+
+def test_label():
+    assert label({"name": "sensor_bias", "channel": "theta1"}) == "sensor bias on theta1"
+    assert label({"name": "unknown_function", "joint": 1, "inputs": ["theta1", "u"]}) == (
+        "unknown function of theta1 and u at joint 1"
+    )

@@ -1,0 +1,285 @@
+"""Statistics against cases with a known answer, and the missing force against one that was put in."""
+
+import io
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from statsmodels.stats.diagnostic import acorr_ljungbox
+from statsmodels.stats.stattools import jarque_bera
+
+from nnap_em import diagnosis_plots
+from nnap_em.data import pad
+from nnap_em.effects.position import TorsionalSpring
+from nnap_em.identify import FrictionTable, begin
+from nnap_em.model import with_effects
+from nnap_em.residual import (
+    LEVEL,
+    Names,
+    Residual,
+    bias,
+    chi2_tail,
+    dependence,
+    holm,
+    names_of,
+    normality,
+    residual,
+    spread,
+    t_tails,
+    whiteness,
+)
+from nnap_em.residual import tests as run_tests
+from nnap_em.rig import Declared, Rig
+
+DT = 0.01
+NAMES = Names(("theta1", "x"), ("dtheta1", "dx"), (True, False), ("u",), (1,), ("theta1", "dx"))
+
+
+def _noise(seed, shape=(10, 300)):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def _found(seed, **changes):
+    """What a right model would leave, of states that move."""
+    rng = np.random.default_rng(1000 + seed)
+    shape = (10, 300)
+    walk = 0.1 * np.cumsum(rng.normal(size=(*shape, 4)), axis=1)
+    whole = Residual(
+        innovation=rng.normal(size=(*shape, 2)),
+        force=np.concatenate([rng.normal(size=(10, 299, 2)), np.full((10, 1, 2), np.nan)], axis=1),
+        force_std=np.ones((*shape, 2)),
+        state=walk,
+        predicted=walk,
+        u=np.sin(0.1 * np.arange(300) + rng.uniform(0, 6, size=(10, 1)))[..., None],
+        t=np.tile(DT * np.arange(300), (10, 1)),
+        valid=np.ones(shape, bool),
+        used=np.ones(10, bool),
+    )
+    return whole._replace(**changes)
+
+
+def test_holm_by_hand():
+    # sorted .005 .01 .03 .04, times 4 3 2 1, then never falling: .02 .03 .06 .06
+    np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02], rtol=1e-12)
+    np.testing.assert_allclose(holm([0.6, 0.9]), [1.0, 1.0])
+    assert holm([]).size == 0
+
+
+def test_tails_are_those_of_scipy():
+    for x, df in ((25.0, 20), (9000.0, 8800), (3.0, 2), (900.0, 4)):
+        assert chi2_tail(x, df) == pytest.approx(scipy.stats.chi2.sf(x, df), rel=1e-6)
+    for t, df in ((2.5, 19), (-4.0, 5), (30.0, 9)):
+        assert t_tails(t, df) == pytest.approx(2 * scipy.stats.t.sf(abs(t), df), rel=1e-6)
+
+
+def test_one_sequence_gives_what_statsmodels_gives():
+    e = _noise(0, (1, 400))
+    q, p, _ = whiteness(e)
+    table = acorr_ljungbox(e[0], lags=[20])
+    # that takes every autocovariance over N, ours over the number of its pairs
+    assert q == pytest.approx(float(table.lb_stat.iloc[0]), rel=0.1)
+    assert p == pytest.approx(float(table.lb_pvalue.iloc[0]), abs=0.1)
+    statistic, p, kurtosis = normality(e)
+    expected = jarque_bera(e[0])
+    assert statistic == pytest.approx(expected[0], rel=1e-9)
+    assert p == pytest.approx(expected[1], rel=1e-6)
+    assert kurtosis == pytest.approx(expected[3] - 3, rel=1e-9)
+
+
+@pytest.mark.parametrize("test", [whiteness, normality, spread, bias])
+def test_white_noise_fails_as_often_as_stated(test):
+    fails = np.mean([test(_noise(seed, (8, 120)))[1] < 0.05 for seed in range(400)])
+    assert abs(fails - 0.05) < 4 * math.sqrt(0.05 * 0.95 / 400)
+
+
+def test_unrelated_cause_fails_at_most_as_often_as_stated():
+    def p(seed, sequences):
+        rng = np.random.default_rng(seed)
+        scale = rng.uniform(0.2, 3.0, size=(sequences, 1))
+        cause = np.cumsum(rng.normal(size=(sequences, 150)), axis=1)
+        return dependence(scale * rng.normal(size=(sequences, 150)), cause)[1]
+
+    for sequences in (1, 6, 20):
+        fails = np.mean([p(seed, sequences) < 0.05 for seed in range(300)])
+        assert fails < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 300)
+
+
+def test_all_tests_together_seldom_accuse_a_right_model():
+    accused = [any(t.p_value < LEVEL for t in run_tests(_found(seed), NAMES)) for seed in range(40)]
+    assert np.mean(accused) < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 40)
+
+
+def test_autoregression_fails_and_its_coefficient_is_the_size():
+    e = _noise(3, (10, 400))
+    for k in range(1, 400):
+        e[:, k] += 0.3 * e[:, k - 1]
+    _, p, size = whiteness(e)
+    assert p < 1e-9
+    assert size == pytest.approx(0.3, abs=4 / math.sqrt(4000))
+
+
+def test_gaps_and_padding_change_no_statistic():
+    e = _noise(4, (5, 200))
+    longer = np.concatenate([e, np.full((5, 40), np.nan)], axis=1)
+    for test in (whiteness, normality, spread, bias):
+        np.testing.assert_allclose(test(longer), test(e), rtol=1e-12)
+    holes = np.where(_noise(5, e.shape) > 1, np.nan, e)
+    assert whiteness(holes)[1] > 1e-3
+    np.testing.assert_allclose(dependence(longer, np.ones_like(longer)), (0.0, 1.0, 0.0))
+
+
+def test_heavy_tails_and_wrong_spread_are_told_from_each_other():
+    heavy = np.random.default_rng(6).standard_t(4, size=(10, 300)) / math.sqrt(2)  # of variance 1
+    assert normality(heavy)[1] < 1e-9 and normality(heavy)[2] > 1
+    wide = 1.2 * _noise(7)
+    mean, p, size = spread(wide)
+    assert p < 1e-9 and size == pytest.approx(0.2, abs=0.06) and mean == pytest.approx(1.44, abs=0.15)
+    assert normality(wide)[1] > 1e-3
+
+
+def test_a_dependence_is_found_and_placed():
+    found = _found(8)
+    e = found.innovation.copy()
+    e[..., 0] += 0.5 * np.cos(found.predicted[..., 0])
+    e[:, 1:, 1] += 0.5 * found.u[:, :-1, 0]
+    results = run_tests(found._replace(innovation=e), NAMES)
+    by = {(t.channel, t.name): t for t in results}
+    assert by["theta1", "correlation with cos(theta1)"].p_value < LEVEL
+    assert by["dx", "correlation with u"].p_value < LEVEL
+    assert by["dx", "correlation with cos(theta1)"].p_value > LEVEL
+    assert "no link" in by["dx", "correlation with cos(theta1)"].meaning
+    assert 0.1 < by["dx", "correlation with u"].size < 0.6
+
+
+def test_lost_sequences_take_no_part():
+    found = _found(9)
+    broken = found.innovation.copy()
+    broken[0] = 1e3
+    used = np.arange(10) > 0
+    results = run_tests(found._replace(innovation=broken, used=used), NAMES)
+    assert all(t.p_value > LEVEL for t in results)
+    assert run_tests(found._replace(used=np.zeros(10, bool)), NAMES) == []
+
+
+def _slide(force, noise=(1e-3, 1e-4), mass=2.0, seconds=3.0, sequences=6):
+    """A slide with both states measured under a force that depends on time, position and velocity; a fit of it."""
+    rig = Rig(
+        name="slide",
+        system="slide",
+        parameters={"m": Declared(mass, 0.0)},
+        friction=False,
+        input_columns=("u",),
+        input_joints=(1,),
+        dt=DT,
+        clock="sequence",
+        measured=("x", "dx"),
+        noise_std=dict(zip(("x", "dx"), noise, strict=True)),
+        start={},
+    )
+    rng = np.random.default_rng(0)
+    rows = round(seconds / DT) + 1
+    logs, truth = [], []
+    for _ in range(sequences):
+        t = DT * np.arange(rows)
+        u = np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6))
+        x, v = rng.normal(), rng.normal()
+        path, forces = [], []
+        for k in range(rows):
+            path.append((x, v))
+            total = 0.0
+            for _ in range(50):  # of semi-implicit Euler
+                f = force(t[k], x, v)
+                total += f / 50
+                v += (u[k] + f) / mass * DT / 50
+                x += v * DT / 50
+            forces.append(total)
+        readings = np.asarray(path) + np.asarray(noise) * rng.normal(size=(rows, 2))
+        logs.append((t, u[:, None], readings))
+        truth.append(forces)
+    data = pad(logs)
+    return begin(rig, data, key=jax.random.key(0)), data, np.asarray(truth)
+
+
+def _with_kick(fitted, std):
+    """Process noise of the velocity as given; of the position what a force does to it within a sample."""
+    log_q = jnp.log(jnp.asarray([3e-5, std])) * 2
+    return fitted._replace(state=eqx.tree_at(lambda s: s.best.log_q, fitted.state, log_q))
+
+
+def test_a_known_force_comes_back_within_its_standard_deviation():
+    fitted, data, truth = _slide(lambda t, x, v: 1.5 * math.sin(2 * t) - 0.8 * x)
+    fitted = _with_kick(fitted, float(np.std(truth)) * DT / 2.0)  # as large as the force
+    found = residual(fitted, data)
+    assert found.used.all()
+    error = (found.force[:, :-1, 0] - truth[:, :-1]) / found.force_std[:, :-1, 0]
+    assert np.sqrt(np.mean(error**2)) < 1.1
+    assert np.isnan(found.force[:, -1]).all()
+    smooth = np.mean((found.force[:, :-1, 0] - truth[:, :-1]).reshape(6, 15, 20), axis=-1)
+    assert np.sqrt(np.mean(smooth**2)) < 0.02 * np.std(truth)
+    np.testing.assert_allclose(found.state, data.y, atol=5e-3)
+    np.testing.assert_allclose(found.u, data.u)
+
+
+def test_adding_an_effect_back_gives_its_force():
+    spring = TorsionalSpring(jnp.asarray(0.8), jnp.asarray(0.24), 1)
+    fitted, data, truth = _slide(lambda t, x, v: 0.24 - 0.8 * x)
+    fitted = _with_kick(fitted, 1e-3)
+    model = with_effects(fitted.model, (spring,))
+    fitted = fitted._replace(state=fitted.state._replace(best=model))
+    left = residual(fitted, data)
+    assert np.sqrt(np.nanmean(left.force**2)) < 0.05 * np.std(truth)
+    found = residual(fitted, data, add_back=True)
+    np.testing.assert_allclose(np.nanmean(found.force[:, :-1, 0] - truth[:, :-1], axis=1), 0, atol=0.01)
+    np.testing.assert_allclose(found.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
+
+
+def test_names_carry_units():
+    fitted, _, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
+    names = names_of(fitted)
+    assert [names.unit(n) for n in ("x", "dx", "u", "time")] == ["m", "m/s", "N", "s"]
+    assert [NAMES.unit(n) for n in ("theta1", "dtheta1", "dx", "u")] == ["rad", "rad/s", "m/s", "N m"]
+
+
+def _labels(figure):
+    return [ax.get_xlabel() for ax in figure.axes]
+
+
+def test_the_cause_of_a_force_has_the_largest_share():
+    found = _found(10)
+    force = found.force.copy()
+    force[..., 0] = 0.3 * force[..., 0] + 2 * np.sin(3 * found.state[..., 0])
+    found = found._replace(force=force)
+    figure = diagnosis_plots.residual_figure(found, NAMES, _found(11))
+    shares = {ax.get_xlabel(): float(ax.get_title(loc="right").split()[0]) for ax in figure.axes[:7] if ax.get_xlabel()}
+    best = max(shares, key=lambda name: shares[name])
+    assert best.startswith("θ₁") and shares[best] > 80
+    alone = diagnosis_plots.cause_figure(found, NAMES)
+    assert _labels(alone)[0].startswith("θ₁") and "joint 1" in alone.axes[0].get_ylabel()
+    assert all("[" in name for name in _labels(figure) if name)
+
+
+def test_figures_of_a_diagnosis_can_be_drawn():
+    found, names = _found(12), NAMES
+    v = np.linspace(-3, 3, 51)
+    table = FrictionTable(
+        jnp.asarray(np.stack([v, v])), jnp.asarray(np.stack([-v, -v])), jnp.tile(1e-4 * jnp.eye(51)[None], (2, 1, 1))
+    )
+    error = {"horizons_s": [0.1, 1.0], "before": {"theta1": [0.1, 1.0]}, "after": {"theta1": [0.05, None]}}
+    pair = found.state[0], np.ones((300, 4))
+    figures = (
+        diagnosis_plots.innovation_figure(found, names, found),
+        diagnosis_plots.error_figure(error),
+        diagnosis_plots.friction_pair_figure(table, table, list(found.state[..., 2:].reshape(-1, 2).T)),
+        diagnosis_plots.prediction_pair_figure(found.t[0], found.state[0][:, [0, 3]], names, pair, pair, 1.0),
+        diagnosis_plots.effect_figure(v, v**2, 0.1 + 0 * v, label_x="θ₁ [rad]", label_y="torque [N m]", visited=v),
+        diagnosis_plots.screen_figure([("a spring", 30.0), ("a delay", -2.0)], chosen="a spring"),
+        diagnosis_plots.screen_figure([]),
+    )
+    for figure in figures:
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=40)
+        assert image.getvalue().startswith(b"\x89PNG")

@@ -41,9 +41,9 @@ class _Bins(NamedTuple):
 
 
 def _binned(x: Float[np.ndarray, "seq time"], r: Float[np.ndarray, "seq time"], edges) -> _Bins:
-    """Mean of r over bins of x, 2 % trimmed at each end, with bands: of the mean, by its scatter over sequences."""
+    """Mean of r over bins of x, its extremes cut off, with bands; that of the mean by its scatter over sequences."""
     seen = np.isfinite(x) & np.isfinite(r)
-    low, high = np.percentile(r[seen], [0.5, 99.5])
+    low, high = np.percentile(r[seen], [0.5, 99.5]) if seen.any() else (0.0, 0.0)
     r = np.clip(r, low, high)
     place = np.where(seen, np.digitize(x, edges) - 1, -1)
     rows = []
@@ -51,12 +51,12 @@ def _binned(x: Float[np.ndarray, "seq time"], r: Float[np.ndarray, "seq time"], 
         inside = place == b
         count = inside.sum()
         parts = inside.any(1).sum()
-        if count < 20 or parts < 2:
+        if count < 20 or parts < min(2, r.shape[0]):
             rows.append([math.nan] * 4)
             continue
         mean = r[inside].mean()
         sums = np.sum(np.where(inside, r - mean, 0.0), axis=1)
-        error = math.sqrt(np.sum(sums**2) * parts / (parts - 1)) / count
+        error = math.sqrt(np.sum(sums**2) * parts / (parts - 1)) / count if parts > 1 else math.nan
         rows.append([mean, NORMAL_90 * error, *np.percentile(r[inside], [5, 95])])
     table = np.asarray(rows).T
     known = seen & (place >= 0) & (place < len(edges) - 1)
@@ -93,7 +93,8 @@ def _causes(found: Residual, names: Names) -> Iterator[_Cause]:
 
 
 def _followed(found: Residual) -> Residual:
-    return found._replace(**{f: getattr(found, f)[found.used] for f in found._fields if f != "used"})
+    used = found.used if found.used.any() else ~found.used
+    return found._replace(**{f: getattr(found, f)[used] for f in found._fields if f != "used"})
 
 
 @_styled
@@ -215,7 +216,7 @@ def _force_label(joint: int, names: Names) -> str:
 
 def _reach(curves: Sequence[_Bins]) -> float:
     """Half height of a panel: means and their bands in full, single samples as far as they do not hide these."""
-    means = [float(np.nanmax(np.abs(b.mean) + b.half)) for b in curves if np.isfinite(b.half).any()]
+    means = [float(np.nanmax(np.abs(b.mean) + np.nan_to_num(b.half))) for b in curves if np.isfinite(b.mean).any()]
     single = np.concatenate([np.abs(np.concatenate([b.low, b.high])) for b in curves])
     single = single[np.isfinite(single)]
     wide = float(np.median(single)) if single.size else 0.0

@@ -246,9 +246,8 @@ def _figures_of_merit(document: Mapping[str, Any]) -> str:
                 tiles.append((title, f"{number(before, 2)} {_unit(column)}", "on test sequences"))
     failed = _failures(document.get("tests"))
     if failed:
-        (first, last), total = failed, len((document.get("tests") or {}).get("before") or [])
-        text = f"{first} → {last}" if last is not None else str(first)
-        tiles.append(("failed tests of one-step errors", text, f"of {total}; a right model fails none"))
+        text = f"{failed.before}" if failed.after is None else f"{failed.before} → {failed.after}"
+        tiles.append(("failed tests of one-step errors", text, f"of {failed.total}; a right model fails none"))
     cells = "".join(
         f"<li><span>{escape(a)}</span><strong>{escape(b)}</strong><span>{escape(c)}</span></li>" for a, b, c in tiles
     )
@@ -259,13 +258,28 @@ def _at(values: Any, place: int) -> Any:
     return values[place] if values and place < len(values) else None
 
 
-def _failures(tests: Any) -> tuple[int, int | None] | None:
+class _Failed(NamedTuple):
+    """How many tests failed before and after (None: there is no after), and how many of these by little."""
+
+    total: int
+    before: int
+    after: int | None
+    slight_before: int
+    slight_after: int
+
+
+def _failures(tests: Any) -> _Failed | None:
     if not (tests and tests.get("before")):
         return None
-    counts = [
-        sum(_finite(p := t.get("p_value")) and p < LEVEL for t in tests.get(side) or []) for side in ("before", "after")
-    ]
-    return counts[0], counts[1] if tests.get("after") else None
+    sides = [[t for t in tests.get(side) or [] if _fails(t)] for side in ("before", "after")]
+    slight = [sum(bool(t.get("slight")) for t in side) for side in sides]
+    first, last = (len(side) - little for side, little in zip(sides, slight, strict=True))
+    return _Failed(len(tests["before"]), first, last if tests.get("after") else None, *slight)
+
+
+def _fails(test: Mapping[str, Any]) -> bool:
+    p = test.get("p_value")
+    return _finite(p) and p < LEVEL  # type: ignore[operator]
 
 
 def _found(effects: Sequence[Mapping[str, Any]]) -> str:
@@ -363,18 +377,25 @@ def _before_after(document: Mapping[str, Any]) -> str:
         parts.append(_box(f"<thead><tr>{head}</tr><tr>{second}</tr></thead><tbody>{''.join(rows)}</tbody>"))
     failed = _failures(document.get("tests"))
     if failed:
-        parts.append(f"<p>{_tests_told(failed, len(document['tests']['before']))}</p>")
+        parts.append(f"<p>{_tests_told(failed)}</p>")
     if document.get("friction_change"):
         parts.append(f"<p>{escape(str(document['friction_change']))}</p>")
     return "".join(parts)
 
 
-def _tests_told(failed: tuple[int, int | None], total: int) -> str:
-    before, after = failed
-    text = f"Of {total} tests that the errors from one sample to the next are pure noise, {before or 'none'} failed"
-    if after is None:
+def _tests_told(failed: _Failed) -> str:
+    before, after = failed.before, failed.after
+    text = (
+        f"Of {failed.total} tests that the errors from one sample to the next are pure noise, {before or 'none'} failed"
+    )
+    more = [f"{failed.slight_before or 'none'}", f"{failed.slight_after or 'none'}"]
+    if after is not None:
+        text += f" before and {after or 'none'} {'fails' if after in (0, 1) else 'fail'} after"
+    if not (failed.slight_before or failed.slight_after):
         return text + "."
-    return f"{text} before and {after or 'none'} {'fails' if after in (0, 1) else 'fail'} after."
+    return (
+        f"{text} (not counting {more[0] if after is None else ' and '.join(more)} that failed by too little to matter)."
+    )
 
 
 def _alike(effects: Sequence[Mapping[str, Any]]) -> str:
@@ -426,9 +447,10 @@ def _tests(tests: Mapping[str, Any]) -> str:
         cells = []
         for t in sorted(rows, key=lambda t: (t.get("p_value") is None, t.get("p_value"))):
             p = t.get("p_value")
-            bad = _finite(p) and p < LEVEL
+            bad = _fails(t)
+            outcome = "✓ passes" if not bad else "✗ slightly" if t.get("slight") else "✗ fails"
             cells.append(
-                f'<tr class="{"bad" if bad else "good"}"><td>{"✗ fails" if bad else "✓ passes"}</td>'
+                f'<tr class="{"bad" if bad else "good"}"><td>{outcome}</td>'
                 f"<td>{escape(str(t.get('channel') or ''))}</td><td>{escape(str(t.get('name') or ''))}</td>"
                 f"<td>{number(t.get('size'), 2)}</td><td>{_p_value(p)}</td>"
                 f'<td class="words">{escape(str(t.get("meaning") or ""))}</td></tr>'

@@ -93,6 +93,8 @@ class Test(NamedTuple):
     deviation minus 1; mean over standard deviation; correlation."""
     meaning: str
     """One sentence."""
+    slight: bool
+    """True where it failed by a size too small to matter."""
 
 
 def names_of(fitted: Identified) -> Names:
@@ -314,13 +316,18 @@ def tests(found: Residual, names: Names) -> list[Test]:
         rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
         rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(found, names)]
     corrected = holm([p for _, _, (_, p, _) in rows])
-    return [
-        Test(name, channel, statistic, float(p), size, _meaning(name, channel, float(p), size))
-        for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True)
-    ]
+    out = []
+    for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
+        slight = bool(p < LEVEL and abs(size) < SLIGHT[name.split()[0]])
+        out.append(
+            Test(
+                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < LEVEL), size, slight), slight
+            )
+        )
+    return out
 
 
-def _meaning(name: str, channel: str, p: float, size: float) -> str:
+def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> str:
     kind = name.split()[0]
     if kind == "correlation":
         cause = name.removeprefix("correlation with ")
@@ -347,6 +354,6 @@ def _meaning(name: str, channel: str, p: float, size: float) -> str:
                 f"Errors in {channel} lean to one side (by {size:.2g} standard deviations).",
             ),
         }[kind]
-    if p >= LEVEL:
+    if not bad:
         return passed
-    return failed[:-1] + "; certain, but small." if abs(size) < SLIGHT[kind] else failed
+    return failed[:-1] + "; certain, but small." if slight else failed

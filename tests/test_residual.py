@@ -153,6 +153,15 @@ def test_a_dependence_is_found_and_placed():
     assert by["dx", "correlation with cos(theta1)"].p_value > LEVEL
     assert "no link" in by["dx", "correlation with cos(theta1)"].meaning
     assert 0.1 < by["dx", "correlation with u"].size < 0.6
+    assert not by["dx", "correlation with u"].slight
+
+
+def test_a_slight_but_certain_misfit_is_called_so():
+    found = _found(14)
+    e = found.innovation.copy()
+    e[..., 0] *= 1.07
+    test = next(t for t in run_tests(found._replace(innovation=e), NAMES) if t[:2] == ("spread", "theta1"))
+    assert test.p_value < LEVEL and test.slight and "small" in test.meaning
 
 
 def test_lost_sequences_take_no_part():
@@ -260,6 +269,13 @@ def test_the_cause_of_a_force_has_the_largest_share():
     alone = diagnosis_plots.cause_figure(found, NAMES)
     assert _labels(alone)[0].startswith("θ₁") and "joint 1" in alone.axes[0].get_ylabel()
     assert all("[" in name for name in _labels(figure) if name)
+
+
+@pytest.mark.parametrize("used", [0, 1, 10])
+def test_few_sequences_can_be_drawn(used):
+    found = _found(13, used=np.arange(10) < used)
+    for figure in (diagnosis_plots.residual_figure(found, NAMES), diagnosis_plots.cause_figure(found, NAMES)):
+        assert any(np.isfinite(line.get_ydata()).any() for line in figure.axes[0].get_lines()[:1])
 
 
 def test_figures_of_a_diagnosis_can_be_drawn():

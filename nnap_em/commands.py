@@ -364,7 +364,7 @@ def _report(
     parameters = {n: {"value": v, "std": s, "unit": parameter_unit(n)} for n, (v, s) in parameter_table(fitted).items()}
     for name, entry in parameters.items():
         say(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
-    kicks, system = np.exp(0.5 * np.asarray(fitted.model.log_q)).tolist(), fitted.model.system
+    kicks = np.exp(0.5 * np.asarray(fitted.model.log_q)).tolist()
     document = {
         "format": 1,
         "rig": fitted.rig.name,

@@ -19,7 +19,7 @@ from .augment import augment, extended, proposals, seeded, surroundings, without
 from .data import Dataset, horizon
 from .effects import AbstractEffect, Candidate, fields
 from .effects.sensor import SensorQuantization, grid_step
-from .em import EMState, Schedule, fit, start_state
+from .em import EMState, FitError, Schedule, fit, start_state
 from .equivalence import standings
 from .gaussian import Gaussian
 from .identify import Identified, identify
@@ -151,6 +151,8 @@ def _best_of_kind(
     """The most promising member of every kind, best first."""
     best: dict[Key, tuple[float, Candidate, Verdict]] = {}
     for candidate, verdict in zip(candidates, verdicts, strict=True):
+        if not seeded(candidate, verdict.coefficients).possible():
+            continue
         net = verdict.gain - _price(verdict.rank, data)
         key = key_of(candidate.start)
         if key not in best or best[key][0] < net:
@@ -158,12 +160,22 @@ def _best_of_kind(
     return sorted(best.values(), key=lambda entry: -entry[0])
 
 
-def _shortlist(ranked, present: set[Key], rules: Rules):
+def _completes(effect: AbstractEffect, model: StateSpaceModel) -> bool:
+    """Whether an unnamed law may be the rest of a named one: a function of the same position at the same joint."""
+    if effect.name != "unknown_function" or effect.joint is None:
+        return False
+    own = (model.system.coordinates[effect.joint - 1],)
+    return effect.inputs_named() == own and any(e.place and e.joint == effect.joint for e in model.effects)
+
+
+def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
     """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
     fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > rules.margin / 2]
     named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
     top = named[0][0] if named else 0.0
     unnamed = [entry for entry in fresh if entry[1].start.name == "unknown_function" and entry[0] > top][:2]
+    beside = [entry for entry in fresh if _completes(entry[1].start, model)]
+    unnamed = (beside + [entry for entry in unnamed if entry not in beside])[:2]
     close = [entry for entry in named if entry[0] > rules.near * top]
     return [(c, v) for _, c, v in unnamed + close[: rules.shortlist - len(unnamed)]]
 
@@ -212,7 +224,7 @@ def look(
     now: _Now, before: Identified, path: Gaussian, data: Dataset, used, rules: Rules, say: Say
 ) -> tuple[Step, list[Refitted], Trial | None]:
     """One look at one horizon: everything screened, the best few refitted; those that hold, best first."""
-    length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    length = _longest(data)
     around = surroundings(before.rig, now.model, data, path)
     candidates = proposals(around)
     weights = now.m_step.weights(now.model)
@@ -220,7 +232,7 @@ def look(
     verdicts = judge(project(table, np.asarray(used, float)), candidates)
     ranked = _best_of_kind(candidates, verdicts, data)
     present = {key_of(effect) for effect in now.model.effects}
-    entries = _shortlist(ranked, present, rules)
+    entries = _shortlist(ranked, present, now.model, rules)
     step = Step(length, tuple((key_of(c.start), net) for net, c, _ in ranked), (), None, len(candidates))
     if not entries:
         return step, [], None
@@ -242,8 +254,10 @@ def look(
         if e.effect.possible() and e.net > rules.margin and _significance(e.candidate, e.trial) > rules.certain
     ]
     named = [e for e in sound if e.effect.name != "unknown_function"]
-    if sound and named and sound[0] not in named and named[0].net > rules.named * sound[0].net:
-        sound = named
+    if sound and named and sound[0] not in named:
+        other = _completes(sound[0].effect, now.model) and named[0].effect.place
+        if named[0].net > (0.9 if other else rules.named) * sound[0].net:
+            sound = named
     return step, sound, null
 
 
@@ -252,19 +266,20 @@ def _settle(
 ) -> tuple[Refitted, EMState | None]:
     """The winner; where the next ones are near, each is followed to a longer horizon, where the wrong ones fail."""
     rivals = [e for e in sound if e.net > rules.rivals * sound[0].net][:3]
-    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    longest = _longest(data)
     if len(rivals) == 1 or length == longest:
         return sound[0], None
     further = min(longest, round(2.5 * length))
     say(f"  {len(rivals)} of them are near: followed to {further * before.rig.dt:.2f} s")
-    states = [_grow(_taken(now, e), data, before, length, further, say) for e in rivals]
-    tops = np.stack([np.nan_to_num(s.top, nan=-1e3) for s in states])
-    best = tops[0]
-    index = 0
-    for i in range(1, len(rivals)):
-        if _trimmed(tops[i] - best) > 0:
-            best, index = tops[i], i
-    return rivals[index], states[index]
+    best: tuple[Refitted, EMState | None] = (sound[0], None)
+    for rival in rivals:
+        try:
+            state = _grow(_taken(now, rival), data, before, length, further, say)
+        except FitError:
+            continue
+        if best[1] is None or _trimmed(np.nan_to_num(state.top, nan=-1e3) - np.nan_to_num(best[1].top, nan=-1e3)) > 0:
+            best = (rival, state)
+    return best
 
 
 def _trimmed(gain) -> float:
@@ -300,7 +315,7 @@ def close(
 ) -> Closed:
     """Search for what `before` lacks; `stages` holds the state of its fit at the end of each horizon."""
     data = Dataset(*map(jnp.asarray, data))
-    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    longest = _longest(data)
     now, steps = _Now(before.model, before.m_step, ()), []
     state: EMState | None = None
     last = 0
@@ -309,33 +324,22 @@ def close(
             state = _grow(now, data, before, last, length, say, state)
         own = stages[length][0].best if length < longest else before.model
         now = now._replace(model=state.best if state else own)
-        part, last = _part(data, length), length
-        while len(now.found) < rules.most:
-            path, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
-            used = np.asarray(used)
-            say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
-            step, sound, null = look(now, before, path, part, used, rules, say)
-            steps.append(step)
-            if not sound or null is None:
-                break
-            winner, further = _settle(now, before, data, length, sound, rules, say)
-            held_out = _held_out(null, winner.trial, part, used)
-            say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} held out")
-            if held_out < rules.margin / 2:
-                break
-            count = len(fields(winner.candidate.start))
-            p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
-            found = Found(winner.candidate, winner.gain, held_out, p_value, length)
-            now = _taken(now, winner)._replace(found=(*now.found, found))
-            steps[-1] = step._replace(accepted=key_of(winner.effect))
-            say(f"  added {_text(key_of(winner.effect))}")
+        part, last, known = _part(data, length), length, len(now.found)
+        now, further = _search(now, before, part, length, data, steps, rules, say)
+        if steps[-1].accepted or len(now.found) > known:
             state = further
-            if further is not None:
-                last = round(2.5 * length)
-                break
+            last = round(2.5 * length) if further is not None else length
     if now.found and state is None:
         state = _grow(now, data, before, longest, longest, say)
+    count = len(now.found)
     now, state = _needed(now, state, before, data, rules, say)
+    if len(now.found) < count:  # what the dropped one stood for may now be seen for what it is
+        now = now._replace(model=state.best if state else before.model)
+        part = _part(data, longest)
+        more, trial = _search(now, before, part, longest, data, steps, rules, say)
+        if len(more.found) > len(now.found):
+            now, state = more, trial or _grow(more, data, before, longest, longest, say)
+            now, state = _needed(now, state, before, data, rules, say)
     now, state = _quantised(now, state, before, data, rules, say)
     if state is None:
         return Closed(before, before, (), tuple(steps))
@@ -343,13 +347,42 @@ def close(
     return Closed(before, after, now.found, tuple(steps))
 
 
+def _search(
+    now: _Now, before: Identified, part: Dataset, length: int, data: Dataset, steps: list[Step], rules: Rules, say: Say
+) -> tuple[_Now, EMState | None]:
+    """Look at one horizon until nothing more is found; a fit to a longer one, where a playoff made it."""
+    while len(now.found) < rules.most:
+        path, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
+        used = np.asarray(used)
+        say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
+        step, sound, null = look(now, before, path, part, used, rules, say)
+        steps.append(step)
+        if not sound or null is None:
+            break
+        winner, further = _settle(now, before, data, length, sound, rules, say)
+        held_out = _held_out(null, winner.trial, part, used)
+        say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} held out")
+        if held_out < rules.margin / 2:
+            break
+        count = len(fields(winner.candidate.start))
+        p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
+        found = Found(winner.candidate, winner.gain, held_out, p_value, length)
+        now = _taken(now, winner)._replace(found=(*now.found, found))
+        steps[-1] = step._replace(accepted=key_of(winner.effect))
+        say(f"  added {_text(key_of(winner.effect))}")
+        if further is not None:
+            return now, further
+    return now, None
+
+
 def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
     """The search without the effects that later ones made needless."""
-    while state is not None and len(now.found) > 1:
+    while state is not None and now.found:
         after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
         path, used = smoothed(after, data)
         chosen = tuple(f.candidate for f in now.found)
         losses = [s.alone for s in standings(before, after, chosen, path, data, np.asarray(used))]
+        losses = [loss if e.possible() else 0.0 for loss, e in zip(losses, after.model.effects, strict=True)]
         least = int(np.argmin(losses))
         if losses[least] > rules.margin:
             break
@@ -357,8 +390,12 @@ def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset,
         sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in after.model.effects]
         model, rule = without(after.model, now.m_step, least, sizes)
         now = _Now(model, rule, tuple(f for i, f in enumerate(now.found) if i != least))
-        state = _grow(now, data, before, int(data.t.shape[1]), int(data.t.shape[1]), say)
+        state = _grow(now, data, before, _longest(data), _longest(data), say) if now.found else None
     return now, state
+
+
+def _longest(data: Dataset) -> int:
+    return int(np.max(np.sum(np.asarray(data.valid), axis=1)))
 
 
 def _quantised(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
@@ -381,7 +418,7 @@ def _quantised(now: _Now, state: EMState | None, before: Identified, data: Datas
             log_r = full.log_r.at[i].set(math.log(told**2 + step**2 / 12))
             full = eqx.tree_at(lambda m: m.log_r, full, log_r)
         now = _Now(full, rule, (*now.found, Found(candidate, float(gain), float(gain), 0.0, data.t.shape[1])))
-        state = _grow(now, data, before, int(data.t.shape[1]), int(data.t.shape[1]), say)
+        state = _grow(now, data, before, _longest(data), _longest(data), say)
     return now, state
 
 
@@ -413,7 +450,7 @@ def _grow(
     state = start_state(now.model, now.m_step, key=before.state.key)._replace(epoch=1)
     growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0
     smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
-    whole = length == int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    whole = length == _longest(data)
     state = fit(state, part, smoother, now.m_step, epochs=growing + (8 if whole else 3), schedule=schedule)
     reach = f"{length * before.rig.dt:.2f} s"
     say(f"  fitted over {reach} in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
@@ -439,4 +476,8 @@ def close_the_loop(
         say(f"epoch {state.epoch}, horizon {seen * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
     before = identify(rig, data, key=key, watch=watch)
-    return close(before, stages, data, rules=rules, say=say)
+    try:
+        return close(before, stages, data, rules=rules, say=say)
+    except FitError as lost:
+        say(f"  with what was added no sequence can be followed to its end ({lost}); nothing is kept of it")
+        return Closed(before, before, (), ())

@@ -66,8 +66,9 @@ class StateSpaceModel(AbstractModel):
     """What the declared physics lacks."""
 
     def inputs(self, seq: Dataset) -> Float[Array, "time input"]:
-        """The inputs; with effects: what reaches the joints, the time in the middle
-        of the step [s], and what reached the joints one row before."""
+        """The inputs; with effects: what reaches the joints, the clock in the middle of the step [s], what reached the
+        joints one row before, and the time since the first row [s].
+        """
         if not self.effects:
             return jnp.asarray(seq.u)
         u = jnp.asarray(seq.u)
@@ -77,7 +78,8 @@ class StateSpaceModel(AbstractModel):
                 u = u.at[:, i].set(effect.input(u[:, i], self.dt))
         before = jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]])
         middle = jnp.asarray(seq.t)[:, None] + 0.5 * self.dt
-        return jnp.concatenate([u, middle, before], axis=1)
+        age = jnp.asarray(seq.t)[:, None] - jnp.asarray(seq.t)[:1, None]
+        return jnp.concatenate([u, middle, before, age], axis=1)
 
     def rate(
         self, x: Float[Array, " state"], u: Float[Array, " input"], force: Float[Array, " dof"]
@@ -121,12 +123,13 @@ class StateSpaceModel(AbstractModel):
         r = x[: len(names)]
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
-            """The state `delay` [s] ago, backwards under the inputs of the row before."""
+            """The state `delay` [s] ago, backwards under the inputs of the row before; at most that of the first row."""
             assert u is not None
             drives = len(self.system.joints)
-            before = jnp.concatenate([u[drives + 1 :], u[drives:]])
+            before = jnp.concatenate([u[drives + 1 : 2 * drives + 1], u[drives:]])
+            reach = jnp.minimum(delay, u[-1])
             still = jnp.zeros(len(self.system.coordinates), x.dtype)
-            return integrate(lambda x: -delay * self.rate(x, before, still), x, 1.0, 3)[: len(names)]
+            return integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3)[: len(names)]
 
         for effect in self.effects:
             for i, name in enumerate(names):

@@ -76,12 +76,14 @@ def tracks(null: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: D
 
     def one(path: Gaussian, seq: Dataset):
         u = null.inputs(seq)
-        rate = jax.vmap(lambda x, u: null.rate(x, u, still))
+        rate = jax.vmap(lambda x, u: null.rate(x, u, still))  # the first row has no past
         now = rate(path.mean, u)
         middle = path.mean + 0.5 * null.dt * now
         acceleration = rate(middle, u)[:, dof : 2 * dof]
         here = local(null, prior, path, seq, TANGENT)
-        return Track(here, middle[:, : 2 * dof], acceleration, now[:, : 2 * dof], u[:, : seq.u.shape[-1]])
+        return Track(
+            here, middle[:, : 2 * dof], acceleration, now[:, : 2 * dof].at[0].set(0.0), u[:, : seq.u.shape[-1]]
+        )
 
     return jax.vmap(one)(path, data)
 

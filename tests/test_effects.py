@@ -187,7 +187,7 @@ def test_absent_strength_is_no_effect():
         ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), True, True,
     )  # fmt: skip
     x = jnp.asarray([0.3, -0.5, 2.0, -3.0])
-    row = jnp.asarray([0.2, 1.0, 0.1])
+    row = jnp.asarray([0.2, 1.0, 0.1, 1.0])
     seen = set()
     for kind in catalogue.values():
         for candidate in kind.candidates(around):

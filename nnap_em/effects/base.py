@@ -81,6 +81,8 @@ class AbstractEffect(eqx.Module):
     """States of its own."""
     substeps: ClassVar[int] = 1
     """Integration steps per sample that it needs."""
+    place: ClassVar[bool] = False
+    """True for a force that depends on the position of its own joint alone."""
     linear: ClassVar[bool] = True
     """False where a probe itself, not its multiple, is the place to start a fit from."""
 

@@ -19,6 +19,7 @@ class TorsionalSpring(AbstractEffect):
     """-k (theta_j - theta0)."""
 
     name: ClassVar[str] = "torsional_spring"
+    place: ClassVar[bool] = True
     confirm: ClassVar[str] = (
         "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
     )
@@ -75,12 +76,15 @@ class Cogging(AbstractEffect):
     """amplitude sin(k theta_j + phase)."""
 
     name: ClassVar[str] = "cogging"
+    place: ClassVar[bool] = True
     confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
     sine: Scalar
     cosine: Scalar
     k: Scalar
     joint: int | None = eqx.field(static=True)
+    near: float = eqx.field(static=True, default=1.0)
+    """Where k was found; far from there it is another law in disguise."""
     channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
@@ -90,11 +94,10 @@ class Cogging(AbstractEffect):
             if not around.system.angles[j - 1]:
                 continue
             size = float(around.torque[j - 1])
-            spread = cls(a(0.5 * size), a(0.5 * size), a(0.05), j)
-            for k in (*range(1, 13), 14, 16, 18, 20, 24):
-                start = cls(a(0.0), a(0.0), a(float(k)), j)
-                probes = (cls(a(0.05 * size), a(0.0), a(float(k)), j), cls(a(0.0), a(0.05 * size), a(float(k)), j))
-                out.append(Candidate(start, probes, spread))
+            for k in (*np.arange(1.0, 8.1, 0.5), *range(9, 13), 14, 16, 18, 20, 24):
+                make = lambda sine, cosine, k=float(k), j=j: cls(a(sine), a(cosine), a(k), j, k)  # noqa: E731
+                spread = cls(a(0.5 * size), a(0.5 * size), a(0.1), j, float(k))
+                out.append(Candidate(make(0.0, 0.0), (make(0.05 * size, 0.0), make(0.0, 0.05 * size)), spread))
         return out
 
     def values(self):
@@ -102,8 +105,7 @@ class Cogging(AbstractEffect):
         return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
 
     def possible(self):
-        k = float(self.k)
-        return k > 0.7 and abs(k - round(k)) < 0.2  # a joint that goes round meets the same magnets again
+        return float(self.k) > 0.7 and abs(float(self.k) - self.near) < 0.3
 
     def force(self, scene, memory):
         assert self.joint is not None
@@ -137,6 +139,7 @@ class HardStop(AbstractEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
     name: ClassVar[str] = "hard_stop"
+    place: ClassVar[bool] = True
     confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
     substeps: ClassVar[int] = 4

@@ -1,0 +1,130 @@
+"""The score test against brute force: columns by difference quotients, projection by least squares."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.augment import augment, extended, proposals, seeded, surroundings, without
+from nnap_em.build import build
+from nnap_em.data import Dataset, fill_missing
+from nnap_em.effects import Candidate, catalogue, fields
+from nnap_em.gaussian import Gaussian
+from nnap_em.kalman import TANGENT, kalman_filter
+from nnap_em.model import with_effects
+from nnap_em.mstep import local
+from nnap_em.rig import Declared, Rig
+from nnap_em.screen import Sheet, judge, project, sheet
+from nnap_em.simulate import paper_experiment, paper_model
+from nnap_em.smoother import CubatureSmoother, active_steps
+from nnap_em.systems.acrobot import table_i
+
+ROWS = 60
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A few short sequences of the paper's acrobot, its model, and the smoothed paths."""
+    truth = paper_model()
+    data = paper_experiment(truth, 4, ROWS - 1, key=jax.random.key(5)).data
+    rig = Rig(
+        "bench",
+        "acrobot",
+        {name: Declared(value, 0.0) for name, value in table_i.items()},
+        True,
+        ("u",),
+        (2,),
+        0.01,
+        "sequence",
+        ("theta1", "dtheta1"),
+        {"theta1": 0.01, "dtheta1": 0.05},
+        {"theta2": Declared(0.0, 0.5), "dtheta1": Declared(0.0, 0.02), "dtheta2": Declared(0.0, 0.02)},
+    )
+    problem = build(rig, data, key=jax.random.key(0))
+    model = eqx.tree_at(lambda m: (m.log_q, m.log_r), problem.model, (truth.log_q + 2.0, truth.log_r))
+    smoother = CubatureSmoother(problem.bank)
+    path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, s))(d))(data).state
+    return rig, model, problem.mstep, data, path
+
+
+def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
+    """Whitened innovations of `model` linearised about a path, moved by what `full` does otherwise on that path."""
+    y, observed = fill_missing(seq.y)
+    here = local(model, rule.prior, path, seq, TANGENT)
+    both = [jax.vmap(m.transition)(path.mean, m.inputs(seq)) for m in (full, model)]
+    read = [jax.vmap(m.emission)(path.mean, m.inputs(seq)) for m in (full, model)]
+    affine = here.affine._replace(offset=here.affine.offset + both[0] - both[1])
+    reading = here.reading._replace(offset=here.reading.offset + read[0] - read[1])
+    active = active_steps(seq.valid)
+    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, y, observed, active).innovation
+
+
+@pytest.mark.parametrize(
+    "name", ["torsional_spring", "payload", "base_tilt", "eddy_brake", "input_delay", "sensor_bias", "sensor_scale"]
+)
+def test_columns_are_difference_quotients(bench, name):
+    """A column is minus the change of the whitened innovations; its force is held over a step, so to some per cent."""
+    rig, model, rule, data, path = bench
+    candidate = catalogue[name].candidates(surroundings(rig, model, data, path))[-1]
+    table = sheet(model, model, rule.weights(model), [candidate], path, data)
+    small = 1e-2 if candidate.start.linear else 1.0
+    weak = jax.tree.map(lambda start, p: start + small * (p - start), candidate.start, candidate.probes[-1])
+    full = with_effects(model, (weak,))
+    run = eqx.filter_jit(lambda other, p, s: _innovations(model, other, rule, p, s))
+    for i in range(2):
+        seq, at = jax.tree.map(lambda a, i=i: a[i], data), jax.tree.map(lambda a, i=i: a[i], path)
+        before = run(model, at, seq)
+        column = -(run(full, at, seq) - before) / small
+        size = float(jnp.linalg.norm(column) * jnp.linalg.norm(before))
+        assert table.score[i, -1] == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
+        assert table.information[i, -1, -1] == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
+
+
+def test_projection_is_least_squares():
+    """Gain and coefficient of a candidate are those of a regression beside the nuisance."""
+    rng = np.random.default_rng(0)
+    x, e = rng.normal(size=(200, 5)), rng.normal(size=200)
+    x[:, 4] += 0.8 * x[:, 0]
+    e += 0.4 * x[:, 4]
+    table = Sheet((x.T @ e)[None], (x.T @ x)[None], 3, 1e-9 * np.eye(3))
+    one = catalogue["motor_gain"](jnp.zeros(()), 2)
+    verdict = judge(project(table, np.ones(1)), [Candidate(one, (one, one), one)])[0]
+    full = np.linalg.lstsq(x, e, rcond=None)[0]
+    rest = np.sum((e - x[:, :3] @ np.linalg.lstsq(x[:, :3], e, rcond=None)[0]) ** 2)
+    gain = 0.5 * (rest - np.sum((e - x @ full) ** 2))
+    assert verdict.rank == 2
+    assert verdict.gain == pytest.approx(gain, rel=1e-3)
+    np.testing.assert_allclose(verdict.coefficients, full[3:], rtol=1e-3)
+
+
+def test_what_a_friction_map_holds_gains_nothing(bench):
+    """A constant torque, back-EMF and a joint's own drag are static maps of one velocity."""
+    rig, model, rule, data, path = bench
+    around = surroundings(rig, model, data, path)
+    maps = ("torque_offset", "motor_back_emf", "air_drag")
+    held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
+    free = catalogue["torsional_spring"].candidates(around)
+    table = sheet(model, model, rule.weights(model), [*held, *free], path, data)
+    much = np.full(4, 1e4)  # as many copies of the data, beside which the prior of the map counts for nothing
+    left = np.diag(project(table, much).information)
+    share = left / np.diag(np.einsum("s,scd->cd", much, table.information))[table.nuisance :]
+    assert np.all(share[: len(held)] < 0.003)
+    assert np.all(share[len(held) :] > 0.01)
+
+
+def test_effects_come_and_go(bench):
+    """Adding two effects and dropping the first leaves the second with its parameters and its prior."""
+    rig, model, rule, data, path = bench
+    candidates = {c.start.name: c for c in proposals(surroundings(rig, model, data, path))}
+    spring, bristle = candidates["torsional_spring"], candidates["presliding_friction"]
+    one, rule_one = augment(model, rule, seeded(spring, np.ones(1)), spring)
+    two, rule_two = augment(one, rule_one, seeded(bristle, np.ones(1)), bristle)
+    assert two.log_q.shape == (5,)
+    assert extended(two, path, data).mean.shape == (4, ROWS, 5)
+    sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in two.effects]
+    bare, rule_bare = without(two, rule_two, 0, sizes)
+    alone, rule_alone = augment(model, rule, seeded(bristle, np.ones(1)), bristle)
+    assert eqx.tree_equal(bare.effects, alone.effects)
+    assert rule_bare.prior.names == rule_alone.prior.names
+    np.testing.assert_array_equal(rule_bare.prior.std, rule_alone.prior.std)

@@ -13,7 +13,6 @@ import json
 import math
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
@@ -21,8 +20,18 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import jax
+
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
+
+from nnap_em.commands import set_up
+from nnap_em.data import read_logs
+from nnap_em.diagnose import entry, findings
+from nnap_em.loop import close_the_loop
+from nnap_em.predict import horizon_errors, predict
+from nnap_em.rig import read_rig, replace_text
+from nnap_em.systems import specs
 
 OUTSIDE: dict[str, tuple[dict[str, Any], ...]] = {
     "bump": ({"name": "unknown_function", "form": "bump", "joint": 2, "amplitude": 0.05, "center": 1.1, "width": 0.4},),
@@ -82,23 +91,25 @@ def case_of(name: str) -> plant.Case:
 
 
 def run(name: str, out: Path) -> None:
-    """One case through the command line, as a user would."""
+    """One case: the loop, the errors on test/ before and after, and those of one who knows the truth."""
     case = case_of(name)
-    with tempfile.TemporaryDirectory() as folder:
-        rig, found = Path(folder) / "rig", Path(folder) / "found"
-        plant.write(case, rig)
+    record: dict[str, Any] = {"case": name, "truth": list(case.effects), "log": []}
+    with tempfile.TemporaryDirectory() as rig_folder:
+        folder = Path(rig_folder)
+        plant.write(case, folder)
+        rig = read_rig(folder / "rig.toml", specs)
+        train, test = (read_logs(folder / part, rig).data for part in ("train", "test"))
         began = time.perf_counter()
-        command = [sys.executable, "-m", "nnap_em.cli", "diagnose", str(rig), "--out", str(found)]
-        done = subprocess.run(command, capture_output=True, text=True)
-        seconds = time.perf_counter() - began
-        record: dict[str, Any] = {"case": name, "truth": list(case.effects), "seconds": seconds}
-        record["log"] = done.stderr.splitlines()
-        if done.returncode == 0:
-            report = json.loads((found / "report.json").read_text())
-            record |= {"effects": report["effects"], "error": report["error"]}
-            record["oracle"] = plant.oracle_errors(case, rig)
+        closed = close_the_loop(rig, train, key=jax.random.key(0), say=record["log"].append)
+        found = findings(closed, train)
+        error = {}
+        for side, fitted in (("before", closed.before), ("after", closed.after)):
+            prediction = predict(fitted, test, 1.0, key=jax.random.key(0))
+            error[side] = horizon_errors(prediction, fitted, test, 1.0)
+        record["seconds"] = time.perf_counter() - began
+        record |= {"effects": [entry(f) for f in found], "error": error, "oracle": plant.oracle_errors(case, folder)}
     out.mkdir(parents=True, exist_ok=True)
-    (out / f"{name.replace(':', '_')}.json").write_text(json.dumps(record))
+    replace_text(out / f"{name.replace(':', '_')}.json", json.dumps(record))
 
 
 def judged(record: dict[str, Any]) -> dict[str, Any]:
@@ -171,18 +182,18 @@ def table(out: Path) -> str:
             f"{score['before']:.3g} / {score['after']:.3g} / {score['oracle']:.3g} | {record['seconds']:.0f} |"
         )
     summary = [
-        "| group | cases | named right | false or extra | within 15 % | inside 2 std | median log ratio | after / true: "
-        "median, 90th | median s |",
+        "| group | cases | named right | false or extra | parameters within 15 % | truth inside 2 std "
+        "| median log ratio | after / true: median, 90th | median s |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for group, scores in groups.items():
-        near, inside = (sum((s[k] for s in scores), []) for k in ("near", "inside"))
+        near, inside = ([flag for s in scores for flag in s[k]] for k in ("near", "inside"))
         ratio = sorted(s["after"] / s["oracle"] for s in scores)
         share = sorted(s["share"] for s in scores if math.isfinite(s["share"]))
         bad = sum(s["false"] or s["extras"] > 0 for s in scores)
         summary.append(
-            f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} | {_share(inside)} | "
-            f"{_middle(share):.2f} | {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
+            f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} "
+            f"| {_share(inside)} | {_middle(share):.2f} | {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
     head = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}."
@@ -213,14 +224,14 @@ def main() -> None:
     if args.table:
         args.table.write_text(table(args.out))
         return
+    set_up()
     first, step = map(int, args.share.split("/"))
     names = [n for n in all_cases() if fnmatch.fnmatch(n, args.only if ":" in args.only else args.only + "*")]
     for name in names[first::step]:
         if (args.out / f"{name.replace(':', '_')}.json").exists():
             continue
-        began = time.perf_counter()
         run(name, args.out)
-        print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
+        print(name, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Identify unknown friction of machines from logs.
+"""Identify what a physics model of a machine does not know, from logs, and find what it lacks.
 
 The names below are loaded at their first use, so that `import nnap_em` costs nothing and sets nothing up.
 """
@@ -12,9 +12,11 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .data import DataError, Dataset, Logs, pad, read_logs
+    from .diagnose import findings
     from .em import EMState, FitError, Schedule
     from .friction import FrictionNetwork
     from .identify import Identified, friction_table, identify, parameter_table
+    from .loop import Closed, close_the_loop
     from .model import StateSpaceModel
     from .particle import ParticleSmoother
     from .predict import Prediction, horizon_errors, predict, smooth
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AbstractSystem",
+    "Closed",
     "DataError",
     "Dataset",
     "EMState",
@@ -44,7 +47,9 @@ __all__ = [
     "StateSpaceModel",
     "StoreError",
     "__version__",
+    "close_the_loop",
     "examples",
+    "findings",
     "friction_table",
     "horizon_errors",
     "identify",
@@ -64,9 +69,11 @@ __all__ = [
 ]
 _homes = {
     "data": ("DataError", "Dataset", "Logs", "pad", "read_logs"),
+    "diagnose": ("findings",),
     "em": ("EMState", "FitError", "Schedule"),
     "friction": ("FrictionNetwork",),
     "identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "loop": ("Closed", "close_the_loop"),
     "model": ("StateSpaceModel",),
     "particle": ("ParticleSmoother",),
     "predict": ("Prediction", "horizon_errors", "predict", "smooth"),

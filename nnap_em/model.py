@@ -123,7 +123,7 @@ class StateSpaceModel(AbstractModel):
         r = x[: len(names)]
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
-            """The state `delay` [s] ago, backwards under the inputs of the row before; no earlier than the first row."""
+            """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
             assert u is not None
             drives = len(self.system.joints)
             before = jnp.concatenate([u[drives + 1 : 2 * drives + 1], u[drives:]])

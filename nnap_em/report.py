@@ -19,7 +19,7 @@ from .data import Logs
 from .diagnose import Finding, advice, curve, entry, friction_change, verdict, words
 from .identify import Identified, friction_table, parameter_table
 from .loop import Closed
-from .page import page
+from .page import Picture, page
 from .predict import HORIZONS, horizon_errors, predict
 from .residual import Residual, names_of, residual, tests
 from .rig import parameter_unit, replace_text
@@ -74,18 +74,19 @@ def write_diagnosis(
         "versions": {"nnap_em": __version__, "python": platform.python_version()}
         | {name: version(name) for name in ("jax", "jaxlib", "equinox", "numpy")},
     }
-    figures = []
+    figures: list[Picture] = []
 
-    def add(title: str, caption: str, figure: Figure) -> None:
+    def add(place: str, title: str, caption: str, figure: Figure) -> None:
         image = io.BytesIO()
-        figure.savefig(image, format="png", dpi=130)
-        figures.append((title, caption, image.getvalue()))
+        figure.savefig(image, format="svg")
+        figures.append(Picture(title, caption, image.getvalue(), place))
 
     if error:
         units = {n: state_unit(closed.before.model.system, n) for n in names.measured}
-        add("Prediction error before and after", "On test sequences that no fit and no choice has seen.",
+        add("error", "Prediction error before and after", "On test sequences that no fit and no choice has seen.",
             plots.error_figure(error, units))  # fmt: skip
     add(
+        "residual",
         "The force that the declared model lacks",
         "What the smoothed motion asks for beyond the declared model, against everything that could cause it.",
         plots.residual_figure(lacked, names, residuals.get("after")),
@@ -95,13 +96,19 @@ def write_diagnosis(
         if drawn is not None:
             label_y = f"torque at joint {found[i].effect.joint} [N m]"
             picture = plots.effect_figure(drawn.x, drawn.mean, drawn.std, label_x=drawn.label, label_y=label_y)
-            add(f"The learned function of {drawn.label}", "With its 90 % band; the mean is taken away.", picture)
+            add(
+                "found",
+                f"The learned function of {drawn.label}",
+                "With its 90 % band; the mean is taken away.",
+                picture,
+            )
     if closed.before.rig.friction:
         tables = {n: friction_table(f, jnp.asarray(visited)) for n, f in sides.items()}
         for name, table in tables.items():
             columns = (np.asarray(a) for a in (table.velocity, table.torque, table.std))
             write_friction(out / f"friction_{name}.csv", *columns)
         add(
+            "error",
             "Learned friction",
             "A missing effect bends the friction that is learned without it.",
             plots.friction_pair_figure(
@@ -114,8 +121,9 @@ def write_diagnosis(
         pair = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predictions.items()}
         t, y = np.asarray(test.data.t[number])[rows], np.asarray(test.data.y[number])[rows]
         picture = plots.prediction_pair_figure(t, y, names, pair["before"], pair.get("after", pair["before"]), GIVEN)
-        add("One test sequence", f"Predicted from its first second ({test.files[number]}).", picture)
+        add("error", "One test sequence", f"Predicted from its first second ({test.files[number]}).", picture)
     add(
+        "residual",
         "One-step errors",
         "Left: they should not remember each other. Right: they should follow the line.",
         plots.innovation_figure(residuals["before"], names, residuals.get("after")),
@@ -124,7 +132,7 @@ def write_diagnosis(
         first = next((s for s in closed.steps if s.accepted), closed.steps[0])
         chosen = words(first.accepted) if first.accepted else None
         entries = [(words(key), gain) for key, gain in first.screened[:10]]
-        add("The first look", "Gain of the likelihood that each candidate promises, before any refit.",
+        add("details", "The first look", "Gain of the likelihood that each candidate promises, before any refit.",
             plots.screen_figure(entries, chosen=chosen))  # fmt: skip
     document["seconds"] = time.perf_counter() - began
     write_json(out / "report.json", document)

@@ -120,15 +120,15 @@ def judged(record: dict[str, Any]) -> dict[str, Any]:
     left, hits, near, inside = list(named), 0, [], []
     for true in truth:
         place = (true["name"], true.get("joint"), true.get("channel"))
-        for entry in left:
-            here = (entry["name"], entry["joint"], entry["channel"])
+        for told in left:
+            here = (told["name"], told["joint"], told["channel"])
             same = here == place or here in SAME.get(place, ())
             if true["name"] == "unknown_function":
-                same = entry["name"] == "unknown_function" and set(entry["inputs"]) == INPUTS[effect]
+                same = told["name"] == "unknown_function" and set(told["inputs"]) == INPUTS[effect]
             if same:
                 hits += 1
-                left.remove(entry)
-                for key, estimate in entry["parameters"].items():
+                left.remove(told)
+                for key, estimate in told["parameters"].items():
                     if key in true and here == place and group != "variant":
                         error = abs(estimate["value"] - true[key])
                         if key in ("phase", "center"):
@@ -193,7 +193,8 @@ def table(out: Path) -> str:
         bad = sum(s["false"] or s["extras"] > 0 for s in scores)
         summary.append(
             f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} "
-            f"| {_share(inside)} | {_middle(share):.2f} | {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
+            f"| {_share(inside)} | {_middle(share):.2f} "
+            f"| {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
     head = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}."

@@ -14,7 +14,7 @@ from .effects import AbstractEffect, catalogue, fields
 from .effects.function import UnknownFunction
 from .equivalence import Standing, standings
 from .identify import Identified, friction_table
-from .loop import RULES, Closed, Key, Rules, key_of, smoothed
+from .loop import RULES, Closed, Key, Rules, key_of, rest_of, smoothed
 from .systems import AbstractSystem
 from .tables import state_unit
 
@@ -168,9 +168,12 @@ def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Findin
     path, used = smoothed(closed.after, data)
     chosen = tuple(f.candidate for f in closed.found)
     firm: Sequence[Standing] = standings(closed.before, closed.after, chosen, path, data, np.asarray(used))
-    out = []
+    model, out = closed.after.model, []
+    rests = {i: rest_of(e, model) for i, e in enumerate(model.effects)}
     for i, (found, standing) in enumerate(zip(closed.found, firm, strict=True)):
-        effect, parameters = closed.after.model.effects[i], estimates(closed.after)[i]
+        if rests[i] is not None:
+            continue  # told with the law that it completes
+        effect, parameters = model.effects[i], estimates(closed.after)[i]
         same = tuple(key_of(c.start) for c, loss in standing.instead if loss < rules.even)
         same = same if standing.alone > 2 * rules.even else ()
         numbers = ", ".join(f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items())
@@ -183,6 +186,9 @@ def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Findin
             "loss_without_it": standing.alone,
         }
         sentence = f"{words(key_of(effect))}: {told}" if told else words(key_of(effect))
+        rest = next((curve(closed.after, k) for k, of in rests.items() if of == i), None)
+        if rest is not None:
+            sentence += f"; the law is not quite of this form, what is left has {np.ptp(rest.mean):.2g} N m"
         out.append(Finding(effect, parameters, evidence, same, sentence))
     return out
 

@@ -160,12 +160,13 @@ def _best_of_kind(
     return sorted(best.values(), key=lambda entry: -entry[0])
 
 
-def _completes(effect: AbstractEffect, model: StateSpaceModel) -> bool:
-    """Whether an unnamed law may be the rest of a named one: a function of the same position at the same joint."""
+def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+    """Place of the named law whose rest an unnamed one is: a function of the same position at the same joint."""
     if effect.name != "unknown_function" or effect.joint is None:
-        return False
-    own = (model.system.coordinates[effect.joint - 1],)
-    return effect.inputs_named() == own and any(e.place and e.joint == effect.joint for e in model.effects)
+        return None
+    if effect.inputs_named() != (model.system.coordinates[effect.joint - 1],):
+        return None
+    return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
 
 
 def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
@@ -174,7 +175,7 @@ def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
     named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
     top = named[0][0] if named else 0.0
     unnamed = [entry for entry in fresh if entry[1].start.name == "unknown_function" and entry[0] > top][:2]
-    beside = [entry for entry in fresh if _completes(entry[1].start, model)]
+    beside = [entry for entry in fresh if rest_of(entry[1].start, model) is not None]
     unnamed = (beside + [entry for entry in unnamed if entry not in beside])[:2]
     close = [entry for entry in named if entry[0] > rules.near * top]
     return [(c, v) for _, c, v in unnamed + close[: rules.shortlist - len(unnamed)]]
@@ -255,7 +256,7 @@ def look(
     ]
     named = [e for e in sound if e.effect.name != "unknown_function"]
     if sound and named and sound[0] not in named:
-        other = _completes(sound[0].effect, now.model) and named[0].effect.place
+        other = rest_of(sound[0].effect, now.model) is not None and named[0].effect.place
         if named[0].net > (0.9 if other else rules.named) * sound[0].net:
             sound = named
     return step, sound, null

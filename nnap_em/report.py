@@ -99,7 +99,7 @@ def write_diagnosis(
             add(
                 "found",
                 f"The learned function of {drawn.label}",
-                "With its 90 % band; the mean is taken away.",
+                "With its 90 % band, without its mean.",
                 picture,
             )
     if closed.before.rig.friction:

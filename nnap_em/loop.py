@@ -7,7 +7,7 @@ few best compete, and the winner must also predict sequences that it was not fit
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -405,15 +405,16 @@ def _quantised(now: _Now, state: EMState | None, before: Identified, data: Datas
     for i, channel in enumerate(rig.measured):
         y = np.asarray(data.y)[..., i]
         step = grid_step(y.ravel())
-        model = state.best if state else now.model
+        model = cast(StateSpaceModel, state.best if state else now.model)
         told, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
         share = step**2 / 12 / (told**2 if told else max(now_r - step**2 / 12, 0.25 * now_r))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
         if gain < rules.margin or share < 0.1:
             continue
         say(f"  {channel} comes in steps of {step:.4g}")
-        effect = SensorQuantization(jnp.asarray(step), channel)
-        candidate = Candidate(effect, (effect,), SensorQuantization(jnp.asarray(1e-3 * step), channel))
+        effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
+        spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
+        candidate = Candidate(effect, (effect,), spread)
         full, rule = augment(model, now.m_step, effect, candidate)
         if told:
             log_r = full.log_r.at[i].set(math.log(told**2 + step**2 / 12))

@@ -157,13 +157,13 @@ def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) ->
     cov = jax.scipy.linalg.block_diag(model.start.cov[: 2 * dof, : 2 * dof], jnp.diag((0.1 * wide) ** 2))
     log_q = jnp.concatenate([model.log_q[: 2 * dof], 2 * jnp.log(1e-3 * wide)])
     return StateSpaceModel(
-        model.system,
-        model.unknown,
-        Gaussian(mean, cov),
-        log_q,
-        model.log_r,
-        model.measured,
-        model.dt,
-        model.substeps,
-        effects,
+        system=model.system,
+        unknown=model.unknown,
+        start=Gaussian(mean, cov),
+        log_q=log_q,
+        log_r=model.log_r,
+        measured=model.measured,
+        dt=model.dt,
+        substeps=model.substeps,
+        effects=effects,
     )

@@ -12,7 +12,7 @@ Levenberg-Marquardt.
 
 import math
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -323,7 +323,8 @@ class MStepInfo(NamedTuple):
 class Core(NamedTuple):
     """What an M-step changes, whatever else the model is made of."""
 
-    unknown: eqx.Module
+    unknown: Any
+    """The friction map."""
     w: Float[Array, " weight"]
     """Network weights, then parameters in units of their prior."""
     log_q: Float[Array, " state"]
@@ -420,6 +421,7 @@ class ScoringMStep(AbstractMStep):
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
         n = model.log_q.shape[0]
         hold = jnp.zeros_like(info).at[: 2 * dof, : 2 * dof].set(self._hold(dof))
+        assert self.shape is not None
         off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
         step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
         step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))

@@ -105,7 +105,7 @@ def refit(
         return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), weights.write(model, w), core[2:])
 
     core = Core(model.unknown, jnp.pad(weights.read(model), (0, pad)), model.log_q, model.log_r, model.start)
-    best, stride = None, 1.0
+    best, stride, here, goal = None, 1.0, core, core
     for _ in range(passes):
         proposal, smoothed, loglik, hessian = program(core, whole(core), path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))

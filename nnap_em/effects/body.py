@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """Bodies that are not as declared: masses, inertias, lengths; each system says how it varies."""
 
 from typing import ClassVar

@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """A law without a name: an unknown function of some inputs, learned as a network of radial basis functions."""
 
 import itertools

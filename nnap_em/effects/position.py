@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """Forces that depend on the position: springs, tilt, cogging, stops, magnets of a brake."""
 
 import itertools

@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """Friction with memory: the contact winds up before it slides."""
 
 from typing import ClassVar

@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """Forces of velocity, and friction that changes with position or time."""
 
 from typing import ClassVar
@@ -166,4 +168,6 @@ class BaseVibration(AbstractEffect):
 
     def force(self, scene, memory):
         turn = 2 * jnp.pi * self.frequency * scene.time
-        return scene.system.shake(scene.q) * (self.sine * jnp.sin(turn) + self.cosine * jnp.cos(turn))
+        shake = scene.system.shake(scene.q)
+        assert shake is not None
+        return shake * (self.sine * jnp.sin(turn) + self.cosine * jnp.cos(turn))

@@ -1,3 +1,5 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
+# (pyright takes equinox's abstract fields for fields of the constructor)
 """Readings that are not what they stand for."""
 
 from typing import ClassVar

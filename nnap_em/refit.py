@@ -66,7 +66,8 @@ def _pass(rule: ScoringMStep, core: Core, here: Local, path: Gaussian, data: Dat
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
     first = jax.tree.map(lambda a: pick(a[:, 0]), state)
     following, hessian = rule.advance(core, weights, total, first, fine)
-    steady = jax.tree.map(lambda new, old: jnp.where(fine.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path)
+    known = jnp.isfinite(loglik) & jnp.all(jnp.isfinite(state.mean), axis=(1, 2))  # those left out of the fit too
+    steady = jax.tree.map(lambda new, old: jnp.where(known.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path)
     return following, steady, loglik, hessian
 
 
@@ -87,9 +88,14 @@ def refit(
     used: Bool[np.ndarray, " seq"],
     *,
     passes: int = 5,
+    noise: bool = True,
 ) -> Trial:
-    """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them."""
+    """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
+
+    Without `noise` the process and reading noise stay as they are.
+    """
     rule, pad = _anonymous(m_step)
+    rule = eqx.tree_at(lambda r: r.stride, rule, jnp.asarray(rule.stride if noise else 0.0))
     weights = m_step.weights(model)
 
     def program(core: Core, model, path):

@@ -153,6 +153,8 @@ class HardStop(AbstractEffect):
     damping: Scalar
     """Log of the contact damping [N m s/rad]."""
     joint: int | None = eqx.field(static=True)
+    reach: float = eqx.field(static=True)
+    """Range of the joint on the paths; stops that nearly touch each other are a spring in disguise."""
     channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
@@ -162,14 +164,17 @@ class HardStop(AbstractEffect):
             low, high = float(around.low[j - 1]), float(around.high[j - 1])
             k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
             middle = 0.5 * (low + high)
-            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), j)
-            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j)
+            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), j, 2 * size)
+            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j, 2 * size)
             shares = (0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
             for above, below in itertools.product(shares, shares):
                 up, down = middle + above * size, middle - below * size
-                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), j)
+                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), j, 2 * size)
                 out.append(Candidate(start, (probe,), spread))
         return out
+
+    def possible(self):
+        return float(self.upper - self.lower) > 0.3 * self.reach
 
     def force(self, scene, memory):
         assert self.joint is not None

@@ -181,9 +181,8 @@ def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Findin
         told = shape(drawn, effect.axes[0].turns) if drawn and isinstance(effect, UnknownFunction) else numbers
         evidence = {
             "log_likelihood_gain": found.gain,
-            "p_value": found.p_value,
+            "p_value": max(found.p_value, 1e-300),
             "held_out_gain": found.held_out,
-            "loss_without_it": standing.alone,
         }
         sentence = f"{words(key_of(effect))}: {told}" if told else words(key_of(effect))
         rest = next((curve(closed.after, k) for k, of in rests.items() if of == i), None)

@@ -27,7 +27,7 @@ from .model import StateSpaceModel
 from .mstep import ScoringMStep, kept
 from .refit import Trial, refit
 from .rig import Rig
-from .screen import Verdict, judge, project, sheet
+from .screen import Verdict, judge, project, sheet, unlike
 from .smoother import CubatureSmoother
 
 Say = Callable[[str], None]
@@ -54,6 +54,10 @@ class Rules(NamedTuple):
     """Share of the gain of an unnamed law that a named one must reach to be preferred."""
     rivals: float = 0.6
     """Share of the winner's gain from which on another one is followed further too."""
+    same: float = 0.01
+    """Share of an effect's information, where it was found, that an equivalent one may leave unexplained."""
+    overlap: float = 0.05
+    """Largest share of an effect's information, over the whole length, that an equivalent one may leave unexplained."""
     even: float = 5.0
     """Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 
@@ -71,6 +75,8 @@ class Refitted(NamedTuple):
     """Log-likelihood over the model without it, after as many passes [nat]."""
     net: float
     """The gain after paying for its parameters."""
+    alike: tuple[tuple[Key, float], ...] = ()
+    """What would be lost with others in its place, by the overlap of their sensitivities [nat]."""
 
     @property
     def effect(self) -> AbstractEffect:
@@ -89,6 +95,8 @@ class Found(NamedTuple):
     """Of the likelihood ratio, times the number of candidates tried."""
     horizon: int
     """Rows of each sequence on which it was found."""
+    equivalent: tuple[Key, ...] = ()
+    """Effects that the data cannot tell from it."""
 
 
 class Step(NamedTuple):
@@ -233,7 +241,8 @@ def look(
     candidates = proposals(around)
     weights = now.m_step.weights(now.model)
     table = sheet(before.model, now.model, weights, candidates, path, data)
-    verdicts = judge(project(table, np.asarray(used, float)), candidates)
+    projected = project(table, np.asarray(used, float))
+    verdicts = judge(projected, candidates)
     ranked = _best_of_kind(candidates, verdicts, data)
     present = {key_of(effect) for effect in now.model.effects}
     entries = _shortlist(ranked, present, now.model, rules)
@@ -246,7 +255,10 @@ def look(
         trial = _try(now, path, data, used, candidate, verdict, rules)
         gain = float(np.sum((np.nan_to_num(trial.loglik, nan=-1e9) - null.loglik)[used]))
         count = verdict.rank if candidate.start.name == "unknown_function" else len(fields(candidate.start))
-        entry = Refitted(candidate, verdict, trial, gain, gain - _price(count, data))
+        shares = zip(candidates, unlike(projected, candidates, candidate), strict=True)
+        lost = ((c, share * gain * (share > rules.same)) for c, share in shares)
+        alike = tuple((key_of(c.start), nats) for c, nats in lost if _other(c, candidate))
+        entry = Refitted(candidate, verdict, trial, gain, gain - _price(count, data), alike)
         tried.append(entry)
         values = {n: float(f"{float(v):.4g}") for n, v in entry.effect.values().items()}
         say(f"  tried {_text(key_of(entry.effect))} {values}: expected {verdict.gain:.0f}, refit {gain:.0f} nat")
@@ -263,6 +275,11 @@ def look(
         if named[0].net > (0.9 if other else rules.named) * sound[0].net:
             sound = named
     return step, sound, null
+
+
+def _other(candidate: Candidate, chosen: Candidate) -> bool:
+    """A named effect of another kind."""
+    return candidate.start.name != "unknown_function" and key_of(candidate.start) != key_of(chosen.start)
 
 
 def _settle(
@@ -370,7 +387,9 @@ def _search(
             break
         count = len(fields(winner.candidate.start))
         p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
-        found = Found(winner.candidate, winner.gain, held_out, p_value, length)
+        refitted = {key_of(e.effect): winner.gain - e.gain for e in sound}
+        same = dict.fromkeys(k for k, lost in winner.alike if max(lost, refitted.get(k, 0.0)) < rules.even)
+        found = Found(winner.candidate, winner.gain, held_out, p_value, length, tuple(same))
         now = _taken(now, winner)._replace(found=(*now.found, found))
         steps[-1] = step._replace(accepted=key_of(winner.effect))
         say(f"  added {_text(key_of(winner.effect))}")

@@ -55,17 +55,18 @@ def write_diagnosis(
     residuals = {n: residual(f, train.data) for n, f in sides.items()}
     lacked = residual(closed.after, train.data, add_back=True) if found else residuals["before"]
     visited = _visited(residuals["before"], closed.before)
+    told = {n: tests(r, names) for n, r in residuals.items()}
     document = {
         "format": 1,
         "rig": closed.before.rig.name,
         "system": closed.before.rig.system,
-        "verdict": verdict(found, error),
+        "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"])),
         "effects": [entry(f) for f in found],
         "error": error,
         "error_note": None if test else "no test sequences (FOLDER/test/*.csv), so no prediction error",
         "models": {"before": "before.npz", "after": "after.npz"},
         "friction_change": friction_change(closed, visited),
-        "tests": {n: [t._asdict() for t in tests(r, names)] for n, r in residuals.items()},
+        "tests": {n: [t._asdict() for t in each] for n, each in told.items()},
         "parameters": {n: _parameters(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "noise": {n: _noise(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "looks": [_look(closed, step) for step in closed.steps],

@@ -5,6 +5,7 @@ parameters and effects already in the model are projected out, so that only what
 [Rao 1948, Proc. Camb. Phil. Soc. 44; the columns by the sensitivity equations of the Kalman filter].
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -228,6 +229,21 @@ def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
     half = np.linalg.solve(factor, information[:n, n:])
     left = np.linalg.solve(factor, score[:n])
     return Projected(score[n:] - half.T @ left, information[n:, n:] - half.T @ half)
+
+
+def unlike(projected: Projected, candidates: Sequence[Candidate], chosen: Candidate) -> list[float]:
+    """Share of what the data say of `chosen` that each candidate could not say in its place; 0: the same model."""
+    sizes = np.cumsum([0, *(len(c.probes) for c in candidates)])
+    spans = [np.arange(a, b) for a, b in itertools.pairwise(sizes)]
+    own = spans[next(i for i, c in enumerate(candidates) if c is chosen)]
+    whole = projected.information[np.ix_(own, own)]
+    out = []
+    for span in spans:
+        block = projected.information[np.ix_(span, span)]
+        cross = projected.information[np.ix_(own, span)]
+        left = whole - cross @ np.linalg.solve(block + 1e-9 * np.trace(block) * np.eye(span.size), cross.T)
+        out.append(float(np.clip(np.trace(left) / max(np.trace(whole), 1e-300), 0.0, 1.0)))
+    return out
 
 
 def judge(projected: Projected, candidates: Sequence[Candidate]) -> list[Verdict]:

@@ -15,7 +15,7 @@ from nnap_em.kalman import TANGENT, kalman_filter
 from nnap_em.model import with_effects
 from nnap_em.mstep import local
 from nnap_em.rig import Declared, Rig
-from nnap_em.screen import Sheet, judge, project, sheet
+from nnap_em.screen import Sheet, judge, project, sheet, unlike
 from nnap_em.simulate import paper_experiment, paper_model
 from nnap_em.smoother import CubatureSmoother, active_steps
 from nnap_em.systems.acrobot import table_i
@@ -128,3 +128,16 @@ def test_effects_come_and_go(bench):
     assert eqx.tree_equal(bare.effects, alone.effects)
     assert rule_bare.prior.names == rule_alone.prior.names
     np.testing.assert_array_equal(rule_bare.prior.std, rule_alone.prior.std)
+
+
+def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
+    """The interface calls the first two the same model; here it is measured."""
+    rig, model, rule, data, path = bench
+    around = surroundings(rig, model, data, path)
+    names = ("base_tilt", "sensor_bias", "torsional_spring")
+    candidates = [catalogue[name].candidates(around)[0] for name in names]
+    table = sheet(model, model, rule.weights(model), candidates, path, data)
+    tilt, bias, spring = unlike(project(table, np.ones(4)), candidates, candidates[0])
+    assert tilt < 1e-6
+    assert bias < 0.02
+    assert spring > 0.2

@@ -74,7 +74,8 @@ class _Left(NamedTuple):
 
 
 def _without(table: Sheet, used, own) -> _Left:
-    information = np.einsum("s,scd->cd", np.asarray(used, float), table.information)
+    known = np.asarray(used, bool) & np.isfinite(table.information).all(axis=(1, 2))
+    information = np.sum(table.information[known], axis=0)
     n = table.nuisance
     rest = np.setdiff1d(np.arange(n), own)
     columns = np.arange(n, information.shape[0])
@@ -89,8 +90,8 @@ def _without(table: Sheet, used, own) -> _Left:
 def _loss(left: _Left, own, span, away) -> float:
     information = left.own
     if span.size:
-        block = left.candidates[np.ix_(span, span)] + 1e-6 * np.eye(span.size)
-        information = information - left.cross[:, span] @ np.linalg.solve(block, left.cross[:, span].T)
+        block = np.linalg.pinv(left.candidates[np.ix_(span, span)], rcond=1e-9, hermitian=True)
+        information = information - left.cross[:, span] @ block @ left.cross[:, span].T
     return float(max(0.0, 0.5 * away @ information @ away))
 
 

@@ -204,7 +204,8 @@ def _significance(candidate: Candidate, trial: Trial) -> float:
     std = np.asarray(trial.m_step.prior.std)[-none.size :]
     cov = np.linalg.inv(np.asarray(trial.hessian))[-none.size :, -none.size :] * np.outer(std, std)
     away = (flat(effect) - none)[strong]
-    return float(np.sqrt(away @ np.linalg.solve(cov[np.ix_(strong, strong)], away)))
+    precision = np.linalg.pinv(cov[np.ix_(strong, strong)], rcond=1e-12, hermitian=True)
+    return float(np.sqrt(max(0.0, away @ precision @ away)))
 
 
 def _held_out(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) -> float:

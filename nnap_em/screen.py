@@ -221,9 +221,11 @@ class Projected(NamedTuple):
 
 
 def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
-    """Sum over sequences with weight `used`, and project."""
-    score = np.einsum("s,sc->c", used, sheet.score)
-    information = np.einsum("s,scd->cd", used, sheet.information)
+    """Sum over sequences with weight `used`, and project; what a lost sequence says does not count, not even as NaN."""
+    known = np.asarray(used) > 0
+    known = known & np.isfinite(sheet.score).all(axis=1) & np.isfinite(sheet.information).all(axis=(1, 2))
+    score = np.einsum("s,sc->c", used[known], sheet.score[known])
+    information = np.einsum("s,scd->cd", used[known], sheet.information[known])
     n = sheet.nuisance
     factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
     half = np.linalg.solve(factor, information[:n, n:])
@@ -241,7 +243,7 @@ def unlike(projected: Projected, candidates: Sequence[Candidate], chosen: Candid
     for span in spans:
         block = projected.information[np.ix_(span, span)]
         cross = projected.information[np.ix_(own, span)]
-        left = whole - cross @ np.linalg.solve(block + 1e-9 * np.trace(block) * np.eye(span.size), cross.T)
+        left = whole - cross @ np.linalg.pinv(block, rcond=1e-9, hermitian=True) @ cross.T
         out.append(float(np.clip(np.trace(left) / max(np.trace(whole), 1e-300), 0.0, 1.0)))
     return out
 

@@ -101,7 +101,6 @@ class InputDelay(AbstractEffect):
     name: ClassVar[str] = "input_delay"
     confirm: ClassVar[str] = "Log command and motor current on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
-    linear: ClassVar[bool] = False
     delay: Scalar
     joint: int | None = eqx.field(static=True)
     channel: str | None = eqx.field(static=True, default=None)
@@ -133,7 +132,6 @@ class ActuatorLag(AbstractEffect):
     name: ClassVar[str] = "actuator_lag"
     confirm: ClassVar[str] = "Log command and motor current on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}
-    linear: ClassVar[bool] = False
     tau: Scalar
     joint: int | None = eqx.field(static=True)
     channel: str | None = eqx.field(static=True, default=None)

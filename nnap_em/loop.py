@@ -339,9 +339,11 @@ def close(
     data = Dataset(*map(jnp.asarray, data))
     longest = _longest(data)
     now, steps = _Now(before.model, before.m_step, ()), []
-    state: EMState | None = None
-    last = 0
-    for length in _lengths(stages, longest):
+    now, state = _quantised(
+        now, None, before, data, rules, say
+    )  # first, for it spoils the noise that all else leans on
+    last = longest if state else 0
+    for length in [longest] if state else _lengths(stages, longest):
         if now.found and (state is None or last < length):
             state = _grow(now, data, before, last, length, say, state)
         own = stages[length][0].best if length < longest else before.model
@@ -362,7 +364,6 @@ def close(
         if len(more.found) > len(now.found):
             now, state = more, trial or _grow(more, data, before, longest, longest, say)
             now, state = _needed(now, state, before, data, rules, say)
-    now, state = _quantised(now, state, before, data, rules, say)
     if state is None:
         return Closed(before, before, (), tuple(steps))
     after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))

@@ -101,7 +101,7 @@ def run(name: str, out: Path) -> None:
         train, test = (read_logs(folder / part, rig).data for part in ("train", "test"))
         began = time.perf_counter()
         closed = close_the_loop(rig, train, key=jax.random.key(0), say=record["log"].append)
-        found = findings(closed, train)
+        found = findings(closed)
         error = {}
         for side, fitted in (("before", closed.before), ("after", closed.after)):
             prediction = predict(fitted, test, 1.0, key=jax.random.key(0))

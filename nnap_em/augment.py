@@ -1,7 +1,5 @@
 """A model with more effects: what the fit then has to estimate, and where it starts."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ from jaxtyping import Float
 
 from .build import measure_scales
 from .data import Dataset
-from .effects import AbstractEffect, Around, Candidate, catalogue, fields
+from .effects import AbstractEffect, Around, Candidate, catalogue, fields, flat
 from .gaussian import Gaussian
 from .model import StateSpaceModel, with_effects
 from .mstep import ParameterPrior, ScoringMStep
@@ -79,14 +77,17 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
     return jax.vmap(one)(path.mean, path.cov, data) if size else path
 
 
-def without(
-    model: StateSpaceModel, m_step: ScoringMStep, place: int, sizes: Sequence[int]
-) -> tuple[StateSpaceModel, ScoringMStep]:
-    """`model` without the effect at `place`, and its rule; `sizes` are the numbers of parameters of all effects."""
-    prior = m_step.prior
-    first = prior.size - sum(sizes)
-    start = first + sum(sizes[:place])
-    keep = np.r_[0:start, start + sizes[place] : prior.size]
+def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:
+    """Where the parameters of every effect stand among all that are estimated."""
+    sizes = [flat(effect).size for effect in model.effects]
+    ends = np.cumsum(sizes) + m_step.prior.size - sum(sizes)
+    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
+
+
+def without(model: StateSpaceModel, m_step: ScoringMStep, place: int) -> tuple[StateSpaceModel, ScoringMStep]:
+    """`model` without the effect at `place`, and its rule."""
+    prior, gone = m_step.prior, blocks(model, m_step)[place]
+    keep = np.r_[0 : gone.start, gone.stop : prior.size]
     names = []
     for name in prior.names:
         at, _, rest = name.rpartition(".")
@@ -109,12 +110,10 @@ def augment(
     place = len(model.effects)
     names = tuple(f"{place}.{name}" for name in fields(effect))
     centre = candidate.start if effect.linear else effect
-    mean = [getattr(centre, name) for name in fields(effect)]
-    std = [getattr(candidate.spread, name) for name in fields(effect)]
     prior = ParameterPrior(
         m_step.prior.names + names,
-        jnp.concatenate([m_step.prior.mean, *map(jnp.ravel, mean)]),
-        jnp.concatenate([m_step.prior.std, *map(jnp.ravel, std)]),
+        jnp.concatenate([m_step.prior.mean, flat(centre)]),
+        jnp.concatenate([m_step.prior.std, flat(candidate.spread)]),
     )
     full = with_effects(model, (*model.effects, effect))
     return full, eqx.tree_at(

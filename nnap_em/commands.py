@@ -109,11 +109,7 @@ def run_simulate(args: argparse.Namespace, say: Say) -> None:
 def run_identify(args: argparse.Namespace, say: Say) -> None:
     """Fit the declared unknowns to the training logs; the test logs serve for the reported error alone."""
     began = time.perf_counter()
-    rig = read_rig(args.folder / "rig.toml", specs)
-    train = read_logs(args.folder / "train", rig)
-    test = read_logs(args.folder / "test", rig) if any(args.folder.glob("test/*.csv")) else None
-    if test:
-        check_split(train, test)
+    rig, train, test = _read(args.folder)
     mark = fingerprint(train.data)
     settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
     if args.resume:
@@ -144,17 +140,13 @@ def run_identify(args: argparse.Namespace, say: Say) -> None:
 def run_diagnose(args: argparse.Namespace, say: Say) -> None:
     """Find what the declared model lacks, and report it; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
-    rig = read_rig(args.folder / "rig.toml", specs)
-    train = read_logs(args.folder / "train", rig)
-    test = read_logs(args.folder / "test", rig) if any(args.folder.glob("test/*.csv")) else None
-    if test:
-        check_split(train, test)
+    rig, train, test = _read(args.folder)
     mark = fingerprint(train.data)
     with _folder(args.out):
         count, rows = train.data.valid.shape
         say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         closed = close_the_loop(rig, train.data, key=jax.random.key(args.seed), say=say)
-        found = findings(closed, train.data)
+        found = findings(closed)
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes={"settings": {"seed": args.seed}})
         write_diagnosis(args.out, closed, found, train, test, seed=args.seed, began=began, say=say)
@@ -186,6 +178,16 @@ commands: dict[str, Callable[[argparse.Namespace, Say], None]] = {
     "predict": run_predict,
     "smooth": run_smooth,
 }
+
+
+def _read(folder: Path) -> tuple[Rig, Logs, Logs | None]:
+    """A data set; test logs only where there are any."""
+    rig = read_rig(folder / "rig.toml", specs)
+    train = read_logs(folder / "train", rig)
+    test = read_logs(folder / "test", rig) if any(folder.glob("test/*.csv")) else None
+    if test:
+        check_split(train, test)
+    return rig, train, test
 
 
 # --- simulate

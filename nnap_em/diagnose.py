@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .data import Dataset
-from .effects import AbstractEffect, catalogue, fields
+from .augment import blocks
+from .effects import AbstractEffect, catalogue, fields, flat
 from .effects.function import UnknownFunction
-from .equivalence import Standing, standings
 from .identify import Identified, friction_table
-from .loop import RULES, Closed, Key, Rules, key_of, rest_of, smoothed
+from .loop import Closed, Key, key_of, rest_of
 from .systems import AbstractSystem
 from .tables import state_unit
 
@@ -25,13 +24,6 @@ class Estimate(NamedTuple):
     value: float
     std: float
     unit: str
-
-
-def blocks(fitted: Identified) -> list[slice]:
-    """Where the parameters of every effect stand among all that are estimated."""
-    sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in fitted.model.effects]
-    ends = np.cumsum(sizes) + fitted.m_step.prior.size - sum(sizes)
-    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
 
 
 def covariance(fitted: Identified) -> Float[np.ndarray, "param param"]:
@@ -47,14 +39,14 @@ def estimates(fitted: Identified) -> list[dict[str, Estimate]]:
     """The reported parameters of every effect, in its order, with standard deviations by the delta method."""
     cov = covariance(fitted)
     out = []
-    for effect, here in zip(fitted.model.effects, blocks(fitted), strict=True):
+    for effect, here in zip(fitted.model.effects, blocks(fitted.model, fitted.m_step), strict=True):
         own = cov[here, here]
 
-        def reported(flat: Float[Array, " param"], effect=effect) -> dict[str, Float[Array, ""]]:
-            return _filled(effect, flat).values()
+        def reported(numbers: Float[Array, " param"], effect=effect) -> dict[str, Float[Array, ""]]:
+            return _filled(effect, numbers).values()
 
-        flat = jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
-        values, slopes = reported(flat), jax.jacfwd(reported)(flat)
+        now = flat(effect)
+        values, slopes = reported(now), jax.jacfwd(reported)(now)
         unit = units(effect, fitted.model.system)
         out.append(
             {
@@ -121,7 +113,8 @@ def curve(fitted: Identified, place: int, nodes: int = 121) -> Curve | None:
     x = np.linspace(axis.low, axis.high, nodes)
     basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
     basis = basis - basis.mean(axis=0)
-    cov = covariance(fitted)[blocks(fitted)[place], blocks(fitted)[place]]
+    own = blocks(fitted.model, fitted.m_step)[place]
+    cov = covariance(fitted)[own, own]
     std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
     return Curve(" + ".join(axis.names), x, basis @ np.asarray(effect.weights), std)
 
@@ -160,22 +153,14 @@ class Finding(NamedTuple):
     sentence: str
 
 
-def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Finding]:
+def findings(closed: Closed) -> list[Finding]:
     """All that was found, with what cannot be told from it."""
-    if not closed.found:
-        return []
-    data = Dataset(*map(jnp.asarray, data))
-    path, used = smoothed(closed.after, data)
-    chosen = tuple(f.candidate for f in closed.found)
-    firm: Sequence[Standing] = standings(closed.before, closed.after, chosen, path, data, np.asarray(used))
     model, out = closed.after.model, []
     rests = {i: rest_of(e, model) for i, e in enumerate(model.effects)}
-    for i, (found, standing) in enumerate(zip(closed.found, firm, strict=True)):
+    for i, (found, parameters) in enumerate(zip(closed.found, estimates(closed.after), strict=True)):
         if rests[i] is not None:
             continue  # told with the law that it completes
-        effect, parameters = model.effects[i], estimates(closed.after)[i]
-        lost = {key_of(c.start): loss for c, loss in standing.instead}
-        same = tuple(k for k in found.equivalent if lost.get(k, 0.0) < max(rules.even, rules.overlap * standing.alone))
+        effect = model.effects[i]
         numbers = ", ".join(f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items())
         drawn = curve(closed.after, i)
         told = shape(drawn, effect.axes[0].turns) if drawn and isinstance(effect, UnknownFunction) else numbers
@@ -188,7 +173,7 @@ def findings(closed: Closed, data: Dataset, rules: Rules = RULES) -> list[Findin
         rest = next((curve(closed.after, k) for k, of in rests.items() if of == i), None)
         if rest is not None:
             sentence += f"; the law is not quite of this form, what is left has {np.ptp(rest.mean):.2g} N m"
-        out.append(Finding(effect, parameters, evidence, same, sentence))
+        out.append(Finding(effect, parameters, evidence, found.equivalent, sentence))
     return out
 
 
@@ -228,7 +213,7 @@ def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> 
     return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
 
 
-def advice(found: Sequence[Finding], error: Mapping[str, Any] | None) -> list[str]:
+def advice(found: Sequence[Finding]) -> list[str]:
     """What to look at next."""
     out = []
     for finding in found:

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from .augment import augment, extended, proposals, seeded, surroundings, without
+from .augment import augment, blocks, extended, proposals, seeded, surroundings, without
 from .data import Dataset, horizon
-from .effects import AbstractEffect, Candidate, fields
+from .effects import AbstractEffect, Candidate, fields, flat
 from .effects.sensor import SensorQuantization, grid_step
 from .em import EMState, FitError, Schedule, fit, start_state
-from .equivalence import standings
 from .gaussian import Gaussian
 from .identify import Identified, identify
 from .model import StateSpaceModel
@@ -56,8 +55,6 @@ class Rules(NamedTuple):
     """Share of the winner's gain from which on another one is followed further too."""
     same: float = 0.01
     """Share of an effect's information, where it was found, that an equivalent one may leave unexplained."""
-    overlap: float = 0.05
-    """Largest share of an effect's information, over the whole length, that an equivalent one may leave unexplained."""
     even: float = 5.0
     """Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 
@@ -131,11 +128,6 @@ def _smoothed(model, data: Dataset, smoother) -> tuple[Gaussian, Bool[Array, " s
     return posterior.state, kept(posterior, data)
 
 
-def smoothed(fitted: Identified, data: Dataset) -> tuple[Gaussian, Bool[Array, " seq"]]:
-    """Smoothed states of all sequences, and which of them are followed."""
-    return _smoothed(fitted.model, data, CubatureSmoother(fitted.bank))
-
-
 class _Now(NamedTuple):
     """The model as it stands during the search."""
 
@@ -195,17 +187,19 @@ def _try(now: _Now, path: Gaussian, data: Dataset, used, candidate: Candidate, v
     return refit(model, rule, extended(model, path, data), data, used, passes=rules.passes)
 
 
-def _significance(candidate: Candidate, trial: Trial) -> float:
-    """How many standard deviations the last effect's strengths are from none, jointly."""
-    effect = trial.model.effects[-1]
-    flat = lambda e: np.concatenate([np.ravel(getattr(e, name)) for name in fields(e)])  # noqa: E731
-    none = flat(candidate.start)
-    strong = np.any([flat(probe) != none for probe in candidate.probes], axis=0)
-    std = np.asarray(trial.m_step.prior.std)[-none.size :]
-    cov = np.linalg.inv(np.asarray(trial.hessian))[-none.size :, -none.size :] * np.outer(std, std)
-    away = (flat(effect) - none)[strong]
-    precision = np.linalg.pinv(cov[np.ix_(strong, strong)], rcond=1e-12, hermitian=True)
-    return float(np.sqrt(max(0.0, away @ precision @ away)))
+def significance(candidate: Candidate, model: StateSpaceModel, m_step: ScoringMStep, hessian, place: int = -1) -> float:
+    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
+
+    Half its square is the log-likelihood that would be lost without the effect, to second order.
+    """
+    here, prior = blocks(model, m_step)[place], m_step.prior
+    none = np.asarray(flat(candidate.start))
+    strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
+    std, cov = np.asarray(prior.std)[here], np.linalg.inv(np.asarray(hessian))
+    cut = cov.shape[0] - prior.size
+    cov = (cov[cut:, cut:][here, here] * np.outer(std, std))[np.ix_(strong, strong)]
+    away = (np.asarray(flat(model.effects[place])) - none)[strong]
+    return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
 
 
 def _held_out(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) -> float:
@@ -265,17 +259,18 @@ def look(
         say(f"  tried {_text(key_of(entry.effect))} {values}: expected {verdict.gain:.0f}, refit {gain:.0f} nat")
     tried.sort(key=lambda e: -e.net)
     step = step._replace(refitted=tuple((key_of(e.effect), e.net) for e in tried))
-    sound = [
-        e
-        for e in tried
-        if e.effect.possible() and e.net > rules.margin and _significance(e.candidate, e.trial) > rules.certain
-    ]
+    sound = [e for e in tried if e.effect.possible() and e.net > rules.margin and _certain(e) > rules.certain]
     named = [e for e in sound if e.effect.name != "unknown_function"]
     if sound and named and sound[0] not in named:
         other = rest_of(sound[0].effect, now.model) is not None and named[0].effect.place
         if named[0].net > (0.9 if other else rules.named) * sound[0].net:
             sound = named
     return step, sound, null
+
+
+def _certain(entry: Refitted) -> float:
+    trial = entry.trial
+    return significance(entry.candidate, trial.model, trial.m_step, trial.hessian)
 
 
 def _other(candidate: Candidate, chosen: Candidate) -> bool:
@@ -285,23 +280,31 @@ def _other(candidate: Candidate, chosen: Candidate) -> bool:
 
 def _settle(
     now: _Now, before: Identified, data: Dataset, length: int, sound: list[Refitted], rules: Rules, say: Say
-) -> tuple[Refitted, EMState | None]:
-    """The winner; where the next ones are near, each is followed to a longer horizon, where the wrong ones fail."""
+) -> tuple[Refitted, EMState | None, dict[Key, float]]:
+    """The winner; where the next ones are near, each is followed to a longer horizon, where the wrong ones fail.
+
+    With it the fit to that horizon, and how many nats each rival fell behind there.
+    """
     rivals = [e for e in sound if e.net > rules.rivals * sound[0].net][:3]
     longest = _longest(data)
     if len(rivals) == 1 or length == longest:
-        return sound[0], None
+        return sound[0], None, {}
     further = min(longest, round(2.5 * length))
     say(f"  {len(rivals)} of them are near: followed to {further * before.rig.dt:.2f} s")
-    best: tuple[Refitted, EMState | None] = (sound[0], None)
+    states: list[tuple[Refitted, EMState]] = []
     for rival in rivals:
         try:
-            state = _grow(_taken(now, rival), data, before, length, further, say)
+            states.append((rival, _grow(_taken(now, rival), data, before, length, further, say)))
         except FitError:
             continue
-        if best[1] is None or _trimmed(np.nan_to_num(state.top, nan=-1e3) - np.nan_to_num(best[1].top, nan=-1e3)) > 0:
-            best = (rival, state)
-    return best
+    if not states:
+        return sound[0], None, {}
+    ahead = lambda a, b: _trimmed(np.nan_to_num(a.top, nan=-1e3) - np.nan_to_num(b.top, nan=-1e3))  # noqa: E731
+    winner, state = states[0]
+    for rival, other in states[1:]:
+        if ahead(other, state) > 0:
+            winner, state = rival, other
+    return winner, state, {key_of(rival.effect): ahead(state, other) for rival, other in states}
 
 
 def _trimmed(gain) -> float:
@@ -339,9 +342,8 @@ def close(
     data = Dataset(*map(jnp.asarray, data))
     longest = _longest(data)
     now, steps = _Now(before.model, before.m_step, ()), []
-    now, state = _quantised(
-        now, None, before, data, rules, say
-    )  # first, for it spoils the noise that all else leans on
+    # steps in a reading come first: they spoil the noise that all else leans on
+    now, state = _quantised(now, before, data, rules, say)
     last = longest if state else 0
     for length in [longest] if state else _lengths(stages, longest):
         if now.found and (state is None or last < length):
@@ -382,7 +384,7 @@ def _search(
         steps.append(step)
         if not sound or null is None:
             break
-        winner, further = _settle(now, before, data, length, sound, rules, say)
+        winner, further, behind = _settle(now, before, data, length, sound, rules, say)
         held_out = _held_out(null, winner.trial, part, used)
         say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} held out")
         if held_out < rules.margin / 2:
@@ -390,7 +392,8 @@ def _search(
         count = len(fields(winner.candidate.start))
         p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
         refitted = {key_of(e.effect): winner.gain - e.gain for e in sound}
-        same = dict.fromkeys(k for k, lost in winner.alike if max(lost, refitted.get(k, 0.0)) < rules.even)
+        told = {key: max(lost, behind.get(key, 0.0)) for key, lost in refitted.items()}
+        same = dict.fromkeys(k for k, lost in winner.alike if max(lost, told.get(k, 0.0)) < rules.even)
         found = Found(winner.candidate, winner.gain, held_out, p_value, length, tuple(same))
         now = _taken(now, winner)._replace(found=(*now.found, found))
         steps[-1] = step._replace(accepted=key_of(winner.effect))
@@ -403,29 +406,33 @@ def _search(
 def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
     """The search without the effects that later ones made needless."""
     while state is not None and now.found:
-        after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
-        path, used = smoothed(after, data)
-        chosen = tuple(f.candidate for f in now.found)
-        losses = [s.alone for s in standings(before, after, chosen, path, data, np.asarray(used))]
-        losses = [loss if e.possible() else 0.0 for loss, e in zip(losses, after.model.effects, strict=True)]
+        model = cast(StateSpaceModel, state.best)
+        losses = [_loss(f, model, now.m_step, state.hessian, i) for i, f in enumerate(now.found)]
         least = int(np.argmin(losses))
         if losses[least] > rules.margin:
             break
         say(f"  {_text(key_of(now.found[least].candidate.start))} is needless now: {losses[least]:.0f} nat")
-        sizes = [sum(np.size(getattr(e, n)) for n in fields(e)) for e in after.model.effects]
-        model, rule = without(after.model, now.m_step, least, sizes)
+        model, rule = without(model, now.m_step, least)
         now = _Now(model, rule, tuple(f for i, f in enumerate(now.found) if i != least))
         state = _grow(now, data, before, _longest(data), _longest(data), say) if now.found else None
     return now, state
+
+
+def _loss(found: Found, model: StateSpaceModel, m_step: ScoringMStep, hessian, place: int) -> float:
+    """Log-likelihood that goes with an effect [nat]; none with one whose value makes no sense, all with steps seen."""
+    effect = model.effects[place]
+    if isinstance(effect, SensorQuantization):
+        return math.inf
+    return 0.5 * significance(found.candidate, model, m_step, hessian, place) ** 2 if effect.possible() else 0.0
 
 
 def _longest(data: Dataset) -> int:
     return int(np.max(np.sum(np.asarray(data.valid), axis=1)))
 
 
-def _quantised(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
+def _quantised(now: _Now, before: Identified, data: Dataset, rules: Rules, say: Say):
     """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise."""
-    rig = before.rig
+    rig, state = before.rig, None
     for i, channel in enumerate(rig.measured):
         y = np.asarray(data.y)[..., i]
         step = grid_step(y.ravel())

@@ -70,7 +70,7 @@ def write_diagnosis(
         "parameters": {n: _parameters(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "noise": {n: _noise(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "looks": [_look(closed, step) for step in closed.steps],
-        "next": advice(found, error),
+        "next": advice(found),
         "seed": seed,
         "versions": {"nnap_em": __version__, "python": platform.python_version()}
         | {name: version(name) for name in ("jax", "jaxlib", "equinox", "numpy")},

@@ -21,7 +21,7 @@ def _closed(case, folder):
     rig = read_rig(folder / "rig.toml", specs)
     data = read_logs(folder / "train", rig).data
     closed = close_the_loop(rig, data, key=jax.random.key(0))
-    return closed, findings(closed, data)
+    return closed, findings(closed)
 
 
 def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):

@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 
-from .base import AbstractEffect, Around, Candidate, Scene, fields
+from .base import AbstractEffect, Around, Candidate, Scene, fields, flat
 from .function import Axis
 
 
@@ -19,4 +19,4 @@ catalogue: dict[str, type[AbstractEffect]] = {kind.name: kind for kind in _leave
 parts: tuple[type, ...] = (Axis,)
 """What effects are made of besides numbers."""
 
-__all__ = ["AbstractEffect", "Around", "Candidate", "Scene", "catalogue", "fields", "parts"]
+__all__ = ["AbstractEffect", "Around", "Candidate", "Scene", "catalogue", "fields", "flat", "parts"]

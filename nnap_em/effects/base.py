@@ -142,6 +142,11 @@ def fields(effect: AbstractEffect) -> tuple[str, ...]:
     return tuple(f.name for f in dataclasses.fields(effect) if eqx.is_array(getattr(effect, f.name)))
 
 
+def flat(effect: AbstractEffect) -> Float[Array, " param"]:
+    """All parameters as one vector, in the order of a fit."""
+    return jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
+
+
 def at_joint(joint: int | None, value: Scalar, scene: Scene) -> Float[Array, " dof"]:
     """A generalised force at one joint."""
     assert joint is not None

@@ -16,76 +16,54 @@ def varieties(around: Around, name: str) -> list[tuple[int, float]]:
     return [(j, float(size(around.system))) for j, size in found]
 
 
-class Payload(AbstractEffect):
+class Variation(AbstractEffect):
+    """A body that differs by an amount; the machine knows what that changes."""
+
+    amount: Scalar
+    joint: int | None = eqx.field(static=True)
+    channel: str | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def candidates(cls, around):
+        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
+
+    def values(self):
+        return dict.fromkeys(self.units, self.amount)
+
+    def physics(self, system, time):
+        return system.vary(self.name, self.joint, self.amount)
+
+
+class Payload(Variation):
     """A point mass at the tip."""
 
     name: ClassVar[str] = "payload"
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg"}
-    mass: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def candidates(cls, around):
-        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
-
-    def physics(self, system, time):
-        return system.vary("payload", self.joint, self.mass)
 
 
-class LinkInertia(AbstractEffect):
+class LinkInertia(Variation):
     """A moment of inertia off by dI."""
 
     name: ClassVar[str] = "link_inertia"
     confirm: ClassVar[str] = "Swing the link alone about a known axis and time it."
     units: ClassVar[dict[str, str]] = {"dI": "kg m^2"}
-    dI: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def candidates(cls, around):
-        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
-
-    def physics(self, system, time):
-        return system.vary("link_inertia", self.joint, self.dI)
 
 
-class LinkLength(AbstractEffect):
+class LinkLength(Variation):
     """A length off by dl."""
 
     name: ClassVar[str] = "link_length"
     confirm: ClassVar[str] = "Measure the distance between the joints."
     units: ClassVar[dict[str, str]] = {"dl": "m"}
-    dl: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def candidates(cls, around):
-        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
-
-    def physics(self, system, time):
-        return system.vary("link_length", self.joint, self.dl)
 
 
-class CenterOfMass(AbstractEffect):
+class CenterOfMass(Variation):
     """A centre of mass off by dlc along the link."""
 
     name: ClassVar[str] = "center_of_mass"
     confirm: ClassVar[str] = "Balance the link on an edge."
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
-    dlc: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def candidates(cls, around):
-        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
-
-    def physics(self, system, time):
-        return system.vary("center_of_mass", self.joint, self.dlc)
 
 
 class PayloadStep(AbstractEffect):

@@ -25,10 +25,14 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
     low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
     y = np.asarray(data.y)
     clock = np.asarray(data.t)[valid]
+    speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
+    ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
+    fast, slow, back, fast_back = np.asarray(jax.vmap(model.unknown)(ends))
     return Around(
         model.system,
         scales.torque,
-        np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9,
+        speed,
+        np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed)),
         low,
         high,
         np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),

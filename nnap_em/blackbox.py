@@ -125,6 +125,7 @@ class GradientMStep(AbstractMStep):
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
         return jnp.zeros((0, 0), model.log_q.dtype)
 
+    @eqx.filter_jit
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[NetworkModel, MStepInfo]:
         finite = jnp.all(jnp.isfinite(posterior.prev) & jnp.isfinite(posterior.next), axis=(1, 2, 3))
         used = kept(posterior, data) & finite

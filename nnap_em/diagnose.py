@@ -110,7 +110,7 @@ def curve(fitted: Identified, place: int, nodes: int = 121) -> Curve | None:
     if not isinstance(effect, UnknownFunction) or len(effect.axes) != 1:
         return None
     axis = effect.axes[0]
-    x = np.linspace(axis.low, axis.high, nodes)
+    x = np.linspace(float(axis.low), float(axis.high), nodes)
     basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
     basis = basis - basis.mean(axis=0)
     own = blocks(fitted.model, fitted.m_step)[place]

@@ -13,13 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Bool, PRNGKeyArray
 
 from .augment import augment, blocks, extended, proposals, seeded, surroundings, without
 from .data import Dataset, horizon
 from .effects import AbstractEffect, Candidate, fields, flat
 from .effects.sensor import SensorQuantization, grid_step
-from .em import EMState, FitError, Schedule, fit, start_state
+from .em import EMState, FitError, Schedule, e_step, fit, start_state
 from .gaussian import Gaussian
 from .identify import Identified, identify
 from .model import StateSpaceModel
@@ -41,10 +41,16 @@ class Rules(NamedTuple):
     """Candidates that are refitted."""
     near: float = 0.4
     """Share of the best expected gain below which a candidate is not refitted."""
+    starts: int = 3
+    """Places from which a law that is not linear is refitted."""
     passes: int = 8
     """Passes of a refit."""
     margin: float = 12.0
     """Log-likelihood [nat] that must be left of a gain after paying half of log(readings) for every parameter."""
+    matters: float = 0.002
+    """The same for every reading: many readings make certain of what nobody would notice."""
+    repeats: float = 0.3
+    """Share of the gain that must be seen on sequences left out of the fit."""
     certain: float = 5.0
     """Standard deviations from zero that the strength must be."""
     most: int = 4
@@ -122,10 +128,32 @@ def key_of(effect: AbstractEffect) -> Key:
     return effect.name, effect.joint, effect.channel, effect.inputs_named()
 
 
-@eqx.filter_jit
-def _smoothed(model, data: Dataset, smoother) -> tuple[Gaussian, Bool[Array, " seq"]]:
-    posterior = jax.vmap(lambda seq: smoother(model, seq))(data)
-    return posterior.state, kept(posterior, data)
+def _followed(
+    now: "_Now", data: Dataset, before: Identified
+) -> tuple[Gaussian, Bool[np.ndarray, " seq"], Bool[np.ndarray, " seq"], Dataset]:
+    """Smoothed paths, the sequences that are followed whole and those used, and the data of the latter.
+
+    A sequence that is lost tells most where it is being lost: it is used until a little later.
+    """
+    smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
+    posterior = e_step(now.model, data, smoother, key=before.state.key)
+    whole = np.asarray(kept(posterior, data))
+    if whole.all():
+        return posterior.state, whole, whole, data
+    dof = len(now.model.system.coordinates)
+    kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
+    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < LOUD)
+    first = np.where(loud.any(axis=1), loud.argmax(axis=1), data.t.shape[1])
+    row = np.arange(data.t.shape[1])
+    cut = data._replace(valid=data.valid & jnp.asarray(whole[:, None] | (row < first[:, None] + LATER)))
+    posterior = e_step(now.model, cut, smoother, key=before.state.key)
+    return posterior.state, whole, np.asarray(kept(posterior, cut)), cut
+
+
+LOUD = 5.0
+"""Standard deviations of a kick with which a track begins to be lost."""
+LATER = 8
+"""Rows after that which still count."""
 
 
 class _Now(NamedTuple):
@@ -143,6 +171,10 @@ def readings(data: Dataset) -> int:
 
 def _price(count: int, data: Dataset) -> float:
     return 0.5 * count * math.log(max(readings(data), 2))
+
+
+def _bar(data: Dataset, rules: Rules) -> float:
+    return max(rules.margin, rules.matters * readings(data))
 
 
 def _best_of_kind(
@@ -169,9 +201,18 @@ def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
 
 
+def _told(effect: AbstractEffect, model: StateSpaceModel) -> bool:
+    """Whether an unnamed law in the model is a function of the same position at the same joint."""
+    if not effect.place or effect.joint is None:
+        return False
+    key = ("unknown_function", effect.joint, None, (model.system.coordinates[effect.joint - 1],))
+    return key in map(key_of, model.effects)
+
+
 def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
     """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
     fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > rules.margin / 2]
+    fresh = [entry for entry in fresh if not _told(entry[1].start, model)]
     named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
     top = named[0][0] if named else 0.0
     unnamed = [entry for entry in fresh if entry[1].start.name == "unknown_function" and entry[0] > top][:2]
@@ -179,6 +220,21 @@ def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
     unnamed = (beside + [entry for entry in unnamed if entry not in beside])[:2]
     close = [entry for entry in named if entry[0] > rules.near * top]
     return [(c, v) for _, c, v in unnamed + close[: rules.shortlist - len(unnamed)]]
+
+
+def _more_starts(entries, candidates: Sequence[Candidate], verdicts: Sequence[Verdict], rules: Rules):
+    """The next best places to start from of laws that are not linear: the score test says less of them."""
+    more = []
+    for chosen, best in entries:
+        if chosen.start.linear:
+            continue
+        own = [(c, v) for c, v in zip(candidates, verdicts, strict=True) if key_of(c.start) == key_of(chosen.start)]
+        seen = {best.gain}
+        for c, v in sorted(own, key=lambda pair: -pair[1].gain):
+            if len(seen) < rules.starts and v.gain not in seen and v.gain > 0.3 * best.gain:
+                seen.add(v.gain)
+                more.append((c, v))
+    return more
 
 
 def _try(now: _Now, path: Gaussian, data: Dataset, used, candidate: Candidate, verdict: Verdict, rules: Rules) -> Trial:
@@ -228,14 +284,14 @@ def _chi2_tail(x: float, df: int) -> float:
 
 
 def look(
-    now: _Now, before: Identified, path: Gaussian, data: Dataset, used, rules: Rules, say: Say
+    now: _Now, before: Identified, path: Gaussian, data: Dataset, used, rows: int, rules: Rules, say: Say
 ) -> tuple[Step, list[Refitted], Trial | None]:
     """One look at one horizon: everything screened, the best few refitted; those that hold, best first."""
     length = _longest(data)
     around = surroundings(before.rig, now.model, data, path)
     candidates = proposals(around)
     weights = now.m_step.weights(now.model)
-    table = sheet(before.model, now.model, weights, candidates, path, data)
+    table = sheet(before.model, now.model, weights, candidates, path, data, rows)
     projected = project(table, np.asarray(used, float))
     verdicts = judge(projected, candidates)
     ranked = _best_of_kind(candidates, verdicts, data)
@@ -245,7 +301,8 @@ def look(
     if not entries:
         return step, [], None
     null = refit(now.model, now.m_step.early(), path, data, used, passes=rules.passes)
-    tried = []
+    entries += _more_starts(entries, candidates, verdicts, rules)
+    tried: list[Refitted] = []
     for candidate, verdict in entries:
         trial = _try(now, path, data, used, candidate, verdict, rules)
         gain = float(np.sum((np.nan_to_num(trial.loglik, nan=-1e9) - null.loglik)[used]))
@@ -254,12 +311,16 @@ def look(
         lost = ((c, share * gain * (share > rules.same)) for c, share in shares)
         alike = tuple((key_of(c.start), nats) for c, nats in lost if _other(c, candidate))
         entry = Refitted(candidate, verdict, trial, gain, gain - _price(count, data), alike)
-        tried.append(entry)
+        same = next((i for i, e in enumerate(tried) if key_of(e.effect) == key_of(entry.effect)), None)
+        if same is None:
+            tried.append(entry)
+        elif tried[same].net < entry.net:
+            tried[same] = entry
         values = {n: float(f"{float(v):.4g}") for n, v in entry.effect.values().items()}
         say(f"  tried {_text(key_of(entry.effect))} {values}: expected {verdict.gain:.0f}, refit {gain:.0f} nat")
     tried.sort(key=lambda e: -e.net)
     step = step._replace(refitted=tuple((key_of(e.effect), e.net) for e in tried))
-    sound = [e for e in tried if e.effect.possible() and e.net > rules.margin and _certain(e) > rules.certain]
+    sound = [e for e in tried if e.effect.possible() and e.net > _bar(data, rules) and _certain(e) > rules.certain]
     named = [e for e in sound if e.effect.name != "unknown_function"]
     if sound and named and sound[0] not in named:
         other = rest_of(sound[0].effect, now.model) is not None and named[0].effect.place
@@ -289,7 +350,7 @@ def _settle(
     longest = _longest(data)
     if len(rivals) == 1 or length == longest:
         return sound[0], None, {}
-    further = min(longest, round(2.5 * length))
+    further = _further(length, longest)
     say(f"  {len(rivals)} of them are near: followed to {further * before.rig.dt:.2f} s")
     states: list[tuple[Refitted, EMState]] = []
     for rival in rivals:
@@ -305,6 +366,11 @@ def _settle(
         if ahead(other, state) > 0:
             winner, state = rival, other
     return winner, state, {key_of(rival.effect): ahead(state, other) for rival, other in states}
+
+
+def _further(length: int, longest: int) -> int:
+    """The horizon of a playoff."""
+    return min(longest, SHORT if length < SHORT else round(2.5 * length))
 
 
 def _trimmed(gain) -> float:
@@ -354,7 +420,7 @@ def close(
         now, further = _search(now, before, part, length, data, steps, rules, say)
         if steps[-1].accepted or len(now.found) > known:
             state = further
-            last = round(2.5 * length) if further is not None else length
+            last = _further(length, longest) if further is not None else length
     if now.found and state is None:
         state = _grow(now, data, before, longest, longest, say)
     count = len(now.found)
@@ -373,21 +439,20 @@ def close(
 
 
 def _search(
-    now: _Now, before: Identified, part: Dataset, length: int, data: Dataset, steps: list[Step], rules: Rules, say: Say
+    now: _Now, before: Identified, every: Dataset, length: int, data: Dataset, steps: list[Step], rules: Rules, say: Say
 ) -> tuple[_Now, EMState | None]:
     """Look at one horizon until nothing more is found; a fit to a longer one, where a playoff made it."""
     while len(now.found) < rules.most:
-        path, used = _smoothed(now.model, part, CubatureSmoother(before.bank.padded(now.model.log_q.shape[0])))
-        used = np.asarray(used)
-        say(f"horizon {length * before.rig.dt:.2f} s: {used.sum()} of {used.size} sequences followed")
-        step, sound, null = look(now, before, path, part, used, rules, say)
+        path, whole, used, part = _followed(now, every, before)
+        say(f"horizon {length * before.rig.dt:.2f} s: {whole.sum()} of {whole.size} sequences followed")
+        step, sound, null = look(now, before, path, part, used, data.t.shape[1], rules, say)
         steps.append(step)
         if not sound or null is None:
             break
         winner, further, behind = _settle(now, before, data, length, sound, rules, say)
         held_out = _held_out(null, winner.trial, part, used)
         say(f"  best: {_text(key_of(winner.effect))}, {winner.net:.0f} nat net, {held_out:.0f} held out")
-        if held_out < rules.margin / 2:
+        if held_out < max(_bar(part, rules) / 2, rules.repeats * winner.net):
             break
         count = len(fields(winner.candidate.start))
         p_value = min(1.0, _chi2_tail(2 * winner.gain, count) * step.tried)
@@ -395,12 +460,37 @@ def _search(
         told = {key: max(lost, behind.get(key, 0.0)) for key, lost in refitted.items()}
         same = dict.fromkeys(k for k, lost in winner.alike if max(lost, told.get(k, 0.0)) < rules.even)
         found = Found(winner.candidate, winner.gain, held_out, p_value, length, tuple(same))
-        now = _taken(now, winner)._replace(found=(*now.found, found))
+        plain = _plain(now, winner, null, path, part, used, rules)
+        if plain is not None:
+            now, dropped = plain
+            say(f"  {_text(key_of(dropped))} was a part of it")
+            further = None
+        else:
+            now = _taken(now, winner)
+        now = now._replace(found=(*now.found, found))
         steps[-1] = step._replace(accepted=key_of(winner.effect))
         say(f"  added {_text(key_of(winner.effect))}")
         if further is not None:
             return now, further
     return now, None
+
+
+def _plain(
+    now: _Now, winner: Refitted, null: Trial, path: Gaussian, part: Dataset, used, rules: Rules
+) -> tuple[_Now, AbstractEffect] | None:
+    """The search with an unnamed law in place of a named one and its rest, where the named one says the lesser part."""
+    place = rest_of(winner.effect, now.model)
+    if place is None:
+        return None
+    model, rule = without(now.model, now.m_step, place)
+    bare = refit(model, rule.early(), path, part, used, passes=rules.passes)
+    whole, own = (_trimmed((trial.loglik - bare.loglik)[used]) for trial in (winner.trial, null))
+    if own > rules.named * whole:
+        return None
+    model, rule = augment(bare.model, rule, winner.effect, winner.candidate)
+    trial = refit(model, rule.early(), bare.path, part, used, passes=rules.passes)
+    found = tuple(f for i, f in enumerate(now.found) if i != place)
+    return _Now(trial.model, rule, found), now.model.effects[place]
 
 
 def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset, rules: Rules, say: Say):
@@ -409,7 +499,7 @@ def _needed(now: _Now, state: EMState | None, before: Identified, data: Dataset,
         model = cast(StateSpaceModel, state.best)
         losses = [_loss(f, model, now.m_step, state.hessian, i) for i, f in enumerate(now.found)]
         least = int(np.argmin(losses))
-        if losses[least] > rules.margin:
+        if losses[least] > _bar(data, rules):
             break
         say(f"  {_text(key_of(now.found[least].candidate.start))} is needless now: {losses[least]:.0f} nat")
         model, rule = without(model, now.m_step, least)
@@ -455,7 +545,7 @@ def _quantised(now: _Now, before: Identified, data: Dataset, rules: Rules, say: 
     return now, state
 
 
-SHORT = 128
+SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
 
 
@@ -472,19 +562,30 @@ def _part(data: Dataset, length: int) -> Dataset:
     return jax.tree.map(lambda a: a[:, :SHORT], part) if length <= SHORT else part
 
 
+LOOSER = 3.0
+"""What is added to the log of the process noise where every track is lost."""
+
+
 def _grow(
     now: _Now, data: Dataset, before: Identified, first: int, length: int, say: Say, state: EMState | None = None
 ) -> EMState:
     """EM of the model as it stands, from the horizon where it was found (or from `state`) to a longer one."""
-    part = horizon(data, length)
+    part = _part(data, length)
     if state is not None:
         now = now._replace(model=state.best)
     schedule = Schedule(first=min(first, length), growth=1.6, hold=1)
-    state = start_state(now.model, now.m_step, key=before.state.key)._replace(epoch=1)
     growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0
     smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
-    whole = length == _longest(data)
-    state = fit(state, part, smoother, now.m_step, epochs=growing + (8 if whole else 3), schedule=schedule)
+    epochs = growing + (8 if length == _longest(data) else 3)
+
+    def run(model: StateSpaceModel) -> EMState:
+        begun = start_state(model, now.m_step, key=before.state.key)._replace(epoch=1)
+        return fit(begun, part, smoother, now.m_step, epochs=epochs, schedule=schedule)
+
+    try:
+        state = run(now.model)
+    except FitError:  # a looser filter keeps a track that a tight one loses
+        state = run(eqx.tree_at(lambda m: m.log_q, now.model, now.model.log_q + LOOSER))
     reach = f"{length * before.rig.dt:.2f} s"
     say(f"  fitted over {reach} in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
     return state

@@ -114,6 +114,25 @@ def local(
     return Local(affine, reading, *jax.vmap(tangents)(path.mean, u, by_input))
 
 
+@eqx.filter_jit
+def locals_along(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset, linearise: Tangent | Cubature
+) -> Local:
+    """`local` of every sequence: all of an M-step that is compiled anew for a model of another structure."""
+    return jax.vmap(lambda path, seq: local(model, prior, path, seq, linearise))(path, data)
+
+
+def readings_at(model: AbstractModel, posterior: Posterior, seq: Dataset) -> Float[Array, "time node obs"]:
+    """The emission at the nodes of a posterior."""
+    nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
+    return jax.vmap(jax.vmap(model.emission, in_axes=(0, None)))(nodes, model.inputs(seq))
+
+
+@eqx.filter_jit
+def _all_readings(model, posterior: Posterior, data: Dataset) -> Float[Array, "seq time node obs"]:
+    return jax.vmap(lambda posterior, seq: readings_at(model, posterior, seq))(posterior, data)
+
+
 def whitened_sensitivities(
     filtered: Filtered,
     columns: Float[Array, "time state column"],
@@ -155,8 +174,7 @@ def expand(
 ) -> Quadratic:
     """The log-likelihood of one sequence to second order."""
     here = local(model, prior, posterior.state, seq, linearise)
-    nodes_now = jnp.concatenate([posterior.prev, posterior.next[-1:]])
-    read = jax.vmap(jax.vmap(model.emission, in_axes=(0, None)))(nodes_now, model.inputs(seq))
+    read = readings_at(model, posterior, seq)
     return quadratic(model.log_q, model.log_r, model.start, here, nodes, posterior, read, seq)
 
 
@@ -348,6 +366,7 @@ class AbstractMStep(eqx.Module):
         """`MStepInfo.hessian` before the first epoch."""
 
 
+@eqx.filter_jit
 def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
     """Sequences whose track is not lost: log-likelihood per reading not far below the median of all."""
     _, observed = fill_missing(data.y)
@@ -357,6 +376,29 @@ def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
     middle = jnp.nanmedian(jnp.where(finite, mean, jnp.nan))
     spread = 1.48 * jnp.nanmedian(jnp.where(finite, jnp.abs(mean - middle), jnp.nan))
     return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
+
+
+BLOCK = 4
+"""The number of parameters is padded to a multiple of this, for fewer programs."""
+
+
+@eqx.filter_jit
+def _advance(rule: "ScoringMStep", core: Core, here: Local, posterior: Posterior, read, data: Dataset, used):
+    weights = rule.weights(core)
+
+    def one(here, posterior, read, seq):
+        return quadratic(core.log_q, core.log_r, core.start, here, weights.nodes, posterior, read, seq)
+
+    each = jax.vmap(one)(here, posterior, read, data)
+    used = used & jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(each.information), axis=(1, 2))
+    used = used & jnp.all(jnp.isfinite(each.score), axis=1) & jnp.all(jnp.isfinite(each.noise_score), axis=1)
+    pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
+    total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
+    first = jax.tree.map(lambda a: pick(a[:, 0]), posterior.state)
+    w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
+    hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
+    log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
+    return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
 
 
 class ScoringMStep(AbstractMStep):
@@ -392,29 +434,49 @@ class ScoringMStep(AbstractMStep):
         return jnp.zeros((w.shape[0], w.shape[0]), w.dtype)
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
-        weights = self.weights(model)
-        each = jax.vmap(lambda p, s: expand(model, self.prior, weights.nodes, p, s, self.linearise))(posterior, data)
-        used = kept(posterior, data) & jnp.all(jnp.isfinite(each.score), axis=1)
-        used = used & jnp.all(jnp.isfinite(each.information), axis=(1, 2)) & jnp.all(jnp.isfinite(each.noise_score), 1)
-        pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
-        total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
-        first = jax.tree.map(lambda a: pick(a[:, 0]), posterior.state)
-        core = Core(model.unknown, weights.read(model), model.log_q, model.log_r, model.start)
-        core, hessian = self.advance(core, weights, total, first, used)
-        fitted = weights.write(model, core.w)
-        fitted = eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
-        return fitted, MStepInfo(hessian, used)
+        here = locals_along(model, self.prior, posterior.state, data, self.linearise)
+        read = _all_readings(model, posterior, data)
+        core = self.core(model)
+        core, hessian, used = self.advance(core, here, posterior, read, data, kept(posterior, data))
+        return self.whole(model, core), MStepInfo(hessian, used)
+
+    def core(self, model) -> Core:
+        """What a step changes of a model."""
+        return Core(model.unknown, self.weights(model).read(model), model.log_q, model.log_r, model.start)
+
+    def whole(self, model, core: Core) -> StateSpaceModel:
+        """`model` with what a step has changed."""
+        fitted = self.weights(model).write(model, core.w)
+        return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
 
     def advance(
-        self, core: "Core", weights: Weights, total: Quadratic, first: Gaussian, used: Bool[Array, " seq"]
-    ) -> tuple["Core", Float[Array, "weight weight"]]:
-        """The step itself, of what every structure of a model has; and the posterior precision where it began."""
-        w = weights.fit(core.unknown, core.w, total.score, total.information, self.iterations)
-        hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
-        log_q, log_r = self._noise(core, total, weights.nodes.shape[0])
-        return Core(core.unknown, w, log_q, log_r, self._start(core.start, first, used)), hessian
+        self,
+        core: Core,
+        here: Local,
+        posterior: Posterior,
+        read: Float[Array, "seq time node obs"],
+        data: Dataset,
+        used: Bool[Array, " seq"],
+    ) -> tuple[Core, Float[Array, "weight weight"], Bool[Array, " seq"]]:
+        """The step itself: one program for models of every structure; parameters are nameless here.
 
-    def _noise(self, model: "Core", total: Quadratic, dof: int):
+        With it the posterior precision where it began, and which of the sequences `used` could be.
+        """
+        count = self.prior.size
+        pad = -count % BLOCK
+        names = tuple(map(str, range(count + pad)))
+        mean, std = jnp.pad(self.prior.mean, (0, pad)), jnp.pad(self.prior.std, (0, pad), constant_values=1.0)
+        rule = eqx.tree_at(lambda r: r.prior, self, ParameterPrior(names, mean, std))
+        widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
+        here = here._replace(
+            by_parameter=widen(here.by_parameter), reading_by_parameter=widen(here.reading_by_parameter)
+        )
+        core, hessian, used = _advance(rule, core._replace(w=widen(core.w)), here, posterior, read, data, used)
+        wide = core.w.shape[0] - pad
+        return core._replace(w=core.w[:wide]), hessian[:wide, :wide], used
+
+    def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
+        """Log variances of process and reading noise after the step."""
         info = total.noise_information
         learn = jnp.asarray([i < 2 * dof for i in range(model.log_q.shape[0])] + list(self.learn_r))
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
@@ -434,7 +496,7 @@ class ScoringMStep(AbstractMStep):
         ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)
         return 1e4 * angle.T @ angle + self.tie * ratio.T @ ratio
 
-    def _start(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
+    def first(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
         """EM's own update of the entries that nobody declared [paper, eq. 11]."""
         learn = jnp.asarray(self.learn_start + (False,) * (start.mean.shape[0] - len(self.learn_start)))
         count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)

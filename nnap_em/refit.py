@@ -16,11 +16,8 @@ from .data import Dataset, fill_missing
 from .gaussian import Gaussian
 from .kalman import CUBATURE, kalman_filter, rts
 from .model import StateSpaceModel
-from .mstep import Core, Local, ParameterPrior, ScoringMStep, local, quadratic
-from .smoother import Posterior, active_steps, pair_nodes
-
-BLOCK = 4
-"""The number of parameters is padded to a multiple of this, for fewer programs."""
+from .mstep import Core, Local, ScoringMStep, locals_along
+from .smoother import Posterior, active_steps, linear_posterior
 
 
 class Trial(NamedTuple):
@@ -35,49 +32,26 @@ class Trial(NamedTuple):
 
 
 @eqx.filter_jit
-def _locals(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Local:
-    return jax.vmap(lambda path, seq: local(model, prior, path, seq, CUBATURE))(path, data)
-
-
-@eqx.filter_jit
-def _pass(rule: ScoringMStep, core: Core, here: Local, path: Gaussian, data: Dataset, used: Bool[Array, " seq"]):
-    weights = rule.weights(core)
+def _smoothed(
+    core: Core, here: Local, path: Gaussian, data: Dataset
+) -> tuple[Posterior, Float[Array, "..."], Gaussian]:
+    """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
 
     def one(here: Local, seq: Dataset):
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
         active = active_steps(jnp.asarray(seq.valid))
         filtered = kalman_filter(core.log_q, core.log_r, core.start, here.affine, here.reading, y, observed, active)
-        smoothed = rts(filtered)
-        prev, following = pair_nodes(smoothed)
-        affine = jax.tree.map(lambda a: a[:-1, None], here.affine)
-        kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
-        endless = jnp.full_like(filtered.loglik, jnp.inf)
-        posterior = Posterior(smoothed.state, prev, following, kick, here.affine.noise[:-1], filtered.loglik, endless)
-        nodes = jnp.concatenate([prev, following[-1:]])
+        posterior = linear_posterior(filtered, rts(filtered))
+        nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
         read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
-        about = quadratic(core.log_q, core.log_r, core.start, here, weights.nodes, posterior, read, seq)
-        return about, smoothed.state, filtered.loglik
+        return posterior, read
 
-    each, state, loglik = jax.vmap(one)(here, data)
-    fine = used & jnp.isfinite(loglik) & jnp.all(jnp.isfinite(each.information), axis=(1, 2))
-    fine = fine & jnp.all(jnp.isfinite(each.score), axis=1) & jnp.all(jnp.isfinite(each.noise_score), axis=1)
-    pick = lambda a: jnp.where(fine.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
-    total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
-    first = jax.tree.map(lambda a: pick(a[:, 0]), state)
-    following, hessian = rule.advance(core, weights, total, first, fine)
-    known = jnp.isfinite(loglik) & jnp.all(jnp.isfinite(state.mean), axis=(1, 2))  # those left out of the fit too
+    posterior, read = jax.vmap(one)(here, data)
+    state = posterior.state
+    known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(state.mean), axis=(1, 2))
     steady = jax.tree.map(lambda new, old: jnp.where(known.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path)
-    return following, steady, loglik, hessian
-
-
-def _anonymous(rule: ScoringMStep) -> tuple[ScoringMStep, int]:
-    """`rule` without the names of its parameters, and how many it was padded with."""
-    count = rule.prior.size
-    pad = -count % BLOCK
-    mean, std = jnp.pad(rule.prior.mean, (0, pad)), jnp.pad(rule.prior.std, (0, pad), constant_values=1.0)
-    names = tuple(str(i) for i in range(count + pad))
-    return eqx.tree_at(lambda r: r.prior, rule, ParameterPrior(names, mean, std)), pad
+    return posterior, read, steady
 
 
 def refit(
@@ -94,26 +68,18 @@ def refit(
 
     Without `noise` the process and reading noise stay as they are.
     """
-    rule, pad = _anonymous(m_step)
-    rule = eqx.tree_at(lambda r: r.stride, rule, jnp.asarray(rule.stride if noise else 0.0))
-    weights = m_step.weights(model)
+    rule = eqx.tree_at(lambda r: r.stride, m_step, jnp.asarray(m_step.stride if noise else 0.0))
+    core = rule.core(model)
 
-    def program(core: Core, model, path):
-        here = _locals(model, m_step.prior, path, data)
-        widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
-        here = here._replace(
-            by_parameter=widen(here.by_parameter), reading_by_parameter=widen(here.reading_by_parameter)
-        )
-        return _pass(rule, core, here, path, data, jnp.asarray(used))
+    def program(core: Core, path: Gaussian):
+        here = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
+        posterior, read, steady = _smoothed(core, here, path, data)
+        following, hessian, _ = rule.advance(core, here, posterior, read, data, jnp.asarray(used))
+        return following, steady, posterior.loglik, hessian
 
-    def whole(core: Core):
-        w = core.w[: core.w.shape[0] - pad] if pad else core.w
-        return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), weights.write(model, w), core[2:])
-
-    core = Core(model.unknown, jnp.pad(weights.read(model), (0, pad)), model.log_q, model.log_r, model.start)
     best, stride, here, goal = None, 1.0, core, core
     for _ in range(passes):
-        proposal, smoothed, loglik, hessian = program(core, whole(core), path)
+        proposal, smoothed, loglik, hessian = program(core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:
             if best is None or total > best[0]:
@@ -126,5 +92,4 @@ def refit(
         core = jax.tree.map(way, here, goal)
     assert best is not None
     _, core, loglik, hessian, path = best
-    kept = hessian.shape[0] - pad
-    return Trial(whole(core), m_step, path, loglik, hessian[:kept, :kept])
+    return Trial(rule.whole(model, core), m_step, path, loglik, hessian)

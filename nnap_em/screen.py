@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from .data import Dataset, fill_missing
 from .effects import AbstractEffect, Candidate, Scene
 from .gaussian import Gaussian
-from .kalman import TANGENT, kalman_filter
+from .kalman import CUBATURE, kalman_filter
 from .model import StateSpaceModel
-from .mstep import Local, ParameterPrior, Weights, friction_columns, local, whitened_sensitivities
+from .mstep import Local, Weights, friction_columns, locals_along, whitened_sensitivities
 from .ode import integrate
 from .smoother import active_steps
 
@@ -28,7 +28,8 @@ from .smoother import active_steps
 class Track(NamedTuple):
     """What candidates see of a fitted model along the smoothed path of a sequence, whatever its structure."""
 
-    local: Local
+    x: Float[Array, "*time state"]
+    """(q, v) in every row."""
     middle: Float[Array, "*time state"]
     """State (q, v) in the middle of every step."""
     acceleration: Float[Array, "*time dof"]
@@ -37,6 +38,8 @@ class Track(NamedTuple):
     """Time derivative of (q, v) in every row."""
     u: Float[Array, "*time input"]
     """What reaches the joints."""
+    t: Float[Array, "*time"]
+    """[s]"""
 
 
 class Columns(NamedTuple):
@@ -70,29 +73,28 @@ class Verdict(NamedTuple):
 
 
 @eqx.filter_jit
-def tracks(null: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Track:
-    """The local models along the paths of all sequences."""
+def tracks(null: StateSpaceModel, path: Gaussian, data: Dataset) -> Track:
+    """The smoothed motion of all sequences."""
     dof = len(null.system.coordinates)
     still = jnp.zeros(dof, path.mean.dtype)
 
-    def one(path: Gaussian, seq: Dataset):
+    def one(mean, seq: Dataset):
         u = null.inputs(seq)
-        rate = jax.vmap(lambda x, u: null.rate(x, u, still))  # the first row has no past
-        now = rate(path.mean, u)
-        middle = path.mean + 0.5 * null.dt * now
+        rate = jax.vmap(lambda x, u: null.rate(x, u, still))
+        now = rate(mean, u)
+        middle = mean + 0.5 * null.dt * now
         acceleration = rate(middle, u)[:, dof : 2 * dof]
-        here = local(null, prior, path, seq, TANGENT)
-        return Track(
-            here, middle[:, : 2 * dof], acceleration, now[:, : 2 * dof].at[0].set(0.0), u[:, : seq.u.shape[-1]]
-        )
+        past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
+        drive = u[:, : seq.u.shape[-1]]
+        return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, past, drive, jnp.asarray(seq.t))
 
-    return jax.vmap(one)(path, data)
+    return jax.vmap(one)(path.mean, data)
 
 
-def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene, x, seq: Dataset) -> Columns:
+def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
     """What `effect` adds, by its own hooks, to the machine `base` along a track."""
     system, substeps = base.system, max(effect.substeps, base.substeps)
-    u = track.u
+    u, x = track.u, track.x
     if effect.joint in system.joints:
         i = system.joints.index(effect.joint)
         u = u.at[:, i].set(effect.input(u[:, i], base.dt))
@@ -135,39 +137,39 @@ def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractE
     places: dict = {}
     for i, probe in enumerate(probes):
         places.setdefault(jax.tree.structure(probe), []).append(i)
-    stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
+
+    def stack(*leaves):  # by NumPy: a stack of many small arrays would be one program for every number of them
+        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+
     return [(index, jax.tree.map(stack, *(probes[i] for i in index))) for index in places.values()]
 
 
 @eqx.filter_jit
-def _all_columns(base: StateSpaceModel, stacks, track: Track, path: Gaussian, data: Dataset) -> Columns:
+def _all_columns(base: StateSpaceModel, stacks, track: Track) -> list[Columns]:
     """Columns of all probes: the same program whatever the model has learned meanwhile."""
     dof = len(base.system.coordinates)
 
-    def one(track: Track, path: Gaussian, seq: Dataset):
+    def one(track: Track):
         q, v = track.middle[:, :dof], track.middle[:, dof:]
         drive, friction = jax.vmap(base.system.drive)(track.u), jax.vmap(base.unknown)(v)
-        scenes = Scene(None, q, v, drive, jnp.asarray(seq.t) + 0.5 * base.dt, friction, None)  # type: ignore[arg-type]
-        x = path.mean[:, : 2 * dof]
-        found = [jax.vmap(lambda e: _columns(base, e, track, scenes, x, seq))(stack) for stack in stacks]
-        return jax.tree.map(lambda *a: jnp.concatenate(a), *found)
+        scenes = Scene(None, q, v, drive, track.t + 0.5 * base.dt, friction, None)  # type: ignore[arg-type]
+        return [jax.vmap(lambda e: _columns(base, e, track, scenes))(stack) for stack in stacks]
 
-    return jax.vmap(one)(track, path, data)
+    return jax.vmap(one)(track)
 
 
 @eqx.filter_jit
-def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, data: Dataset):
+def _sheet(log_q, log_r, start, nodes, here: Local, middle, found: Columns, data: Dataset):
     dof = nodes.shape[0]
 
     def one(args):
-        track, found, seq = args
+        here, middle, found, seq = args
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
         active = active_steps(jnp.asarray(seq.valid))
-        here = track.local
         filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
         moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-        torque, _ = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(track.middle[:, dof:], here.by_force)
+        torque, _ = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
         of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
         states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
         readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
@@ -175,7 +177,7 @@ def _sheet(log_q, log_r, start, nodes, track: Track, found: Columns, data: Datas
         jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
         return jac.T @ filtered.innovation.ravel(), jac.T @ jac
 
-    return jax.lax.map(one, (track, found, data))
+    return jax.lax.map(one, (here, middle, found, data))
 
 
 def sheet(
@@ -185,14 +187,22 @@ def sheet(
     candidates: Sequence[Candidate],
     path: Gaussian,
     data: Dataset,
+    rows: int = 0,
 ) -> Sheet:
-    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects."""
+    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects.
+
+    Tracks are padded to `rows`, so that horizons share the largest program.
+    """
     probes = [probe for candidate in candidates for probe in candidate.probes]
     groups = _groups(probes)
-    track = tracks(null, weights.prior, path, data)
+    here = locals_along(null, weights.prior, path, data, CUBATURE)
+    track, length = tracks(null, path, data), data.t.shape[1]
     base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
-    found = _all_columns(base, [g for _, g in groups], track, path, data)
-    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, track, found, data)
+    more = [(0, 0), (0, max(0, rows - length))]
+    longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
+    found = _all_columns(base, [g for _, g in groups], jax.tree.map(longer, track))
+    every = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1)[:, :, :length], *found)
+    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, here, track.middle, every, data)
     score, information = (np.asarray(a) for a in outcome)
     nuisance = score.shape[1] - len(probes)
     order = np.argsort([i for index, _ in groups for i in index])

@@ -128,12 +128,7 @@ class GaussianSmoother(AbstractSmoother):
         return filtered, rts(filtered)
 
     def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray | None = None) -> Posterior:
-        filtered, smoothed = self.path(model, seq)
-        prev, following = pair_nodes(smoothed)
-        endless = jnp.full_like(filtered.loglik, jnp.inf)
-        affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-        kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
-        return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
+        return linear_posterior(*self.path(model, seq))
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
@@ -144,6 +139,15 @@ def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
 def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:
     """The cubature (sigma-point) filter with RTS smoother."""
     return GaussianSmoother(bank, Cubature(), **options)
+
+
+def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
+    """The posterior of a model that was linearised about a path."""
+    prev, following = pair_nodes(smoothed)
+    endless = jnp.full_like(filtered.loglik, jnp.inf)
+    affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
+    kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
+    return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
 
 
 def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:

@@ -25,7 +25,16 @@ def _a(value):
 
 
 def _spring(e):
-    return catalogue["torsional_spring"](_a(e["k"]), _a(e["k"] * e["theta0"]), e["joint"])
+    at, cube = e["theta0"], e["k"] * e.get("k3", 0.0)  # k (q - at) + cube (q - at)^3 in powers of q
+    moment = e["k"] * at + cube * at**3
+    slope = e["k"] + 3 * cube * at**2
+    return catalogue["torsional_spring"](_a(slope), _a(moment), _a(-3 * cube * at), _a(cube), e["joint"])
+
+
+def _bristle(e):
+    b = plant.drawn_friction(plant.Case(steps=STEPS, hidden=False, seed=3))[e["joint"] - 1]["b"]
+    numbers = (np.log(e["sigma0"]), 0.05 * np.sqrt(e["sigma0"]), b, 0.2, 1.0, 200.0)
+    return catalogue["presliding_friction"](*map(_a, numbers), e["joint"])
 
 
 def _cogging(e):
@@ -75,12 +84,13 @@ MAKE = {
     "sensor_delay": lambda e: catalogue["sensor_delay"](_a(e["delay"]), e["channel"]),
     "base_vibration": _shake,
     "payload_step": lambda e: catalogue["payload_step"](_a(e["mass"]), _a(e["time"]), e["joint"], 0.003),
+    "presliding_friction": _bristle,
     "eddy_brake": _eddy,
     "joint_flexibility": _flexible,
     "motor_back_emf": lambda e: catalogue["motor_back_emf"](_a(e["b"]), e["joint"]),
 }
 """The catalogue's effect of a simulator's one."""
-CRUDE = {"payload_step": 0.02, "sensor_delay": 0.02, "joint_flexibility": 0.03}
+CRUDE = {"payload_step": 0.02, "presliding_friction": 0.03, "sensor_delay": 0.02, "joint_flexibility": 0.03}
 """Share of the effect that may be missed where the model is approximate on purpose; .01 elsewhere."""
 
 
@@ -150,6 +160,15 @@ def test_moves_as_the_independent_simulator_says(name):
     assert np.all(missed[moved] < CRUDE.get(name, 0.01) * effect.max() + 1e-4), (missed, effect)
 
 
+def test_a_spring_that_stiffens():
+    effect = {"name": "torsional_spring", "joint": 2, "k": 0.04, "theta0": 0.3, "k3": 0.1}
+    case = plant.Case(effects=(effect,), steps=STEPS, hidden=False, seed=3)
+    made = MAKE["torsional_spring"](effect)
+    told, mine, without = _both(case, (made,))
+    assert np.abs(told - mine).max() < 0.01 * np.abs(told - without).max()
+    np.testing.assert_allclose([made.values()["k"], made.values()["theta0"]], [0.04, 0.3], rtol=1e-6)
+
+
 def test_slide_and_pendulum_know_their_effects():
     for system, effects in (("slide", "torsional_spring"), ("pendulum", "base_tilt")):
         effect = {"name": effects, "joint": 1, "k": 2.0, "theta0": 0.1, "angle": 0.2}
@@ -183,7 +202,7 @@ def test_absent_strength_is_no_effect():
     case = plant.Case(steps=20, hidden=False)
     model = _model(case)
     around = Around(
-        model.system, np.ones(2), 10 * np.ones(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
+        model.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
         ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), True, True,
     )  # fmt: skip
     x = jnp.asarray([0.3, -0.5, 2.0, -3.0])

@@ -234,7 +234,7 @@ def test_a_known_force_comes_back_within_its_standard_deviation():
 
 
 def test_adding_an_effect_back_gives_its_force():
-    spring = TorsionalSpring(jnp.asarray(0.8), jnp.asarray(0.24), 1)
+    spring = TorsionalSpring(*map(jnp.asarray, (0.8, 0.24, 0.0, 0.0)), 1)
     fitted, data, truth = _slide(lambda t, x, v: 0.24 - 0.8 * x)
     fitted = _with_kick(fitted, 1e-3)
     model = with_effects(fitted.model, (spring,))

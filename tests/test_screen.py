@@ -11,7 +11,7 @@ from nnap_em.build import build
 from nnap_em.data import Dataset, fill_missing
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import TANGENT, kalman_filter
+from nnap_em.kalman import CUBATURE, kalman_filter
 from nnap_em.model import with_effects
 from nnap_em.mstep import local
 from nnap_em.rig import Declared, Rig
@@ -51,7 +51,7 @@ def bench():
 def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
     """Whitened innovations of `model` linearised about a path, moved by what `full` does otherwise on that path."""
     y, observed = fill_missing(seq.y)
-    here = local(model, rule.prior, path, seq, TANGENT)
+    here = local(model, rule.prior, path, seq, CUBATURE)
     both = [jax.vmap(m.transition)(path.mean, m.inputs(seq)) for m in (full, model)]
     read = [jax.vmap(m.emission)(path.mean, m.inputs(seq)) for m in (full, model)]
     affine = here.affine._replace(offset=here.affine.offset + both[0] - both[1])

@@ -40,6 +40,8 @@ class Around(NamedTuple):
     """Typical torque of gravity and drive [N m]."""
     speed: Float[np.ndarray, " dof"]
     """Largest velocity [rad/s]."""
+    viscous: Float[np.ndarray, " dof"]
+    """Slope of the learned friction map at speed [N m s/rad]."""
     low: Float[np.ndarray, " dof"]
     """Smallest and largest coordinate on the smoothed paths [rad]."""
     high: Float[np.ndarray, " dof"]
@@ -69,7 +71,10 @@ class Candidate(NamedTuple):
 
 
 class AbstractEffect(eqx.Module):
-    """A law that the declared physics may lack.  Array fields are its parameters; the hooks say what it changes."""
+    """A law that the declared physics may lack.  The hooks say what it changes.
+
+    Array fields are its parameters, but for `known` ones.
+    """
 
     name: ClassVar[str]
     """Key of the vocabulary."""
@@ -137,9 +142,15 @@ class AbstractEffect(eqx.Module):
         return value
 
 
+def known(**options):
+    """A field with a number that no fit moves; an array all the same, so that another number is no other program."""
+    return eqx.field(converter=a, metadata={"known": True}, **options)
+
+
 def fields(effect: AbstractEffect) -> tuple[str, ...]:
     """Names of the parameters, in the order of a fit."""
-    return tuple(f.name for f in dataclasses.fields(effect) if eqx.is_array(getattr(effect, f.name)))
+    free = (f.name for f in dataclasses.fields(effect) if "known" not in f.metadata)
+    return tuple(name for name in free if eqx.is_array(getattr(effect, name)))
 
 
 def flat(effect: AbstractEffect) -> Float[Array, " param"]:
@@ -153,6 +164,6 @@ def at_joint(joint: int | None, value: Scalar, scene: Scene) -> Float[Array, " d
     return jnp.zeros_like(scene.v).at[joint - 1].set(value)
 
 
-def a(value: float) -> Scalar:
+def a(value: float | Scalar) -> Scalar:
     """A number as an array of the default precision."""
     return jnp.asarray(value, float)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 
-from .base import AbstractEffect, Around, Candidate, Scalar, a
+from .base import AbstractEffect, Around, Candidate, Scalar, a, known
 
 
 def varieties(around: Around, name: str) -> list[tuple[int, float]]:
@@ -75,7 +75,7 @@ class PayloadStep(AbstractEffect):
     mass: Scalar
     time: Scalar
     joint: int | None = eqx.field(static=True)
-    edge: float = eqx.field(static=True)
+    edge: Scalar = known()
     channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod

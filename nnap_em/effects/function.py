@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Candidate, at_joint
+from .base import AbstractEffect, Candidate, Scalar, a, at_joint
 from .position import joints
 
 
@@ -18,19 +18,19 @@ class Axis(eqx.Module):
     """One axis of the function: a sum of signals, and where its basis functions stand."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    low: float = eqx.field(static=True)
-    high: float = eqx.field(static=True)
+    low: Scalar = eqx.field(converter=a)
+    high: Scalar = eqx.field(converter=a)
     turns: bool = eqx.field(static=True)
     """True for an angle that goes round: the basis is periodic."""
     count: int = eqx.field(static=True)
 
-    def centres(self) -> Float[np.ndarray, " basis"]:
+    def centres(self) -> Float[Array, " basis"]:
         """Places of the basis functions."""
-        return np.linspace(self.low, self.high, self.count, endpoint=not self.turns)
+        return jnp.linspace(self.low, self.high, self.count, endpoint=not self.turns)
 
     def basis(self, value: Float[Array, ""]) -> Float[Array, " basis"]:
         """Basis functions at a value."""
-        centres = jnp.asarray(self.centres(), value.dtype)
+        centres = self.centres().astype(value.dtype)
         width = (self.high - self.low) / (self.count - (not self.turns))
         away = value - centres
         away = 2 * jnp.sin(0.5 * away) if self.turns else away

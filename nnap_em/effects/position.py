@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import AbstractEffect, Around, Candidate, Scalar, a, at_joint
+from .base import AbstractEffect, Around, Candidate, Scalar, a, at_joint, known
 
 
 def joints(around: Around) -> range:
@@ -18,7 +18,10 @@ def joints(around: Around) -> range:
 
 
 class TorsionalSpring(AbstractEffect):
-    """-k (theta_j - theta0)."""
+    """-k (theta_j - theta0), which may stiffen or soften with the angle.
+
+    Inside a cubic in the angle, which is linear in what is estimated: k is its slope where it pulls to neither side.
+    """
 
     name: ClassVar[str] = "torsional_spring"
     place: ClassVar[bool] = True
@@ -26,9 +29,14 @@ class TorsionalSpring(AbstractEffect):
         "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
     )
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
-    k: Scalar
+    slope: Scalar
+    """At zero [N m/rad]."""
     moment: Scalar
-    """k theta0 [N m]."""
+    """At zero [N m]."""
+    square: Scalar
+    """[N m/rad^2]"""
+    cube: Scalar
+    """[N m/rad^3]"""
     joint: int | None = eqx.field(static=True)
     channel: str | None = eqx.field(static=True, default=None)
 
@@ -38,19 +46,31 @@ class TorsionalSpring(AbstractEffect):
         for j in joints(around):
             reach = max(abs(around.low[j - 1]), abs(around.high[j - 1]), 1e-3)
             size = float(around.torque[j - 1]) / reach
-            start, probe = cls(a(0.0), a(0.0), j), cls(a(0.1 * size), a(0.0), j)
-            out.append(Candidate(start, (probe,), cls(a(size), a(size * reach), j)))
+            none = a(0.0)
+            start, probe = cls(none, none, none, none, j), cls(a(0.1 * size), none, none, none, j)
+            bend = 0.3 * size / reach
+            out.append(Candidate(start, (probe,), cls(a(size), a(size * reach), a(bend), a(bend / reach), j)))
         return out
 
     def values(self):
-        return {"k": self.k, "theta0": self.moment / jnp.where(self.k == 0, 1.0, self.k)}
+        at = self.moment / jnp.where(self.slope == 0, 1.0, self.slope)
+        for _ in range(3):  # Newton's steps to where it pulls to neither side
+            slope = self._slope(at)
+            at = at + self._pull(at) / jnp.where(slope == 0, 1.0, slope)
+        return {"k": self._slope(at), "theta0": at}
 
     def possible(self):
-        return float(self.k) > 0
+        return float(self.values()["k"]) > 0
+
+    def _pull(self, angle):
+        return self.moment - angle * (self.slope + angle * (self.square + angle * self.cube))
+
+    def _slope(self, angle):
+        return self.slope + angle * (2 * self.square + 3 * angle * self.cube)
 
     def force(self, scene, memory):
         assert self.joint is not None
-        return at_joint(self.joint, self.moment - self.k * scene.q[self.joint - 1], scene)
+        return at_joint(self.joint, self._pull(scene.q[self.joint - 1]), scene)
 
 
 class BaseTilt(AbstractEffect):
@@ -85,7 +105,7 @@ class Cogging(AbstractEffect):
     cosine: Scalar
     k: Scalar
     joint: int | None = eqx.field(static=True)
-    near: float = eqx.field(static=True, default=1.0)
+    near: Scalar = known(default=1.0)
     """Where k was found; far from there it is another law in disguise."""
     channel: str | None = eqx.field(static=True, default=None)
 
@@ -107,7 +127,7 @@ class Cogging(AbstractEffect):
         return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
 
     def possible(self):
-        return float(self.k) > 0.7 and abs(float(self.k) - self.near) < 0.3
+        return float(self.k) > 0.7 and abs(float(self.k) - float(self.near)) < 0.3
 
     def force(self, scene, memory):
         assert self.joint is not None
@@ -153,7 +173,7 @@ class HardStop(AbstractEffect):
     damping: Scalar
     """Log of the contact damping [N m s/rad]."""
     joint: int | None = eqx.field(static=True)
-    reach: float = eqx.field(static=True)
+    reach: Scalar = known()
     """Range of the joint on the paths; stops that nearly touch each other are a spring in disguise."""
     channel: str | None = eqx.field(static=True, default=None)
 
@@ -174,7 +194,7 @@ class HardStop(AbstractEffect):
         return out
 
     def possible(self):
-        return float(self.upper - self.lower) > 0.3 * self.reach
+        return float(self.upper - self.lower) > 0.3 * float(self.reach)
 
     def force(self, scene, memory):
         assert self.joint is not None

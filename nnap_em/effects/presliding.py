@@ -8,13 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import AbstractEffect, Candidate, Scalar, a, at_joint
+from .base import AbstractEffect, Candidate, Scalar, a, at_joint, known
 from .position import joints
 
 
 class PreslidingFriction(AbstractEffect):
-    """The LuGre bristle: s' = -sigma0 (w + |w| s / g(w)), whose rest over all motion is the learned map.
+    """The LuGre bristle: s' = -sigma0 (w + |w| s / g(w)), friction s + sigma1 s' / sigma0 - b w.
 
+    In steady sliding that is the learned map: g is what the map holds beyond its viscous part.
     [Canudas de Wit, Olsson, Astrom & Lischinsky 1995, eqs. 1 to 3, written in the bristle's torque s]
     """
 
@@ -24,10 +25,14 @@ class PreslidingFriction(AbstractEffect):
     memory: ClassVar[int] = 1
     linear: ClassVar[bool] = False
     log_sigma: Scalar
-    knee: float = eqx.field(static=True)
+    damping: Scalar
+    """sigma1 [N m s/rad]."""
+    viscous: Scalar
+    """b [N m s/rad]."""
+    knee: Scalar = known()
     """Speed [rad/s] below which the map is read at this speed: it is smooth near rest, the bristle is not."""
-    size: float = eqx.field(static=True)
-    fastest: float = eqx.field(static=True)
+    size: Scalar = known()
+    fastest: Scalar = known()
     """Largest relaxation rate that the integrator bears [1/s]."""
     joint: int | None = eqx.field(static=True)
     channel: str | None = eqx.field(static=True, default=None)
@@ -39,16 +44,19 @@ class PreslidingFriction(AbstractEffect):
         out = []
         for j in joints(around):
             size, knee = float(around.torque[j - 1]), 0.02 * float(around.speed[j - 1])
-            make = lambda log_s, j=j, knee=knee, size=size: cls(a(log_s), knee, size, 2.0 / around.dt, j)  # noqa: E731
-            for s in (2.0, 10.0):
-                out.append(Candidate(make(np.log(1e4 * size)), (make(np.log(s * size)),), make(1.0)))
+            rest = (knee, size, 2.0 / around.dt, j)
+            b, inner = float(around.viscous[j - 1]), 0.05 * size
+            spread = cls(a(1.0), a(inner), a(0.5 * b + 0.01 * size / float(around.speed[j - 1])), *rest)
+            for s in (0.5, 2.0, 8.0):
+                stiff, soft = (cls(a(np.log(k * size)), a(inner), a(b), *rest) for k in (1e4, s))
+                out.append(Candidate(stiff, (soft,), spread))
         return out
 
     def values(self):
         return {"sigma0": jnp.exp(self.log_sigma)}
 
     def memory_scale(self):
-        return jnp.asarray([0.1 * self.size])
+        return 0.1 * self.size[None]
 
     def _level(self, scene):
         assert self.joint is not None
@@ -56,11 +64,14 @@ class PreslidingFriction(AbstractEffect):
         fast = jnp.sign(v) * jnp.sqrt(v**2 + self.knee**2)
         away = scene.v.at[self.joint - 1].set(jnp.where(v == 0, self.knee, fast))
         torque = scene.map(away)[self.joint - 1] - scene.map(-away)[self.joint - 1]
-        return jnp.abs(0.5 * torque) + 1e-9
+        whole = jnp.abs(0.5 * torque)
+        return jnp.maximum(whole - self.viscous * jnp.abs(fast), 0.1 * whole) + 1e-9
 
     def force(self, scene, memory):
         assert self.joint is not None
-        return at_joint(self.joint, memory[0] - scene.friction[self.joint - 1], scene)
+        i = self.joint - 1
+        torque = memory[0] + self.damping * jnp.exp(-self.log_sigma) * self.drift(scene, memory)[0]
+        return at_joint(self.joint, torque - self.viscous * scene.v[i] - scene.friction[i], scene)
 
     def drift(self, scene, memory):
         assert self.joint is not None

@@ -2,6 +2,7 @@
 # (pyright takes equinox's abstract fields for fields of the constructor)
 """Forces of velocity, and friction that changes with position or time."""
 
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -136,6 +137,10 @@ class FrictionDrift(AbstractEffect):
         return torque.at[self.joint - 1].multiply(1 + self.change * grown)
 
 
+GRID = 64
+"""The number of frequencies is a multiple of this, so that few programs serve all durations."""
+
+
 class BaseVibration(AbstractEffect):
     """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
 
@@ -153,8 +158,8 @@ class BaseVibration(AbstractEffect):
         if around.system.shake(jnp.zeros(len(around.system.coordinates))) is None:
             return []
         span = around.duration[1] - around.duration[0]
-        step = max(0.4 / span, 8.0 / 400)
-        count = int(8.0 / step)
+        count = GRID * math.ceil(min(8.0 * span / 0.4, 400) / GRID)
+        step = 8.0 / count
         out = []
         for i in range(1, count + 1):
             start = cls(a(0.0), a(0.0), a(i * step))

@@ -13,7 +13,8 @@ from .augment import blocks
 from .effects import AbstractEffect, catalogue, fields, flat
 from .effects.function import UnknownFunction
 from .identify import Identified, friction_table
-from .loop import Closed, Key, key_of, rest_of
+from .look import Key, key_of, rest_of, words
+from .loop import Closed
 from .systems import AbstractSystem
 from .tables import state_unit
 
@@ -83,15 +84,6 @@ def units(effect: AbstractEffect, system: AbstractSystem) -> dict[str, str]:
             unit = "N s^2/m^2"
         out[name] = unit.replace("N m", "N").replace("rad", "m") if straight else unit
     return out
-
-
-def words(key: Key) -> str:
-    """An effect as a reader would call it."""
-    name, joint, channel, inputs = key
-    text = name.replace("_", " ")
-    if inputs:
-        text += f" of {' and '.join(inputs)}"
-    return text + (f" at joint {joint}" if joint else "") + (f" on {channel}" if channel else "")
 
 
 class Curve(NamedTuple):

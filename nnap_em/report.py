@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from . import __version__
 from . import diagnosis_plots as plots
 from .data import Logs
-from .diagnose import Finding, advice, curve, entry, friction_change, verdict, words
+from .diagnose import Finding, advice, curve, entry, friction_change, verdict
 from .identify import Identified, friction_table, parameter_table
+from .look import words
 from .loop import Closed
 from .page import Picture, page
 from .predict import HORIZONS, horizon_errors, predict

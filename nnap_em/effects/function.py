@@ -65,7 +65,7 @@ class UnknownFunction(AbstractEffect):
         for j in joints(around):
             size = float(around.torque[j - 1])
             for kinds in (*((name,) for name in single), *pairs):
-                count = 14 if len(kinds) == 1 else 6
+                count = 20 if len(kinds) == 1 else 6
                 axes = tuple(Axis(name, *limits[name], count) for name in kinds)
                 number = count ** len(kinds)
                 make = lambda w, axes=axes, j=j: cls(jnp.asarray(w, float), axes, j)  # noqa: E731

@@ -39,7 +39,8 @@ def _bristle(e):
 
 def _cogging(e):
     sine, cosine = (_a(e["amplitude"] * f(e["phase"])) for f in (np.cos, np.sin))
-    return catalogue["cogging"](sine, cosine, _a(e["k"]), e["joint"])
+    over = (e.get("amplitude2", 0.0) * f(e.get("phase2", 0.0)) for f in (np.cos, np.sin))
+    return catalogue["cogging"](sine, cosine, _a(e["k"]), e["joint"], e["k"], *over)
 
 
 def _eddy(e):
@@ -160,13 +161,20 @@ def test_moves_as_the_independent_simulator_says(name):
     assert np.all(missed[moved] < CRUDE.get(name, 0.01) * effect.max() + 1e-4), (missed, effect)
 
 
-def test_a_spring_that_stiffens():
-    effect = {"name": "torsional_spring", "joint": 2, "k": 0.04, "theta0": 0.3, "k3": 0.1}
-    case = plant.Case(effects=(effect,), steps=STEPS, hidden=False, seed=3)
-    made = MAKE["torsional_spring"](effect)
+@pytest.mark.parametrize(
+    ("name", "law"),
+    [
+        ("torsional_spring", {"k": 0.04, "theta0": 0.3, "k3": 0.1}),
+        ("cogging", {"amplitude": 0.03, "k": 4.0, "phase": 0.5, "amplitude2": 0.012, "phase2": 1.0}),
+    ],
+)
+def test_a_spring_that_stiffens_and_detents_with_an_overtone(name, law):
+    case = plant.Case(effects=({"name": name, "joint": 2, **law},), steps=STEPS, hidden=False, seed=3)
+    made = MAKE[name](case.effects[0])
     told, mine, without = _both(case, (made,))
     assert np.abs(told - mine).max() < 0.01 * np.abs(told - without).max()
-    np.testing.assert_allclose([made.values()["k"], made.values()["theta0"]], [0.04, 0.3], rtol=1e-6)
+    for key, value in made.values().items():
+        np.testing.assert_allclose(value, law[key], rtol=1e-6)
 
 
 def test_slide_and_pendulum_know_their_effects():

@@ -95,7 +95,7 @@ class BaseTilt(AbstractEffect):
 
 
 class Cogging(AbstractEffect):
-    """amplitude sin(k theta_j + phase)."""
+    """amplitude sin(k theta_j + phase), and an overtone of twice k: detents are seldom pure."""
 
     name: ClassVar[str] = "cogging"
     place: ClassVar[bool] = True
@@ -107,6 +107,8 @@ class Cogging(AbstractEffect):
     joint: int | None = eqx.field(static=True)
     near: Scalar = known(default=1.0)
     """Where k was found; far from there it is another law in disguise."""
+    sine2: Scalar = eqx.field(default=0.0, converter=a)
+    cosine2: Scalar = eqx.field(default=0.0, converter=a)
     channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
@@ -118,7 +120,7 @@ class Cogging(AbstractEffect):
             size = float(around.torque[j - 1])
             for k in (*np.arange(1.0, 8.1, 0.5), *range(9, 13), 14, 16, 18, 20, 24):
                 make = lambda sine, cosine, k=float(k), j=j: cls(a(sine), a(cosine), a(k), j, k)  # noqa: E731
-                spread = cls(a(0.5 * size), a(0.5 * size), a(0.1), j, float(k))
+                spread = cls(a(0.5 * size), a(0.5 * size), a(0.1), j, float(k), 0.1 * size, 0.1 * size)
                 out.append(Candidate(make(0.0, 0.0), (make(0.05 * size, 0.0), make(0.0, 0.05 * size)), spread))
         return out
 
@@ -132,7 +134,9 @@ class Cogging(AbstractEffect):
     def force(self, scene, memory):
         assert self.joint is not None
         angle = self.k * scene.q[self.joint - 1]
-        return at_joint(self.joint, self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle), scene)
+        tone = self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
+        tone = tone + self.sine2 * jnp.sin(2 * angle) + self.cosine2 * jnp.cos(2 * angle)
+        return at_joint(self.joint, tone, scene)
 
 
 class TorqueOffset(AbstractEffect):

@@ -45,10 +45,12 @@ class PreslidingFriction(AbstractEffect):
         for j in joints(around):
             size, knee = float(around.torque[j - 1]), 0.02 * float(around.speed[j - 1])
             rest = (knee, size, 2.0 / around.dt, j)
-            b, inner = float(around.viscous[j - 1]), 0.05 * size
-            spread = cls(a(1.0), a(inner), a(0.5 * b + 0.01 * size / float(around.speed[j - 1])), *rest)
-            for s in (0.5, 2.0, 8.0):
+            b = float(around.viscous[j - 1])
+            inertia = float(around.system.mass(jnp.zeros(len(around.system.coordinates)))[j - 1, j - 1])
+            for s in (0.5, 2.0, 8.0, 32.0):
+                inner = 0.4 * np.sqrt(s * size * inertia)  # a fifth of critical
                 stiff, soft = (cls(a(np.log(k * size)), a(inner), a(b), *rest) for k in (1e4, s))
+                spread = cls(a(1.0), a(inner), a(0.5 * b + 0.01 * size / float(around.speed[j - 1])), *rest)
                 out.append(Candidate(stiff, (soft,), spread))
         return out
 

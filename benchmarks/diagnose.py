@@ -4,7 +4,7 @@
     python benchmarks/diagnose.py --out out/diagnose --only strong:*:hidden --jobs 2
     python benchmarks/diagnose.py --out out/diagnose --table docs/diagnose_table.md     # the table of what is there
 
-A case is group:effect:view:seed.  Each leaves one JSON file in --out; a case that has one is not run again.
+A case is group:effect:view:seed; a whole name with another seed runs too.  Each leaves one JSON file in --out; a case that has one is not run again.
 """
 
 import argparse
@@ -227,7 +227,10 @@ def main() -> None:
         return
     set_up()
     first, step = map(int, args.share.split("/"))
-    names = [n for n in all_cases() if fnmatch.fnmatch(n, args.only if ":" in args.only else args.only + "*")]
+    pattern = args.only if ":" in args.only else args.only + "*"
+    names = [n for n in all_cases() if fnmatch.fnmatch(n, pattern)]
+    if not names and pattern.count(":") == 3:
+        names = [pattern]  # a case of another seed
     for name in names[first::step]:
         if (args.out / f"{name.replace(':', '_')}.json").exists():
             continue

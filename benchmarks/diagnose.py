@@ -4,7 +4,8 @@
     python benchmarks/diagnose.py --out out/diagnose --only strong:*:hidden --jobs 2
     python benchmarks/diagnose.py --out out/diagnose --table docs/diagnose_table.md     # the table of what is there
 
-A case is group:effect:view:seed; a whole name with another seed runs too.  Each leaves one JSON file in --out; a case that has one is not run again.
+A case is group:effect:view:seed; a whole name with another seed runs too.  Each leaves one JSON file in --out; a case
+that has one is not run again.
 """
 
 import argparse

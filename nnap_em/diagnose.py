@@ -191,6 +191,11 @@ def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: i
     if not ratios:
         return text + "."
     column, before, after = ratios[0]
+    if after >= before:
+        return (
+            f"The training data ask for {names}, but on test data the 1 s prediction error of {column} does not fall "
+            f"with it ({before:.3g} before, {after:.3g} after): do not trust it."
+        )
     return f"{text}; with it the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g} on test data."
 
 

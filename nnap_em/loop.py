@@ -171,6 +171,10 @@ def close(
             now, state = _needed(now, state, before, data, rules, say)
     if state is None:
         return Closed(before, before, (), tuple(steps))
+    gain = trimmed(np.nan_to_num(state.top, nan=-1e3) - np.nan_to_num(before.state.top, nan=-1e3))
+    if gain < bar(data, rules):
+        say(f"  over the whole length that gains {gain:.0f} nat only; nothing is kept of it")
+        return Closed(before, before, (), tuple(steps))
     after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))
     return Closed(before, after, now.found, tuple(steps))
 

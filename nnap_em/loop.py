@@ -172,7 +172,8 @@ def close(
     if state is None:
         return Closed(before, before, (), tuple(steps))
     gain = trimmed(np.nan_to_num(state.top, nan=-1e3) - np.nan_to_num(before.state.top, nan=-1e3))
-    if gain < bar(data, rules):
+    stepped = any(isinstance(e, SensorQuantization) for e in cast(StateSpaceModel, state.best).effects)
+    if gain < bar(data, rules) and not stepped:  # steps were read off the numbers themselves
         say(f"  over the whole length that gains {gain:.0f} nat only; nothing is kept of it")
         return Closed(before, before, (), tuple(steps))
     after = Identified(before.rig, state, now.m_step, before.bank.padded(state.best.log_q.shape[0]))

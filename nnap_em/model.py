@@ -81,18 +81,23 @@ class StateSpaceModel(AbstractModel):
         age = jnp.asarray(seq.t)[:, None] - jnp.asarray(seq.t)[:1, None]
         return jnp.concatenate([u, middle, before, age], axis=1)
 
-    def rate(
-        self, x: Float[Array, " state"], u: Float[Array, " input"], force: Float[Array, " dof"]
-    ) -> Float[Array, " state"]:
-        """Time derivative of the state under inputs u and an extra generalised force [N m]."""
-        dof, drives = force.shape[0], len(self.system.joints)
-        q, v, memory = x[:dof], x[dof : 2 * dof], x[2 * dof :]
+    def scene(self, x: Float[Array, " state"], u: Float[Array, " input"]) -> Scene:
+        """What the effects see at one moment."""
+        dof, drives = len(self.system.coordinates), len(self.system.joints)
+        q, v = x[:dof], x[dof : 2 * dof]
         time = u[drives] if self.effects else jnp.zeros((), x.dtype)
         system = self.system
         for effect in self.effects:
             system = effect.physics(system, time)
-        torque = self.unknown(v)
-        scene = Scene(system, q, v, system.drive(u[:drives]), time, torque, self.unknown)
+        return Scene(system, q, v, system.drive(u[:drives]), time, self.unknown(v), self.unknown)
+
+    def rate(
+        self, x: Float[Array, " state"], u: Float[Array, " input"], force: Float[Array, " dof"]
+    ) -> Float[Array, " state"]:
+        """Time derivative of the state under inputs u and an extra generalised force [N m]."""
+        dof = force.shape[0]
+        memory, scene = x[2 * dof :], self.scene(x, u)
+        system, q, v, torque = scene.system, scene.q, scene.v, scene.friction
         rates, place = [v], 2 * dof
         total = scene.drive + force - system.bias(q, v)
         rest = []

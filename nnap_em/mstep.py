@@ -56,6 +56,13 @@ class ParameterPrior(eqx.Module):
         shaped = [v.reshape(a.shape) for v, a in zip(values, places, strict=True)]
         return eqx.tree_at(self.places, model, shaped)
 
+    def held(self, model) -> Bool[np.ndarray, " param"]:
+        """Which of the numbers act as forces held over a step."""
+        pairs = [name.rpartition(".") for name in self.names]
+        kinds = [bool(at) and model.effects[int(at)].held for at, _, _ in pairs]
+        flags = [np.full(np.size(a), k) for a, k in zip(self.places(model), kinds, strict=True)]
+        return np.concatenate([np.zeros(0, bool), *flags])
+
     @property
     def size(self) -> int:
         """How many numbers are estimated."""
@@ -96,18 +103,31 @@ def local(
     model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, linearise: Tangent | Cubature = TANGENT
 ) -> Local:
     """The model of one sequence, linearised about the Gaussians of `path`, and its sensitivities at their means."""
-    value = prior.read(model)
+    value, held = prior.read(model), prior.held(model)
+    free = np.flatnonzero(~held)
     still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
     u = model.inputs(seq)
-    by_input = jax.jacfwd(lambda p: prior.write(model, p).inputs(seq))(value)
+    by_input = jax.jacfwd(lambda p: prior.write(model, value.at[free].set(p)).inputs(seq))(value[free])
 
     def tangents(x, u, slope):
         def both(force, p, u):
-            now = prior.write(model, p)
+            now = prior.write(model, value.at[free].set(p))
             return now.transition(x, u, force), now.emission(x, u)
 
-        moved, read = jax.jacfwd(both, argnums=(0, 1, 2))(still, value, u)
-        return moved[0], moved[1] + moved[2] @ slope, read[1] + read[2] @ slope
+        def pushed(p):
+            now = prior.write(model, value.at[held].set(p))
+            scene = now.scene(middle, u)
+            nothing = jnp.zeros(0, x.dtype)
+            return sum((e.force(scene, nothing) for e in now.effects if e.held), still)
+
+        moved, read = jax.jacfwd(both, argnums=(0, 1, 2))(still, value[free], u)
+        by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype)
+        by_parameter = by_parameter.at[:, free].set(moved[1] + moved[2] @ slope)
+        if held.any():
+            middle = x + 0.5 * model.dt * model.rate(x, u, still)
+            by_parameter = by_parameter.at[:, held].set(moved[0] @ jax.jacfwd(pushed)(value[held]))
+        of_reading = jnp.zeros((read[1].shape[0], value.shape[0]), x.dtype).at[:, free].set(read[1] + read[2] @ slope)
+        return moved[0], by_parameter, of_reading
 
     affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, u)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, u)

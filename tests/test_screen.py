@@ -140,3 +140,23 @@ def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
     assert tilt < 1e-6
     assert bias < 0.02
     assert spring > 0.2
+
+
+def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, monkeypatch):
+    """The short way to its sensitivities against differentiation through the whole step."""
+    rig, model, rule, data, path = bench
+    around = surroundings(rig, model, data, path)
+    one = next(c for c in catalogue["unknown_function"].candidates(around) if c.start.joint == 2)
+    full, wide = augment(model, rule, one.probes[3], one)
+    ways = []
+    for held in (True, False):
+        monkeypatch.setattr(catalogue["unknown_function"], "held", held)
+        ways.append(
+            local(full, wide.prior, path_of(path, 0), jax.tree.map(lambda a: a[0], data), CUBATURE).by_parameter
+        )
+    assert jnp.linalg.norm(ways[0] - ways[1]) < 0.02 * jnp.linalg.norm(ways[1])
+
+
+def path_of(path: Gaussian, i: int) -> Gaussian:
+    """That of one sequence."""
+    return Gaussian(path.mean[i], path.cov[i])

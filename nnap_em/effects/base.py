@@ -91,6 +91,9 @@ class AbstractEffect(eqx.Module):
     linear: ClassVar[bool] = True
     """False where a probe itself, not its multiple, is the place to start a fit from."""
 
+    held: ClassVar[bool] = False
+    """True for a force with many parameters: their sensitivity is that of a force held over the step."""
+
     joint: eqx.AbstractVar[int | None]
     """The joint that it acts on, counted from 1; None: all, or no joint."""
     channel: eqx.AbstractVar[str | None]

@@ -42,6 +42,7 @@ class UnknownFunction(AbstractEffect):
 
     name: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Repeat the motion with what stands under suspicion taken off."
+    held: ClassVar[bool] = True
     weights: Float[Array, " basis"]
     axes: tuple[Axis, ...]
     joint: int | None = eqx.field(static=True)

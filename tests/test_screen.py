@@ -148,6 +148,7 @@ def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, monkeyp
     around = surroundings(rig, model, data, path)
     one = next(c for c in catalogue["unknown_function"].candidates(around) if c.start.joint == 2)
     full, wide = augment(model, rule, one.probes[3], one)
+    seq, at = jax.tree.map(lambda a: a[0], data), jax.tree.map(lambda a: a[0], path)
     ways = []
     for held in (True, False):
         monkeypatch.setattr(catalogue["unknown_function"], "held", held)
@@ -155,8 +156,3 @@ def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, monkeyp
             local(full, wide.prior, path_of(path, 0), jax.tree.map(lambda a: a[0], data), CUBATURE).by_parameter
         )
     assert jnp.linalg.norm(ways[0] - ways[1]) < 0.02 * jnp.linalg.norm(ways[1])
-
-
-def path_of(path: Gaussian, i: int) -> Gaussian:
-    """That of one sequence."""
-    return Gaussian(path.mean[i], path.cov[i])

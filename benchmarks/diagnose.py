@@ -14,6 +14,7 @@ import json
 import math
 import os
 import platform
+import subprocess
 import sys
 import tempfile
 import time
@@ -94,7 +95,7 @@ def case_of(name: str) -> plant.Case:
 def run(name: str, out: Path) -> None:
     """One case: the loop, the errors on test/ before and after, and those of one who knows the truth."""
     case = case_of(name)
-    record: dict[str, Any] = {"case": name, "truth": list(case.effects), "log": []}
+    record: dict[str, Any] = {"case": name, "truth": list(case.effects), "log": [], "code": _commit()}
     with tempfile.TemporaryDirectory() as rig_folder:
         folder = Path(rig_folder)
         plant.write(case, folder)
@@ -111,6 +112,14 @@ def run(name: str, out: Path) -> None:
         record |= {"effects": [entry(f) for f in found], "error": error, "oracle": plant.oracle_errors(case, folder)}
     out.mkdir(parents=True, exist_ok=True)
     replace_text(out / f"{name.replace(':', '_')}.json", json.dumps(record))
+
+
+def _commit() -> str:
+    """The commit that is run; empty outside a clone."""
+    told = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+    )
+    return told.stdout.strip()
 
 
 def judged(record: dict[str, Any]) -> dict[str, Any]:
@@ -158,8 +167,9 @@ def table(out: Path) -> str:
     """What the files in `out` say, as Markdown."""
     rows = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     lines = [
-        "| case | found | parameters (truth) | right | error before / after / with the true effect [rad, 1 s] | s |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| case | found | parameters (truth) | right | error before / after / with the true effect [rad, 1 s] | s "
+        "| code |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[str, list[dict[str, Any]]] = {}
     for record in rows:
@@ -180,7 +190,8 @@ def table(out: Path) -> str:
         mark = "yes" if score["right"] and not score["extras"] else "with extras" if score["right"] else "**no**"
         lines.append(
             f"| {group} {effect} {view} | {found} | {values} ({true}) | {mark} | "
-            f"{score['before']:.3g} / {score['after']:.3g} / {score['oracle']:.3g} | {record['seconds']:.0f} |"
+            f"{score['before']:.3g} / {score['after']:.3g} / {score['oracle']:.3g} | {record['seconds']:.0f} "
+            f"| {record.get('code', '')} |"
         )
     summary = [
         "| group | cases | named right | false or extra | parameters within 15 % | truth inside 2 std "

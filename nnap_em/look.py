@@ -171,9 +171,9 @@ def _best_of_kind(
     return sorted(best.values(), key=lambda entry: -entry[0])
 
 
-def _shortlist(ranked, present: set[Key], model: StateSpaceModel, rules: Rules):
+def _shortlist(ranked, present: set[Key], model: StateSpaceModel, needed: float, rules: Rules):
     """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
-    fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > rules.margin / 2]
+    fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > needed]
     fresh = [entry for entry in fresh if not _told(entry[1].start, model)]
     named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
     top = named[0][0] if named else 0.0
@@ -245,12 +245,13 @@ def look(
     verdicts = judge(projected, candidates)
     ranked = _best_of_kind(candidates, verdicts, data)
     present = {key_of(effect) for effect in now.model.effects}
-    entries = _shortlist(ranked, present, now.model, rules)
+    entries = _shortlist(ranked, present, now.model, 0.5 * bar(data, rules), rules)
     step = Step(length, tuple((key_of(c.start), net) for net, c, _ in ranked), (), None, len(candidates))
     if not entries:
         return step, [], None
     null = refit(now.model, now.m_step.early(), path, data, used, passes=rules.passes)
-    entries += _more_starts(entries, candidates, verdicts, rules)
+    if data.t.shape[1] < rows:  # over a long horizon a start that is far off loses every track
+        entries += _more_starts(entries, candidates, verdicts, rules)
     tried: list[Refitted] = []
     for candidate, verdict in entries:
         trial = _try(now, path, data, used, candidate, verdict, rules)

@@ -235,7 +235,9 @@ def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
     known = np.asarray(used) > 0
     known = known & np.isfinite(sheet.score).all(axis=1) & np.isfinite(sheet.information).all(axis=(1, 2))
     score = np.einsum("s,sc->c", used[known], sheet.score[known])
-    information = np.einsum("s,scd->cd", used[known], sheet.information[known])
+    information = np.zeros(sheet.information.shape[1:])
+    for s in np.flatnonzero(known):  # one by one: the whole is large
+        information += used[s] * sheet.information[s]
     n = sheet.nuisance
     factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
     half = np.linalg.solve(factor, information[:n, n:])

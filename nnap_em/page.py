@@ -102,7 +102,7 @@ def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
     effects = document.get("effects") or []
     parts = [
         _head(document),
-        _section("What was found, and how sure", _found(effects) + drawn("found")),
+        _section("What was found, and how sure", _found(effects, _doubted(document)) + drawn("found")),
         _section("Before and after" if effects else "Prediction error", _before_after(document) + drawn("error")),
         _section("What the declared model leaves unexplained", drawn("residual")),
         _section("What could not be told apart", _alike(effects)),
@@ -282,7 +282,19 @@ def _fails(test: Mapping[str, Any]) -> bool:
     return _finite(p) and p < LEVEL  # type: ignore[operator]
 
 
-def _found(effects: Sequence[Mapping[str, Any]]) -> str:
+def _doubted(document: Mapping[str, Any]) -> bool:
+    """Whether the test sequences speak against what was found."""
+    error = document.get("error") or {}
+    horizons = error.get("horizons_s") or []
+    if 1.0 not in horizons or not document.get("effects"):
+        return False
+    at = horizons.index(1.0)
+    pairs = [(error["before"][c][at], error["after"][c][at]) for c in error["before"] if c in error["after"]]
+    known = [(b, a) for b, a in pairs if _finite(b) and _finite(a)]
+    return bool(known) and known[0][1] >= known[0][0]
+
+
+def _found(effects: Sequence[Mapping[str, Any]], doubted: bool) -> str:
     if not effects:
         return (
             "<p>No effect of the catalogue, and no unknown force, improves the model by more than chance would. "
@@ -292,10 +304,10 @@ def _found(effects: Sequence[Mapping[str, Any]]) -> str:
         '<p class="evidence">nat: the unit of log-likelihood; every 2.3 nat make the data ten times as likely. '
         "±: one standard deviation.</p>"
     )
-    return f'<div class="cards">{"".join(_card(e) for e in effects)}</div>{note}'
+    return f'<div class="cards">{"".join(_card(e, doubted) for e in effects)}</div>{note}'
 
 
-def _card(effect: Mapping[str, Any]) -> str:
+def _card(effect: Mapping[str, Any], doubted: bool) -> str:
     name = str(effect.get("name") or "")
     told = [MEANINGS.get(name, "")]
     description = str(effect.get("description") or "")
@@ -312,7 +324,9 @@ def _card(effect: Mapping[str, Any]) -> str:
     table = f"<dl>{''.join(rows)}</dl>" if rows else ""
     text = "".join(f"<p>{escape(t)}</p>" for t in told if t)
     title = label(effect)
-    return f"<article><h3>{escape(title[:1].upper() + title[1:])}</h3>{text}{table}{_evidence(effect)}</article>"
+    return (
+        f"<article><h3>{escape(title[:1].upper() + title[1:])}</h3>{text}{table}{_evidence(effect, doubted)}</article>"
+    )
 
 
 def _entry(entry: Any) -> tuple[Any, Any, Any]:
@@ -324,7 +338,7 @@ def _entry(entry: Any) -> tuple[Any, Any, Any]:
     return entry, None, None
 
 
-def _evidence(effect: Mapping[str, Any]) -> str:
+def _evidence(effect: Mapping[str, Any], doubted: bool) -> str:
     evidence = effect.get("evidence") or {}
     gain, held, p = (evidence.get(k) for k in ("log_likelihood_gain", "held_out_gain", "p_value"))
     lines = []
@@ -332,6 +346,7 @@ def _evidence(effect: Mapping[str, Any]) -> str:
     if decisive is not None and _finite(decisive):
         steps = ((100, "beyond doubt"), (30, "very sure"), (10, "sure"), (3, "likely"))
         word = next((w for least, w in steps if decisive >= least), "a hint only")
+        word = "doubtful: the test sequences are predicted no better with it" if doubted else word
         lines.append(f'<span class="sure">{escape(word[0].upper() + word[1:])}.</span>')
     if _finite(gain):
         lines.append(f"The training data speak for it with {number(gain, 3)} nat.")

@@ -4,11 +4,14 @@ import csv
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
 
 from nnap_em import cli, close_the_loop, findings, load, read_logs, read_rig, specs
+from nnap_em.diagnose import Finding, verdict
+from nnap_em.effects import catalogue
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
@@ -94,3 +97,13 @@ def _table(path):
     with path.open() as file:
         rows = list(csv.DictReader(file))
     return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+
+
+def test_the_verdict_claims_a_fall_only_where_there_is_one():
+    """The same finding with a test error that falls, that rises, and that nobody knows."""
+    effect = catalogue["payload"](jnp.zeros(()), 2)
+    found = [Finding(effect, {}, {}, (), "payload")]
+    error = {"horizons_s": [1.0], "before": {"theta1": [0.2]}, "after": {"theta1": [0.1]}}
+    assert "falls from 0.2 to 0.1" in verdict(found, error)
+    assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
+    assert verdict(found, None) == "The model lacks payload at joint 2."

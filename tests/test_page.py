@@ -185,3 +185,10 @@ def test_label():
     assert label({"name": "unknown_function", "joint": 1, "inputs": ["theta1", "u"]}) == (
         "unknown function of theta1 and u at joint 1"
     )
+
+
+def test_what_the_test_sequences_do_not_bear_out_is_doubted():
+    error = WHOLE["error"] | {"after": {"theta1": [0.3, 0.9], "dtheta1": [1.0, None]}}
+    assert "Doubtful" in page(WHOLE | {"error": error})
+    assert "Doubtful" not in page(WHOLE)
+    assert "Beyond doubt" in page(WHOLE)

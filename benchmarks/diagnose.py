@@ -14,6 +14,7 @@ import json
 import math
 import os
 import platform
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -206,7 +207,7 @@ def table(out: Path) -> str:
         summary.append(
             f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} "
             f"| {_share(inside)} | {_middle(share):.2f} "
-            f"| {_middle(ratio):.2f}, {ratio[int(0.9 * (len(ratio) - 1))]:.2f} | "
+            f"| {_middle(ratio):.2f}, {ratio[math.ceil(0.9 * len(ratio)) - 1]:.2f} | "
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
     head = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}."
@@ -223,7 +224,7 @@ def _share(flags: list[bool]) -> str:
 
 
 def _middle(values: list[float]) -> float:
-    return values[len(values) // 2] if values else math.nan
+    return statistics.median(values) if values else math.nan
 
 
 def main() -> None:

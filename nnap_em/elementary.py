@@ -25,8 +25,11 @@ def sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Arr
 
     Other types fall back on `jax.numpy`.
     """
-    if x.dtype not in TERMS:
-        return jnp.sin(x), jnp.cos(x)
+    return _pair(x) if x.dtype in TERMS else (jnp.sin(x), jnp.cos(x))
+
+
+@jax.jit  # traced once, not for every sine of a model
+def _pair(x):
     quarter = jnp.round(x * (2 / math.pi))
     for part in PARTS[x.dtype]:
         x = x - quarter * part

@@ -439,7 +439,7 @@ class ScoringMStep(AbstractMStep):
     nodes: int = eqx.field(static=True, default=41)
     ridge: float = 1.0
     iterations: int = eqx.field(static=True, default=200)
-    stride: float = 1.5
+    stride: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
     """Largest change of a log variance in one step."""
     tie: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
     """Precision with which the ratios of the joints' process noises are held to those of the first model.

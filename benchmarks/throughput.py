@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="of the text; the whole of a full run goes to docs/throughput.md")
     args = parser.parse_args()
     size = (3, 60, 200) if args.quick else (20, 500, 1000)
-    repeats, budget = (3, 0.0) if args.quick else (7, 15.0)
+    repeats, budget = (3, 0.0) if args.quick else (7, 5.0)
     cpus = sorted(os.sched_getaffinity(0))
     full = not args.quick and set(args.only) == set(kinds)
     out = args.out or (root / "docs" / "throughput.md" if full else None)

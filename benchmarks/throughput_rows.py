@@ -109,7 +109,7 @@ def quality(case: Case, result) -> dict:
 
 
 def speed(group: str, size: list[int], quick: bool, repeats: int, budget: float) -> list[dict]:
-    """Times of all rows of a group in turn: at least 3 rounds, then until `repeats` or `budget` [s] of each row."""
+    """Times of all rows of a group in turn: 3 rounds, then until `repeats` or `budget` [s] of each row."""
     rows, runs, times = [], [], []
     for case in filter(installed, groups(Size(*size), quick)[group]):
         common_logs(case.size)
@@ -118,11 +118,11 @@ def speed(group: str, size: list[int], quick: bool, repeats: int, budget: float)
         compile_s = time.perf_counter() - began
         first, result = seconds(runs[-1])
         say(f"  {case.who}: {case.what}: {compile_s:.1f} s to compile, {1e3 * first:.0f} ms")
-        times.append([])
+        times.append([first])
         rows.append({"who": case.who, "what": case.what, "size": case.size, "compile": compile_s})
         rows[-1] |= quality(case, result)
         del result
-    for turn in range(repeats):
+    for turn in range(1, repeats):
         for run, spent in zip(runs, times, strict=True):
             if turn < 3 or sum(spent) < budget:
                 spent.append(seconds(run)[0])

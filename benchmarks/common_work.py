@@ -17,6 +17,7 @@ import numpy as np
 
 from nnap_em.data import Dataset
 from nnap_em.em import e_step
+from nnap_em.friction import AbstractJointMap
 from nnap_em.gaussian import Gaussian
 from nnap_em.model import StateSpaceModel
 from nnap_em.particle import (
@@ -51,13 +52,19 @@ class Network(NamedTuple):
         return self.last @ jnp.tanh(self.second @ hidden + self.second_bias) + self.last_bias
 
 
-class Networks(eqx.Module):
+class Networks(AbstractJointMap):
     """Torques of both joints."""
 
-    joints: tuple[Network, Network]
+    stacked: Network
+    """Weights with a leading joint axis."""
 
-    def __call__(self, v):
-        return jnp.stack([net(v[j]) for j, net in enumerate(self.joints)])
+    @property
+    def joints(self) -> tuple[Network, Network]:
+        """The networks one by one."""
+        return tuple(jax.tree.map(lambda a, j=j: a[j], self.stacked) for j in range(2))
+
+    def torque(self, v):
+        return jax.vmap(lambda net, v: net(v))(self.stacked, v)
 
 
 def friction_networks() -> Networks:
@@ -75,7 +82,7 @@ def friction_networks() -> Networks:
         weights = (first, first_bias, second, second_bias, last[:-1], last[-1])
         return Network(*(jnp.asarray(w, jnp.float32) for w in weights))
 
-    return Networks((fit(torque[:, 0]), fit(torque[:, 1])))
+    return Networks(jax.tree.map(lambda *a: jnp.stack(a), fit(torque[:, 0]), fit(torque[:, 1])))
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """The unknown term: one small network per joint from velocity to torque."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
@@ -11,7 +12,35 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .elementary import asinh
 
 
-class FrictionNetwork(eqx.Module):
+class AbstractJointMap(eqx.Module):
+    """Torques that each depend on their own joint's velocity only; their derivatives then cost one slope, not one pass
+    for every tangent.
+    """
+
+    @abstractmethod
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Torques [N m] at joint velocities [rad/s]."""
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        return _torque(self, v)
+
+
+@eqx.filter_custom_jvp
+def _torque(friction: AbstractJointMap, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    return friction.torque(v)
+
+
+@_torque.def_jvp
+def _torque_jvp(primals, tangents):
+    (friction, v), (by_weights, dv) = primals, tangents
+    torque, slope = jax.jvp(friction.torque, (v,), (jnp.ones_like(v),))
+    moved = jnp.zeros_like(torque) if dv is None else slope * dv
+    if jax.tree.leaves(by_weights):
+        moved = moved + eqx.filter_jvp(lambda f: f.torque(v), (friction,), (by_weights,))[1]
+    return torque, moved
+
+
+class FrictionNetwork(AbstractJointMap):
     """tau_f(v): joint velocities [rad/s] to joint torques [N m], a network for each joint.
 
     Each joint has features v / speed and asinh(v / knee), scaled to +-1 at `speed`, so that both the Stribeck
@@ -45,8 +74,10 @@ class FrictionNetwork(eqx.Module):
         self.knee = speed / resolution
         self.scale = scale
 
-    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        return _torque(self, v)
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        top = asinh(self.speed / self.knee)
+        features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)
+        return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
 
     def nodes(self, count: int) -> Float[Array, "dof count"]:
         """Velocities [rad/s], dense near rest, at which the map is tabulated in the M-step."""
@@ -62,28 +93,6 @@ class FrictionNetwork(eqx.Module):
         """This map with the weights replaced."""
         arrays, static = eqx.partition(self.mlp, eqx.is_inexact_array)
         return eqx.tree_at(lambda f: f.mlp, self, eqx.combine(ravel_pytree(arrays)[1](flat), static))
-
-
-def _plain_torque(friction: FrictionNetwork, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-    top = asinh(friction.speed / friction.knee)
-    features = jnp.stack([v / friction.speed, asinh(v / friction.knee) / top], axis=-1)
-    return friction.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(friction.mlp, features)
-
-
-@eqx.filter_custom_jvp
-def _torque(friction: FrictionNetwork, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-    return _plain_torque(friction, v)
-
-
-@_torque.def_jvp
-def _torque_jvp(primals, tangents):
-    """A torque moves with its own joint's velocity only: one slope for all tangents, and not a pass for each."""
-    (friction, v), (by_weights, dv) = primals, tangents
-    torque, slope = jax.jvp(lambda v: _plain_torque(friction, v), (v,), (jnp.ones_like(v),))
-    moved = jnp.zeros_like(torque) if dv is None else slope * dv
-    if jax.tree.leaves(by_weights):
-        moved = moved + eqx.filter_jvp(lambda f: _plain_torque(f, v), (friction,), (by_weights,))[1]
-    return torque, moved
 
 
 class FixedFriction(eqx.Module):

@@ -205,15 +205,16 @@ def rts(filtered: Filtered) -> Smoothed:
     """Rauch-Tung-Striebel smoother behind either filter."""
 
     def step(later: Gaussian, slices):
-        state, predicted, matrix = slices
-        gain = spd_solve(predicted.cov, matrix @ state.cov).T
+        state, predicted, gain = slices
         mean = state.mean + gain @ (later.mean - predicted.mean)
         cov = symmetric(state.cov + gain @ (later.cov - predicted.cov) @ gain.T)
-        return Gaussian(mean, cov), (Gaussian(mean, cov), gain)
+        return Gaussian(mean, cov), Gaussian(mean, cov)
 
     last = jax.tree.map(lambda a: a[-1], filtered.state)
     earlier = jax.tree.map(lambda a: a[:-1], filtered.state)
     predicted = jax.tree.map(lambda a: a[1:], filtered.predicted)
-    _, (states, gain) = jax.lax.scan(step, last, (earlier, predicted, filtered.affine.matrix[:-1]), reverse=True)
+    crossed = filtered.affine.matrix[:-1] @ earlier.cov
+    gain = jnp.swapaxes(jax.vmap(spd_solve)(predicted.cov, crossed), 1, 2)  # all times at once
+    _, states = jax.lax.scan(step, last, (earlier, predicted, gain), reverse=True)
     mean, cov = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, last)
     return Smoothed(Gaussian(mean, cov), gain)

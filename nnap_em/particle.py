@@ -380,6 +380,18 @@ def particle_filter(
     return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ahead, ancestors, leave, ess, loglik)
 
 
+def _exp2(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """2^x, in single precision to 3e-6 and at least 2^-126: a Taylor series times a power of two."""
+    if x.dtype != jnp.float32:
+        return jnp.exp2(x)
+    x = jnp.maximum(x, -126.0)
+    whole = jnp.round(x)
+    z = (x - whole) * math.log(2)
+    power = 1 + z * (1 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z / 120))))
+    shift = whole.astype(jnp.int32) << 23
+    return jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(power, jnp.int32) + shift, jnp.float32)
+
+
 class AbstractBackward(eqx.Module):
     """Draws the particle that a trajectory passes through at k, given where it is at k + 1."""
 
@@ -414,20 +426,30 @@ class ExactBackward(AbstractBackward):
     def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
         spare = -log_w.shape[0] % self.block
         centre = jnp.mean(f, axis=1, keepdims=True)  # or the squares below would cancel
-        x_next, f = x_next - centre, f - centre
-        logits = jnp.pad(log_w - 0.5 * jnp.sum(f**2, axis=0), (0, spare), constant_values=-jnp.inf)[None, :]
-        f = jnp.pad(f, ((0, 0), (0, spare)))
+        f = f - centre
+        x_next = (x_next - centre) / math.log(2)  # from here on logarithms are to base 2
+        level = jnp.maximum((log_w - 0.5 * jnp.sum(f**2, axis=0)) / math.log(2), -1e30)
+        level = jnp.pad(level, (0, spare), constant_values=-1e30).reshape(-1, self.block)
+        f = jnp.pad(f, ((0, 0), (0, spare))).reshape(f.shape[0], -1, self.block)
+
+        def weigh(_, particles):
+            f, level = particles
+            for i in range(f.shape[0]):
+                level = level + f[i][:, None] * x_next[i][None]
+            top = jnp.max(level, axis=0)
+            return None, (top, jnp.sum(_exp2(level - top[None]), axis=0))
+
+        _, (tops, sums) = jax.lax.scan(weigh, None, (jnp.swapaxes(f, 0, 1), level[:, :, None]))
+        top = jnp.max(tops, axis=0)
+        reach = _before((sums * _exp2(tops - top[None])).T, 0).T
+        target = uniform[0] * reach[-1]
+        outer = jnp.minimum(jnp.sum(reach <= target[None], axis=0), reach.shape[0] - 1)
+        before = jnp.take_along_axis(jnp.pad(reach, ((1, 0), (0, 0))), outer[None], axis=0)[0]
+        within = level[outer] - top[:, None]
         for i in range(f.shape[0]):
-            logits = logits + x_next[i][:, None] * f[i][None, :]
-        paths = x_next.shape[1]
-        w = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True)).reshape(paths, -1, self.block)
-        reach = jnp.cumsum(jnp.sum(w, axis=2), axis=1)
-        level = uniform[0] * reach[:, -1]
-        outer = jnp.minimum(jnp.sum(reach <= level[:, None], axis=1), reach.shape[1] - 1)
-        chosen = jnp.take_along_axis(w, outer[:, None, None], axis=1)[:, 0]
-        before = jnp.where(outer > 0, jnp.take_along_axis(reach, jnp.maximum(outer - 1, 0)[:, None], axis=1)[:, 0], 0.0)
-        within = jnp.cumsum(chosen, axis=1)
-        rest = jnp.minimum(level - before, within[:, -1] * (1 - jnp.finfo(level.dtype).eps))
+            within = within + f[i][outer] * x_next[i][:, None]
+        within = _before(_exp2(within), 0)
+        rest = jnp.minimum(target - before, within[:, -1] * (1 - jnp.finfo(target.dtype).eps))
         inner = jnp.sum(within <= rest[:, None], axis=1)
         return (outer * self.block + inner).astype(jnp.int32)
 

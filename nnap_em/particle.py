@@ -381,7 +381,7 @@ def particle_filter(
 
 
 def _exp2(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """2^x, in single precision to 3e-6 and at least 2^-126: a Taylor series times a power of two."""
+    """2^x, in single precision to 4e-6 and at least 2^-126: a Taylor series times a power of two."""
     if x.dtype != jnp.float32:
         return jnp.exp2(x)
     x = jnp.maximum(x, -126.0)

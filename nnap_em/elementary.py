@@ -73,3 +73,16 @@ def asinh(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def _asinh_jvp(primals, tangents):
     (x,), (dx,) = primals, tangents
     return asinh(x), dx * jax.lax.rsqrt(1 + x * x)
+
+
+@jax.custom_jvp
+def reciprocal(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """1 / x, whose derivative divides no second time."""
+    return 1 / x
+
+
+@reciprocal.defjvp
+def _reciprocal_jvp(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    inverse = reciprocal(x)
+    return inverse, -inverse * inverse * dx

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, fill_missing
-from .gaussian import Gaussian, cholesky, cubature, lower
+from .gaussian import Gaussian, cholesky, cubature, lower, product
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, linear_reading, rts
 from .model import AbstractModel
 
@@ -152,7 +152,7 @@ def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
     prev, following = pair_nodes(smoothed)
     endless = jnp.full_like(filtered.loglik, jnp.inf)
     affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-    kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
+    kick = following - (jnp.sum(affine.matrix * prev[..., None, :], axis=-1) + affine.offset)
     return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
 
 
@@ -163,10 +163,11 @@ def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Fl
         n = mean.shape[0]
         unit = cubature(2 * n, mean.dtype)
         later = lower(cholesky(cov_next))
-        rest = lower(cholesky(cov - gain @ cov_next @ gain.T + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
-        spread_next = unit[:, :n] @ later.T
+        left = cov - product(product(gain, cov_next), gain.T)
+        rest = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
+        spread_next = product(unit[:, :n], later.T)
         following = mean_next[None] + spread_next
-        return mean[None] + spread_next @ gain.T + unit[:, n:] @ rest.T, following
+        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], rest.T), following
 
     mean, cov = smoothed.state
     return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.elementary import asinh, cos, sin, sincos
+from nnap_em.elementary import asinh, cos, reciprocal, sin, sincos
 
 
 @pytest.mark.parametrize("turns", [1.0, 1e3])
@@ -32,8 +32,10 @@ def test_asinh():
     np.testing.assert_array_equal(asinh(-x), -asinh(x))
 
 
-@pytest.mark.parametrize(("mine", "reference"), [(sin, jnp.sin), (cos, jnp.cos), (asinh, jnp.arcsinh)])
+@pytest.mark.parametrize(
+    ("mine", "reference"), [(sin, jnp.sin), (cos, jnp.cos), (asinh, jnp.arcsinh), (reciprocal, jnp.reciprocal)]
+)
 def test_derivatives_both_ways_and_twice(mine, reference):
-    for x in jnp.linspace(-5.0, 5.0, 7):
+    for x in jnp.linspace(-5.0, 5.0, 8):
         for derive in (jax.jacfwd, jax.grad, lambda f: jax.grad(jax.jacfwd(f))):
             np.testing.assert_allclose(derive(mine)(x), derive(reference)(x), rtol=1e-13, atol=1e-15)

@@ -11,7 +11,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +29,7 @@ from .identify import FrictionTable, Identified, begin, friction_table, identify
 from .law import PARAMETERS, UNITS, describe, fit_law
 from .loop import close_the_loop
 from .model import StateSpaceModel
+from .parallel import use_every_device
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
@@ -42,6 +43,8 @@ from .tables import state_unit, visited_nodes, write_friction, write_json
 MISTAKES = (RigError, DataError, StoreError, FitError)
 GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
+MOST = 64
+"""Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 Say = Callable[[str], None]
 """Where lines of progress go."""
 
@@ -58,8 +61,12 @@ class Epoch(NamedTuple):
 
 
 def set_up() -> None:
-    """64-bit numbers, and compiled programs kept for the next call if there is a place for them."""
+    """64-bit numbers, every core, and compiled programs kept for the next call if there is a place for them."""
     jax.config.update("jax_enable_x64", True)
+    if not jax.distributed.is_initialized():  # launch.py has dealt out the cores
+        with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
+            jax.config.update("jax_num_cpu_devices", min(MOST, len(os.sched_getaffinity(0))))
+        use_every_device()
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

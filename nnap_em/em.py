@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from .data import Dataset, horizon
 from .model import AbstractModel
 from .mstep import AbstractMStep, MStepInfo
+from .parallel import each
 from .smoother import AbstractSmoother, Posterior
 
 
@@ -59,11 +60,17 @@ class Schedule(eqx.Module):
         return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
 
 
-@eqx.filter_jit
 def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
-    """Smooth every sequence of `data`."""
-    keys = jax.random.split(key, data.t.shape[0])
-    return jax.vmap(lambda seq, key: smoother(model, seq, key=key))(data, keys)
+    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`."""
+    sequences, rows = data.t.shape
+    keys = jax.random.split(key, sequences)
+    together = max(1, smoother.room // (rows * smoother.bytes_per_row))
+    return each(_smooth, (model, smoother), (data, keys), together=together)
+
+
+def _smooth(common, one) -> Posterior:
+    (model, smoother), (seq, key) = common, one
+    return smoother(model, seq, key=key)
 
 
 def em_step(

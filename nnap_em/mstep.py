@@ -24,6 +24,7 @@ from .data import Dataset, fill_missing
 from .gaussian import Gaussian, spd_solve
 from .kalman import TANGENT, Affine, Cubature, Filtered, Reading, Tangent, kalman_filter, linear_reading
 from .model import AbstractModel, StateSpaceModel
+from .parallel import each
 from .smoother import Posterior, active_steps
 
 
@@ -142,12 +143,16 @@ def local(
     return Local(affine, reading, *jax.vmap(tangents)(path.mean, u, by_input))
 
 
-@eqx.filter_jit
 def locals_along(
     model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset, linearise: Tangent | Cubature
 ) -> Local:
     """`local` of every sequence: all of an M-step that is compiled anew for a model of another structure."""
-    return jax.vmap(lambda path, seq: local(model, prior, path, seq, linearise))(path, data)
+    return each(_local, (model, prior, linearise), (path, data))
+
+
+def _local(common, one) -> Local:
+    (model, prior, linearise), (path, seq) = common, one
+    return local(model, prior, path, seq, linearise)
 
 
 def readings_at(model: AbstractModel, posterior: Posterior, seq: Dataset) -> Float[Array, "time node obs"]:
@@ -156,9 +161,8 @@ def readings_at(model: AbstractModel, posterior: Posterior, seq: Dataset) -> Flo
     return jax.vmap(jax.vmap(model.emission, in_axes=(0, None)))(nodes, model.inputs(seq))
 
 
-@eqx.filter_jit
-def _all_readings(model, posterior: Posterior, data: Dataset) -> Float[Array, "seq time node obs"]:
-    return jax.vmap(lambda posterior, seq: readings_at(model, posterior, seq))(posterior, data)
+def _readings(model, one) -> Float[Array, "time node obs"]:
+    return readings_at(model, *one)
 
 
 def whitened_sensitivities(
@@ -409,19 +413,19 @@ BLOCK = 4
 """The number of parameters is padded to a multiple of this, for fewer programs."""
 
 
+def _quadratic(common, one) -> Quadratic:
+    (log_q, log_r, start, nodes), (here, posterior, read, seq) = common, one
+    return quadratic(log_q, log_r, start, here, nodes, posterior, read, seq)
+
+
 @eqx.filter_jit
-def _advance(rule: "ScoringMStep", core: Core, here: Local, posterior: Posterior, read, data: Dataset, used):
+def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian, loglik, used):
     weights = rule.weights(core)
-
-    def one(here, posterior, read, seq):
-        return quadratic(core.log_q, core.log_r, core.start, here, weights.nodes, posterior, read, seq)
-
-    each = jax.vmap(one)(here, posterior, read, data)
-    used = used & jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(each.information), axis=(1, 2))
-    used = used & jnp.all(jnp.isfinite(each.score), axis=1) & jnp.all(jnp.isfinite(each.noise_score), axis=1)
+    used = used & jnp.isfinite(loglik) & jnp.all(jnp.isfinite(terms.information), axis=(1, 2))
+    used = used & jnp.all(jnp.isfinite(terms.score), axis=1) & jnp.all(jnp.isfinite(terms.noise_score), axis=1)
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
-    total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), each)
-    first = jax.tree.map(lambda a: pick(a[:, 0]), posterior.state)
+    total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
+    first = jax.tree.map(pick, first)
     w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
     hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
     log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
@@ -462,7 +466,7 @@ class ScoringMStep(AbstractMStep):
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         here = locals_along(model, self.prior, posterior.state, data, self.linearise)
-        read = _all_readings(model, posterior, data)
+        read = each(_readings, model, (posterior, data))
         core = self.core(model)
         core, hessian, used = self.advance(core, here, posterior, read, data, kept(posterior, data))
         return self.whole(model, core), MStepInfo(hessian, used)
@@ -498,7 +502,11 @@ class ScoringMStep(AbstractMStep):
         here = here._replace(
             by_parameter=widen(here.by_parameter), reading_by_parameter=widen(here.reading_by_parameter)
         )
-        core, hessian, used = _advance(rule, core._replace(w=widen(core.w)), here, posterior, read, data, used)
+        common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
+        terms = each(_quadratic, common, (here, posterior, read, data))
+        first = jax.tree.map(lambda a: a[:, 0], posterior.state)
+        wide_core = core._replace(w=widen(core.w))
+        core, hessian, used = _advance(rule, wide_core, terms, first, posterior.loglik, used)
         wide = core.w.shape[0] - pad
         return core._replace(w=core.w[:wide]), hessian[:wide, :wide], used
 

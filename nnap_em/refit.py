@@ -16,7 +16,8 @@ from .data import Dataset, fill_missing
 from .gaussian import Gaussian
 from .kalman import CUBATURE, kalman_filter, rts
 from .model import StateSpaceModel
-from .mstep import Core, Local, ScoringMStep, locals_along
+from .mstep import Core, ScoringMStep, locals_along
+from .parallel import each
 from .smoother import Posterior, active_steps, linear_posterior
 
 
@@ -31,27 +32,18 @@ class Trial(NamedTuple):
     """Posterior precision of network weights and parameters."""
 
 
-@eqx.filter_jit
-def _smoothed(
-    core: Core, here: Local, path: Gaussian, data: Dataset
-) -> tuple[Posterior, Float[Array, "..."], Gaussian]:
+def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
     """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
-
-    def one(here: Local, seq: Dataset):
-        y, observed = fill_missing(seq.y)
-        observed = observed & seq.valid[:, None]
-        active = active_steps(jnp.asarray(seq.valid))
-        filtered = kalman_filter(core.log_q, core.log_r, core.start, here.affine, here.reading, y, observed, active)
-        posterior = linear_posterior(filtered, rts(filtered))
-        nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
-        read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
-        return posterior, read
-
-    posterior, read = jax.vmap(one)(here, data)
-    state = posterior.state
-    known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(state.mean), axis=(1, 2))
-    steady = jax.tree.map(lambda new, old: jnp.where(known.reshape(-1, *[1] * (new.ndim - 1)), new, old), state, path)
-    return posterior, read, steady
+    (log_q, log_r, start), (here, path, seq) = common, one
+    y, observed = fill_missing(seq.y)
+    observed = observed & seq.valid[:, None]
+    active = active_steps(jnp.asarray(seq.valid))
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
+    posterior = linear_posterior(filtered, rts(filtered))
+    nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
+    read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
+    known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(posterior.state.mean))
+    return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
 
 def refit(
@@ -73,7 +65,7 @@ def refit(
 
     def program(core: Core, path: Gaussian):
         here = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
-        posterior, read, steady = _smoothed(core, here, path, data)
+        posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (here, path, data))
         following, hessian, _ = rule.advance(core, here, posterior, read, data, jnp.asarray(used))
         return following, steady, posterior.loglik, hessian
 

@@ -20,8 +20,9 @@ from .effects import AbstractEffect, Candidate, Scene
 from .gaussian import Gaussian
 from .kalman import CUBATURE, kalman_filter
 from .model import StateSpaceModel
-from .mstep import Local, Weights, friction_columns, locals_along, whitened_sensitivities
+from .mstep import Weights, friction_columns, locals_along, whitened_sensitivities
 from .ode import integrate
+from .parallel import each
 from .smoother import active_steps
 
 
@@ -72,23 +73,23 @@ class Verdict(NamedTuple):
     """Multiples of the probes."""
 
 
-@eqx.filter_jit
 def tracks(null: StateSpaceModel, path: Gaussian, data: Dataset) -> Track:
     """The smoothed motion of all sequences."""
+    return each(_track, null, (path.mean, data))
+
+
+def _track(null: StateSpaceModel, one) -> Track:
+    mean, seq = one
     dof = len(null.system.coordinates)
-    still = jnp.zeros(dof, path.mean.dtype)
-
-    def one(mean, seq: Dataset):
-        u = null.inputs(seq)
-        rate = jax.vmap(lambda x, u: null.rate(x, u, still))
-        now = rate(mean, u)
-        middle = mean + 0.5 * null.dt * now
-        acceleration = rate(middle, u)[:, dof : 2 * dof]
-        past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
-        drive = u[:, : seq.u.shape[-1]]
-        return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, past, drive, jnp.asarray(seq.t))
-
-    return jax.vmap(one)(path.mean, data)
+    still = jnp.zeros(dof, mean.dtype)
+    u = null.inputs(seq)
+    rate = jax.vmap(lambda x, u: null.rate(x, u, still))
+    now = rate(mean, u)
+    middle = mean + 0.5 * null.dt * now
+    acceleration = rate(middle, u)[:, dof : 2 * dof]
+    past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
+    drive = u[:, : seq.u.shape[-1]]
+    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, past, drive, jnp.asarray(seq.t))
 
 
 def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
@@ -146,40 +147,32 @@ def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractE
     return [(index, jax.tree.map(stack, *(probes[i] for i in index))) for index in places.values()]
 
 
-@eqx.filter_jit
-def _all_columns(base: StateSpaceModel, stacks, track: Track) -> list[Columns]:
+def _all_columns(common, track: Track) -> list[Columns]:
     """Columns of all probes: the same program whatever the model has learned meanwhile."""
+    base, stacks = common
     dof = len(base.system.coordinates)
-
-    def one(track: Track):
-        q, v = track.middle[:, :dof], track.middle[:, dof:]
-        drive, friction = jax.vmap(base.system.drive)(track.u), jax.vmap(base.unknown)(v)
-        scenes = Scene(None, q, v, drive, track.t + 0.5 * base.dt, friction, None)  # type: ignore[arg-type]
-        return [jax.vmap(lambda e: _columns(base, e, track, scenes))(stack) for stack in stacks]
-
-    return jax.vmap(one)(track)
+    q, v = track.middle[:, :dof], track.middle[:, dof:]
+    drive, friction = jax.vmap(base.system.drive)(track.u), jax.vmap(base.unknown)(v)
+    scenes = Scene(None, q, v, drive, track.t + 0.5 * base.dt, friction, None)  # type: ignore[arg-type]
+    return [jax.vmap(lambda e: _columns(base, e, track, scenes))(stack) for stack in stacks]
 
 
-@eqx.filter_jit
-def _sheet(log_q, log_r, start, nodes, here: Local, middle, found: Columns, data: Dataset):
+def _sheet(common, one) -> tuple[Float[Array, " column"], Float[Array, "column column"]]:
+    """Score and information of one sequence."""
+    (log_q, log_r, start, nodes), (here, middle, found, seq) = common, one
     dof = nodes.shape[0]
-
-    def one(args):
-        here, middle, found, seq = args
-        y, observed = fill_missing(seq.y)
-        observed = observed & seq.valid[:, None]
-        active = active_steps(jnp.asarray(seq.valid))
-        filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
-        moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-        torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
-        of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
-        states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-        readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
-        states = jnp.where(active[:, None, None], states, 0.0)
-        jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
-        return jac.T @ filtered.innovation.ravel(), jac.T @ jac
-
-    return jax.lax.map(one, (here, middle, found, data))
+    y, observed = fill_missing(seq.y)
+    observed = observed & seq.valid[:, None]
+    active = active_steps(jnp.asarray(seq.valid))
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
+    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
+    of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
+    states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
+    readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
+    states = jnp.where(active[:, None, None], states, 0.0)
+    jac = whitened_sensitivities(filtered, states, readings, observed).reshape(-1, states.shape[-1])
+    return jac.T @ filtered.innovation.ravel(), jac.T @ jac
 
 
 def sheet(
@@ -202,9 +195,10 @@ def sheet(
     base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
     more = [(0, 0), (0, max(0, rows - length))]
     longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
-    found = _all_columns(base, [g for _, g in groups], jax.tree.map(longer, track))
+    found = each(_all_columns, (base, [g for _, g in groups]), jax.tree.map(longer, track))
     every = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1)[:, :, :length], *found)
-    outcome = _sheet(null.log_q, null.log_r, null.start, weights.nodes, here, track.middle, every, data)
+    common = (null.log_q, null.log_r, null.start, weights.nodes)
+    outcome = each(_sheet, common, (here, track.middle, every, data), together=1)  # a sequence fills the cache
     score, information = (np.asarray(a) for a in outcome)
     nuisance = score.shape[1] - len(probes)
     order = np.argsort([i for index, _ in groups for i in index])

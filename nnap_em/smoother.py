@@ -1,7 +1,7 @@
 """E-steps: p(x_{0:T} | y_{0:T}) of one sequence, in the one form that the M-step takes."""
 
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,6 +31,14 @@ class Posterior(NamedTuple):
 
 class AbstractSmoother(eqx.Module):
     """An E-step for one sequence."""
+
+    room: ClassVar[int] = 2**30
+    """Memory [B] that smoothing may take on a device beside its results."""
+
+    @property
+    @abstractmethod
+    def bytes_per_row(self) -> int:
+        """Memory [B] that a row of a sequence takes while it is smoothed."""
 
     @abstractmethod
     def __call__(self, model: AbstractModel, seq: Dataset, *, key: PRNGKeyArray) -> Posterior:
@@ -86,6 +94,10 @@ class GaussianSmoother(AbstractSmoother):
     """Relinearisations about the smoothed path."""
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
+
+    @property
+    def bytes_per_row(self) -> int:
+        return 8192  # measured for four states in 64 bits (docs/throughput.md)
 
     def path(self, model, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""

@@ -1,0 +1,110 @@
+"""Several processes for one command: `python -m nnap_em.launch 2 identify FOLDER --out OUT`.
+
+Every process does the same on its share of the sequences; the first one writes and speaks.  For several machines, start
+the same command on each with `--coordinator HOST:PORT --first K`, K being the number of processes before it and the
+first argument the number of all.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+
+def free_address() -> str:
+    """An address on this machine at which nobody listens."""
+    with socket.socket() as s:
+        s.bind(("localhost", 0))
+        return f"localhost:{s.getsockname()[1]}"
+
+
+def work(coordinator: str, count: int, index: int, threads: int, command: list[str]) -> None:
+    """One process: join the others, then run the command; all but the first into a folder that is thrown away."""
+    import jax
+
+    from . import cli, parallel
+
+    jax.config.update("jax_num_cpu_devices", threads)
+    jax.distributed.initialize(coordinator, count, index, initialization_timeout=60)
+    parallel.use_every_device()
+    if index == 0:
+        sys.exit(cli.main(command))
+    place = command.index("--out") + 1
+    out = Path(command[place])
+    with tempfile.TemporaryDirectory() as spare:
+        copy = Path(spare) / "out"
+        if out.is_dir():
+            shutil.copytree(out, copy)  # where --resume goes on
+        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+        sys.exit(cli.main([*command[:place], str(copy), *command[place + 1 :]]))
+
+
+def watch(children: list[subprocess.Popen], first: int) -> int:
+    """Wait for all; where one dies, end the others, which would wait for it for ever.  The exit status."""
+    try:
+        while any(child.poll() is None for child in children):
+            if any(child.poll() for child in children):
+                time.sleep(1.0)  # so that the message of the one that died is out
+                break
+            time.sleep(0.05)
+        return _blame(children, first) if any(child.returncode for child in children) else 0
+    finally:
+        for child in children:
+            if child.poll() is None:
+                child.kill()
+            child.wait()
+
+
+def _blame(children: list[subprocess.Popen], first: int) -> int:
+    codes = [child.poll() for child in children]
+    if codes[0] and codes[0] > 0:
+        return codes[0]  # it has said why
+    index = next(i for i, code in enumerate(codes) if code)
+    code = codes[index]
+    assert code is not None
+    cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+    print(
+        f"error: process {first + index} {cause}; the others were ended. The last checkpoint is whole: "
+        "give the same command with --resume",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def main() -> None:
+    """Start the processes of this machine."""
+    arguments = argparse.ArgumentParser(prog="python -m nnap_em.launch", description=__doc__)
+    arguments.add_argument("processes", type=int, help="how many in all")
+    arguments.add_argument("command", nargs=argparse.REMAINDER, help="a command of nnap-em with --out")
+    arguments.add_argument("--coordinator", help="host:port of the first process")
+    arguments.add_argument("--first", type=int, default=0, help="processes on machines before this one")
+    arguments.add_argument("--here", type=int, help="processes on this machine; all, if not given")
+    arguments.add_argument("--work", type=int, nargs=2, help=argparse.SUPPRESS)
+    args = arguments.parse_args()
+    if args.work:
+        index, threads = args.work
+        work(args.coordinator, args.processes, index, threads, args.command)
+        return
+    if "--out" not in args.command:
+        arguments.error("the command needs --out FOLDER")
+    here = args.here or args.processes
+    threads = max(1, len(os.sched_getaffinity(0)) // here)
+    address = args.coordinator or free_address()
+    children = []
+    for index in range(args.first, args.first + here):
+        order = ["--coordinator", address, "--work", str(index), str(threads), str(args.processes), *args.command]
+        children.append(subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *order]))
+    try:
+        sys.exit(watch(children, args.first))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""The same work for every sequence, over the devices of a mesh, in groups that bound the memory.
+
+    with over(all_devices()):
+        fitted = identify(rig, data, key=key)
+
+Sequences are independent but for sums in the M-step, so that nothing is exchanged while a program runs: results are
+gathered after it, within a machine by a copy, among processes (`jax.distributed`) by one collective.
+"""
+
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+AXIS = "seq"
+_mesh: contextvars.ContextVar[Mesh | None] = contextvars.ContextVar("nnap_em_mesh", default=None)
+
+
+@contextlib.contextmanager
+def over(mesh: Mesh) -> Iterator[None]:
+    """Spread sequences over `mesh`, which has one axis "seq", in what is called inside.
+
+    Raises ValueError where the mesh has other axes.
+    """
+    if mesh.axis_names != (AXIS,):
+        raise ValueError(f'the axes of the mesh are {mesh.axis_names}; make it with the one axis "{AXIS}"')
+    token = _mesh.set(mesh)
+    try:
+        yield
+    finally:
+        _mesh.reset(token)
+
+
+def all_devices() -> Mesh:
+    """Every device of every process."""
+    return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(jax.sharding.AxisType.Auto,))
+
+
+def use_every_device() -> None:
+    """Spread sequences over all devices from here on; commands and examples do."""
+    if jax.device_count() > 1:
+        _mesh.set(all_devices())
+
+
+def each(function: Callable, common: Any, batch: Any, *, together: int | None = None) -> Any:
+    """`function(common, one)` for every entry `one` along the first axis of the arrays in `batch`.
+
+    Compiled, and cached by `function`, which therefore stands at the top of its module.  At most `together` entries
+    are worked on at once by each device; without it, all are.
+    """
+    mesh = _mesh.get()
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((common, batch))):
+        mesh = None  # part of a larger program
+    count = next(leaf for leaf in jax.tree.leaves(batch) if eqx.is_array_like(leaf)).shape[0]
+    share = -(-count // (1 if mesh is None else mesh.size))
+    rounds = -(-share // (together or share))
+    group = -(-share // rounds)
+    whole = group * rounds * (1 if mesh is None else mesh.size)
+    if whole > count:  # what is over does the work of the last once more
+        index = np.minimum(np.arange(whole), count - 1)
+        batch = jax.tree.map(lambda a: a[index], batch)
+    if mesh is None:
+        out = _run(function, None, group, common, batch)
+    else:
+        common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
+        out = jax.tree.map(_gather, _run(function, mesh, group, common, batch))
+    return jax.tree.map(lambda a: a[:count], out) if whole > count else out
+
+
+@eqx.filter_jit
+def _run(function: Callable, mesh: Mesh | None, group: int, common, batch):
+    numbers, rest = eqx.partition(common, eqx.is_array)
+
+    def share(numbers, batch):
+        """What one device does."""
+        one = jax.vmap(lambda one: function(eqx.combine(numbers, rest), one))
+        size = jax.tree.leaves(batch)[0].shape[0]
+        if size == group:
+            return one(batch)
+        out = jax.lax.map(one, jax.tree.map(lambda a: a.reshape(-1, group, *a.shape[1:]), batch))
+        return jax.tree.map(lambda a: a.reshape(size, *a.shape[2:]), out)
+
+    if mesh is None:
+        return share(numbers, batch)
+    # check_vma is about scans that begin with what all devices share and go on with their own: all of ours do
+    return jax.shard_map(share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)(numbers, batch)
+
+
+def _place(tree, sharding: NamedSharding):
+    """Arrays that this process holds whole, where its devices' shares of them belong."""
+
+    def place(a):
+        if not isinstance(a, jax.Array | np.ndarray):
+            return a
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(place(jax.random.key_data(a)), impl=jax.random.key_impl(a))
+        if jax.process_count() == 1:
+            return jax.device_put(a, sharding)
+        whole = np.asarray(a)
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+
+    return jax.tree.map(place, tree)
+
+
+def _gather(a):
+    """All of a sharded array, on this process's first device."""
+    if jax.process_count() > 1:
+        return jnp.asarray(multihost_utils.process_allgather(a, tiled=True))
+    return jax.device_put(a, jax.local_devices()[0])

@@ -1,0 +1,138 @@
+"""Sequences over devices, groups and processes: the same numbers as one device gives."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.parallel import all_devices, each, over
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "jax"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "TF_CPP_MIN_LOG_LEVEL": "3",
+}
+
+
+def _weigh(common, one):
+    scale, key = one
+    return common["a"] @ scale, jax.random.normal(key, (3,))
+
+
+@pytest.mark.parametrize("together", [None, 1, 3, 100])
+def test_groups_change_nothing(together):
+    common, scales = {"a": jnp.arange(6.0).reshape(2, 3)}, jnp.arange(21.0).reshape(7, 3)
+    keys = jax.random.split(jax.random.key(0), 7)
+    product, draw = each(_weigh, common, (scales, keys), together=together)
+    np.testing.assert_allclose(product, scales @ common["a"].T, rtol=1e-15)
+    np.testing.assert_array_equal(draw, jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys))
+
+
+def test_mesh_of_other_axes_is_refused():
+    mesh = jax.make_mesh((1,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    with pytest.raises(ValueError, match="seq"), over(mesh):
+        pass
+
+
+def test_over_one_device():
+    with over(all_devices()):
+        product, _ = each(_weigh, {"a": jnp.ones((2, 3))}, (jnp.ones((5, 3)), jax.random.split(jax.random.key(0), 5)))
+    np.testing.assert_array_equal(product, np.full((5, 2), 3.0))
+
+
+DEVICES = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 4)
+import equinox as eqx
+import numpy as np
+from nnap_em.em import fit
+from nnap_em.identify import begin
+from nnap_em.parallel import AXIS, over
+from nnap_em.data import read_logs
+from nnap_em.rig import read_rig
+from nnap_em.smoother import CubatureSmoother, GaussianSmoother
+from nnap_em.systems import specs
+from pathlib import Path
+folder = Path(sys.argv[1])
+rig = read_rig(folder / "rig.toml", specs)
+data = read_logs(folder / "train", rig).data
+now = begin(rig, data, key=jax.random.key(0))
+def run(count):
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:count]), (AXIS,))
+    with over(mesh):
+        state = fit(now.state, data, CubatureSmoother(now.bank), now.m_step, epochs=2)
+    arrays = eqx.filter((state.best, state.hessian, state.loglik), eqx.is_array_like)
+    return np.concatenate([np.ravel(a) for a in jax.tree.leaves(arrays)])
+one = run(1)
+for count in (2, 4):
+    np.testing.assert_allclose(run(count), one, rtol=1e-9, atol=1e-9)
+GaussianSmoother.room = 1
+np.testing.assert_allclose(run(2), one, rtol=1e-9, atol=1e-9)
+"""
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("parallel") / "rig"
+    _nnap("simulate", "--system", "slide", "--sequences", "5", "--test", "1", "--steps", "40", str(folder))
+    shutil.rmtree(folder / "test")  # nothing to predict: it is the fit that is spread
+    return folder
+
+
+def _nnap(*command, launch=()):
+    first = [sys.executable, "-m", "nnap_em.launch", *launch] if launch else [sys.executable, "-m", "nnap_em.cli"]
+    return subprocess.run([*first, *command], env=ENVIRONMENT, check=True, capture_output=True, text=True, timeout=600)
+
+
+@pytest.mark.slow
+def test_devices_agree(rig):
+    """Five sequences over 1, 2 and 4 devices, and one at a time."""
+    subprocess.run([sys.executable, "-c", DEVICES, str(rig)], env=ENVIRONMENT, check=True, timeout=600)
+
+
+def _numbers(out: Path) -> dict[str, np.ndarray]:
+    with np.load(out / "model.npz", allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files if stored[name].dtype.kind == "f"}
+
+
+@pytest.mark.slow
+def test_processes_agree(rig, tmp_path):
+    for count in (1, 2, 4):
+        _nnap("identify", str(rig), "--epochs", "1", "--out", str(tmp_path / str(count)), launch=(str(count),))
+    one = _numbers(tmp_path / "1")
+    assert len(one) > 5
+    for count in (2, 4):
+        for name, value in _numbers(tmp_path / str(count)).items():
+            np.testing.assert_allclose(value, one[name], rtol=1e-8, atol=1e-8, err_msg=name)
+
+
+@pytest.mark.slow
+def test_a_dying_process_ends_the_run_and_leaves_the_checkpoint(rig, tmp_path):
+    out = tmp_path / "out"
+    order = [sys.executable, "-m", "nnap_em.launch", "2", "identify", str(rig), "--epochs", "500", "--out", str(out)]
+    run = subprocess.Popen(order, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    try:
+        deadline = time.monotonic() + 300
+        while not (out / "checkpoint.npz").exists():
+            assert run.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+        os.kill(int(children[1]), signal.SIGKILL)
+        _, said = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 1
+    assert "process 1 was killed by SIGKILL" in said and "--resume" in said
+    _nnap("identify", str(rig), "--resume", "--epochs", "3", "--out", str(out))

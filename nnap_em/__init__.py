@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .data import DataError, Dataset, Logs, pad, read_logs
+    from .data import Dataset, Logs, pad, read_logs
     from .diagnose import findings
     from .em import EMState, FitError, Schedule
+    from .formats import DataError, DataWarning
     from .friction import FrictionNetwork
     from .identify import Identified, friction_table, identify, parameter_table
     from .loop import Closed, close_the_loop
@@ -30,6 +31,7 @@ __all__ = [
     "AbstractSystem",
     "Closed",
     "DataError",
+    "DataWarning",
     "Dataset",
     "EMState",
     "Experiment",
@@ -68,9 +70,10 @@ __all__ = [
     "write_rig",
 ]
 _homes = {
-    "data": ("DataError", "Dataset", "Logs", "pad", "read_logs"),
+    "data": ("Dataset", "Logs", "pad", "read_logs"),
     "diagnose": ("findings",),
     "em": ("EMState", "FitError", "Schedule"),
+    "formats": ("DataError", "DataWarning"),
     "friction": ("FrictionNetwork",),
     "identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "loop": ("Closed", "close_the_loop"),

@@ -129,7 +129,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            warnings.simplefilter("default", commands.DataWarning)
+            for kind in commands.WARNINGS:
+                warnings.simplefilter("always", kind)
             commands.set_up()
             say = _silent if getattr(args, "quiet", False) else _say
             commands.commands[args.command](args, say)

@@ -22,9 +22,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from . import __version__
-from .data import DataError, DataWarning, Logs, check_split, read_logs, write_csv
+from .data import Logs, check_split, read_logs
 from .diagnose import findings
 from .em import EMState, FitError
+from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
 from .law import PARAMETERS, UNITS, describe, fit_law
 from .loop import close_the_loop
@@ -32,7 +33,7 @@ from .model import StateSpaceModel
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
-from .rig import Declared, Rig, RigError, nearest, parameter_unit, read_rig, write_rig
+from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, write_rig
 from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
 from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
@@ -40,6 +41,7 @@ from .systems import specs
 from .tables import state_unit, visited_nodes, write_friction, write_json
 
 MISTAKES = (RigError, DataError, StoreError, FitError)
+WARNINGS = (RigWarning, DataWarning)
 GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
 Say = Callable[[str], None]
@@ -184,9 +186,8 @@ def _read(folder: Path) -> tuple[Rig, Logs, Logs | None]:
     """A data set; test logs only where there are any."""
     rig = read_rig(folder / "rig.toml", specs)
     train = read_logs(folder / "train", rig)
-    test = read_logs(folder / "test", rig) if any(folder.glob("test/*.csv")) else None
-    if test:
-        check_split(train, test)
+    test = read_logs(folder / "test", rig) if has_logs(folder / "test") else None
+    check_split(train, test)
     return rig, train, test
 
 
@@ -449,4 +450,4 @@ def _write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> No
             values = np.where(np.isfinite(values), values, np.nan)
         names = (*states, *(f"{name}_std" for name in states))
         time_ = {"time": np.asarray(logs.data.t[i])[rows]}
-        write_csv(folder / file, time_ | dict(zip(names, values.T, strict=True)))
+        write_csv((folder / file).with_suffix(".csv"), time_ | dict(zip(names, values.T, strict=True)))

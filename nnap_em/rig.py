@@ -5,6 +5,7 @@ import json
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,10 @@ _MEND = {  # how the line of a key or table should look
 
 class RigError(ValueError):
     """A mistake in rig.toml: the message names the file, the table and key, what was found and the mend."""
+
+
+class RigWarning(UserWarning):
+    """Something in rig.toml that is possible but seldom meant."""
 
 
 @dataclass(frozen=True)
@@ -238,6 +243,10 @@ def _parameter(model: _Table, key: str) -> Declared:
         model.refuse(
             key, mend=f"write 0 or more [{parameter_unit(key)}]: directions are in the equations, not in the signs"
         )
+    large, unit = (100.0, "mm/s^2") if key == "g" else (50.0, "mm") if key.startswith("l") else (math.inf, "")
+    if value.mean > large:
+        found = f"{model.path}: [model] {key}: found {value.mean:g}"
+        warnings.warn(f"{found}; is it in {unit}? write it in {parameter_unit(key)}", RigWarning, 2)
     return value
 
 

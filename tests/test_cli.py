@@ -384,16 +384,6 @@ def _bench_file(name: str, old: str, new: str):
 IDENTIFY = ("identify", "{bench}", "--out", "{out}")
 PREDICT = ("predict", "{fit}", "{bench}/test", "--given", "1", "--out", "{out}")
 BAD = {
-    "no rig": (lambda b: (b / "rig.toml").unlink(), IDENTIFY, r"bench/rig\.toml: cannot be read"),
-    "rig typo": (_bench_file("rig.toml", "friction =", "fricton ="), IDENTIFY, "did you mean 'friction'"),
-    "no train": (lambda b: shutil.rmtree(b / "train"), IDENTIFY, "bench/train: is no folder"),
-    "bad number": (_bench_file("train/002.csv", "0.02,", "0.02,oops"), IDENTIFY, r"train/002\.csv: line 4, column 'u'"),
-    "bad test file": (_bench_file("test/002.csv", "time", "tme"), IDENTIFY, r"test/002\.csv: line 1, column 'time'"),
-    "test in train": (
-        lambda b: shutil.copy(b / "test/000.csv", b / "train/900.csv"),
-        IDENTIFY,
-        r"test file 000\.csv: the same content as train file 900\.csv",
-    ),
     "nothing to resume": (lambda b: None, (*IDENTIFY, "--resume"), "checkpoint.npz: is not there; leave --resume out"),
     "out is a file": (
         lambda b: None,

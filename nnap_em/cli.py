@@ -13,6 +13,7 @@ from . import __version__
 _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
+  nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em predict fit bench/test --given 1 --out prediction
@@ -27,6 +28,14 @@ examples:
   nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
 
 OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
+_CHECK = """\
+example:
+  nnap-em check bench
+
+One line per question: ok, look (it may do, but look at it) or bad (a fit would be in vain).  Length, missing samples,
+sampling rate, noise, torques, the velocities that each joint visits, and whether the readings tell the whole state.
+Nothing is fitted and nothing is written.  Exit status 1 where something is bad.
 """
 _IDENTIFY = """\
 examples:
@@ -89,6 +98,9 @@ def parser() -> argparse.ArgumentParser:
             help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
         )
 
+    check = command("check", "say whether the logs can identify what is asked", _CHECK)
+    check.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+
     identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
     identify.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
     identify.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
@@ -119,7 +131,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; 0 is done, 2 is refused with one line on stderr, 130 is stopped by Ctrl-C."""
+    """Run one command: 0 is done, 1 a check that found something bad, 2 refused with one line on stderr, 130 Ctrl-C."""
     arguments = parser()
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
@@ -133,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 warnings.simplefilter("always", kind)
             commands.set_up()
             say = _silent if getattr(args, "quiet", False) else _say
-            commands.commands[args.command](args, say)
+            return commands.commands[args.command](args, say) or 0
     except KeyboardInterrupt as stopped:
         _say(str(stopped) or "stopped")
         return 130
@@ -143,7 +155,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _say(f"error: {line}")
         return 2
-    return 0
 
 
 def _line(error: Exception) -> str | None:

@@ -22,6 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from . import __version__
+from .build import build_system, measure_scales
+from .check import BAD, check, torques
 from .data import Logs, check_split, read_logs
 from .diagnose import findings
 from .em import EMState, FitError
@@ -108,10 +110,22 @@ def run_simulate(args: argparse.Namespace, say: Say) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
+def run_check(args: argparse.Namespace, say: Say) -> int:
+    """Say whether the logs can identify what is asked, a line per question; 1 where they cannot."""
+    rig, train, test = _read(args.folder)
+    found = check(rig, train, test, key=jax.random.key(0))
+    for finding in found:
+        print(f"{finding.mark:4}  {finding.subject:8}  {finding.text}")
+    bad = sum(finding.mark == BAD for finding in found)
+    say(f"{bad} of {len(found)} answers are bad" if bad else "nothing speaks against a fit")
+    return int(bad > 0)
+
+
 def run_identify(args: argparse.Namespace, say: Say) -> None:
     """Fit the declared unknowns to the training logs; the test logs serve for the reported error alone."""
     began = time.perf_counter()
     rig, train, test = _read(args.folder)
+    _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
     if args.resume:
@@ -143,6 +157,7 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
     """Find what the declared model lacks, and report it; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
     rig, train, test = _read(args.folder)
+    _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     with _folder(args.out):
         count, rows = train.data.valid.shape
@@ -173,8 +188,9 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
     say(f"wrote {len(logs.files)} files to {args.out}")
 
 
-commands: dict[str, Callable[[argparse.Namespace, Say], None]] = {
+commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
     "simulate": run_simulate,
+    "check": run_check,
     "identify": run_identify,
     "diagnose": run_diagnose,
     "predict": run_predict,
@@ -189,6 +205,14 @@ def _read(folder: Path) -> tuple[Rig, Logs, Logs | None]:
     test = read_logs(folder / "test", rig) if has_logs(folder / "test") else None
     check_split(train, test)
     return rig, train, test
+
+
+def _warn_of_torques(folder: Path, rig: Rig, train: Logs) -> None:
+    """Warn where the inputs cannot be those of the declared bodies."""
+    system = build_system(rig)
+    for finding in torques(rig, system, train.data, measure_scales(rig, system, train.data)):
+        if finding.mark == BAD:
+            warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
 
 
 # --- simulate

@@ -110,12 +110,16 @@ def _huge(folder: Path) -> None:
         file.truncate(LARGEST + 2**20)  # sparse: it takes no place on the disk
 
 
-def _milliseconds(folder: Path) -> None:
-    """Time and dt both in ms: they agree, but not with the rates."""
-    _rig("dt = 0.01", "dt = 10")(folder)
-    for path in folder.glob("t*/*.csv"):
-        log = np.genfromtxt(path, delimiter=",", names=True)
-        path.write_text(_text({name: log[name] * (1000 if name == "time" else 1) for name in log.dtype.names}))
+def _everywhere(name: str, change) -> Callable[[Path], object]:
+    """A change of one column of all files."""
+
+    def apply(folder: Path) -> None:
+        for path in folder.glob("t*/*.csv"):
+            log = np.genfromtxt(path, delimiter=",", names=True)
+            columns = {other: log[other] for other in log.dtype.names}
+            path.write_text(_text(columns | {name: change(columns[name])}))
+
+    return apply
 
 
 def _cut(first: int, last: int) -> Callable[[Path], object]:
@@ -282,7 +286,13 @@ FOLDERS = {  # name: (the change of the folder, the file, then the words of the 
         "line 1, column 'time'",
         "did you mean 'tme'?",
     ),
-    "time and dt in ms": (_milliseconds, "train/00.csv", "column 'dtheta1'", "times column", "time and dt are in ms"),
+    "time and dt in ms": (
+        _both(_rig("dt = 0.01", "dt = 10"), _everywhere("time", lambda t: 1000 * t)),
+        "train/00.csv",
+        "column 'dtheta1'",
+        "times column",
+        "time and dt are in ms",
+    ),
     "test in train": (_cut(0, 201), "test file 01.csv", "same content as train file 01.csv", "remove one"),
     "a part of train in test": (
         _cut(100, 150),
@@ -340,6 +350,13 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         "row 1 and those after it are also in train file 01.csv",
         "cut sequences without overlap",
     ),
+    "input in N mm": (
+        _everywhere("u", lambda x: 1e4 * x),
+        "train: column u",
+        "gravity and inertia of joint 1",
+        "look at its unit (N m)",
+    ),
+    "mass in g": (_rig("m = 0.5", "m = 500e3"), "train: column u", "ask for", "masses (kg)"),
     "gravity in mm/s^2": (_rig("g = 9.81", "g = 9810"), "rig.toml", "[model] g", "9810", "write it in m/s^2"),
     "length in mm": (_rig("lc = 0.4", "lc = 400"), "rig.toml", "[model] lc", "400", "write it in m"),
 }

@@ -13,6 +13,7 @@ from . import __version__
 _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
+  nnap-em init bench/train/01.csv --system acrobot  a first rig.toml from the log, to be filled in
   nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
@@ -28,6 +29,14 @@ examples:
   nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
 
 OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
+_INIT = """\
+examples:
+  nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
+  nnap-em init log.csv --out bench
+
+Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
+filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
 """
 _CHECK = """\
 example:
@@ -97,6 +106,13 @@ def parser() -> argparse.ArgumentParser:
             metavar=("POSITION", "RATE"),
             help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
         )
+
+    init = command("init", "write a first rig.toml for a log", _INIT)
+    init.add_argument("csv", metavar="CSV", type=Path, help="a log with a header")
+    init.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    init.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
+    )
 
     check = command("check", "say whether the logs can identify what is asked", _CHECK)
     check.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")

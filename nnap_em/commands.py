@@ -26,6 +26,7 @@ from .build import build_system, measure_scales
 from .check import BAD, check, torques
 from .data import Logs, check_split, read_logs
 from .diagnose import findings
+from .draft import draft
 from .em import EMState, FitError
 from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
@@ -35,7 +36,7 @@ from .model import StateSpaceModel
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
-from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, write_rig
+from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, replace_text, write_rig
 from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
 from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
@@ -108,6 +109,19 @@ def run_simulate(args: argparse.Namespace, say: Say) -> None:
         say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def run_init(args: argparse.Namespace, say: Say) -> None:
+    """Write a first rig.toml for a log, to be filled in; one that is there stays as it is."""
+    home = args.csv.parent.parent if args.csv.parent.name in ("train", "test") else args.csv.parent
+    path = (args.out or home) / "rig.toml"
+    if path.exists():
+        raise DataError(f"{path}: is there already; give another --out, or remove it")
+    found = draft(args.csv, args.system, specs)
+    replace_text(path, found.text)
+    for note in found.notes:
+        say(f"in the log: {note}")
+    say(f"wrote {path}" + (f"; fill in {', '.join(found.missing)}" if found.missing else ""))
 
 
 def run_check(args: argparse.Namespace, say: Say) -> int:
@@ -190,6 +204,7 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
 
 commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
     "simulate": run_simulate,
+    "init": run_init,
     "check": run_check,
     "identify": run_identify,
     "diagnose": run_diagnose,

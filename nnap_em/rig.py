@@ -115,13 +115,19 @@ def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    lines = ["format = 1", f"name = {_text(rig.name)}"]
-    lines += ["", "[model]", f"type = {_text(rig.system)}", *_lines(parameters)]
+    lines = ["format = 1", f"name = {toml_text(rig.name)}"]
+    lines += ["", "[model]", f"type = {toml_text(rig.system)}", *_lines(parameters)]
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
-    lines += ["", "[input]", f"columns = [{', '.join(map(_text, rig.input_columns))}]    # N m, or N on a slide"]
+    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
     lines += [f"joints = {list(rig.input_joints)}"]
-    lines += ["", "[sampling]", f"dt = {rig.dt!r}    # s", 'input_hold = "zero-order"', f"clock = {_text(rig.clock)}"]
-    lines += ["", "[measurement]", f"columns = [{', '.join(map(_text, rig.measured))}]"]
+    lines += [
+        "",
+        "[sampling]",
+        f"dt = {rig.dt!r}    # s",
+        'input_hold = "zero-order"',
+        f"clock = {toml_text(rig.clock)}",
+    ]
+    lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
     lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
     lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
     replace_text(path, "\n".join(lines) + "\n")
@@ -136,6 +142,11 @@ def replace_text(path: Path, text: str) -> None:
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def toml_text(text: str) -> str:
+    """A text as TOML writes it."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL
 
 
 def nearest(word: str, known: Collection[str]) -> str:
@@ -297,7 +308,3 @@ def _lines(values: Mapping[str, str]) -> list[str]:
 
 def _pair(value: Declared) -> str:
     return f"{{ mean = {value.mean!r}, std = {value.std!r} }}"
-
-
-def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL

@@ -241,7 +241,7 @@ def _no_number(path: Path, name: str, row: int, found: str, missing: bool, gaps:
 
 def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
     """Columns of numbers side by side, checked as those of a CSV file are."""
-    rows = max(np.size(values) for values in columns.values())
+    rows = np.size(next(iter(columns.values())))
     if rows < 2:
         refuse(path, "the file", f"found {rows} rows", "write 2 rows or more")
     out = []
@@ -250,7 +250,9 @@ def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float
             refuse(path, f"column {name!r}", f"holds {values.dtype}, no numbers", "store it as 64-bit floating point")
         if values.shape != (rows,):
             shape = " x ".join(map(str, values.shape))
-            refuse(path, f"column {name!r}", f"is {shape}, others have {rows} rows", "give all columns one length")
+            refuse(
+                path, f"column {name!r}", f"is {shape or 1}, the first has {rows} rows", "give all columns one length"
+            )
         values = values.astype(np.float64)
         wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
         if wrong.size:

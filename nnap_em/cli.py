@@ -19,6 +19,7 @@ examples:
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
+  nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """
@@ -76,6 +77,14 @@ example:
   nnap-em smooth fit bench/test --out smoothed
 
 DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+"""
+_EXPORT = """\
+examples:
+  nnap-em export fit --out exported
+  nnap-em export found/after.npz --out exported
+
+OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
+python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
 """
 SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
 SMOOTHERS = ("cubature", "ekf", "particle")
@@ -143,6 +152,10 @@ def parser() -> argparse.ArgumentParser:
         use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
+
+    export = command("export", "write a fitted model for other programs", _EXPORT)
+    export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
+    export.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the files")
     return top
 
 

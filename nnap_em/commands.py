@@ -28,6 +28,7 @@ from .data import Logs, check_split, read_logs
 from .diagnose import findings
 from .draft import draft
 from .em import EMState, FitError
+from .export import ExportError, export
 from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
 from .law import PARAMETERS, UNITS, describe, fit_law
@@ -43,7 +44,7 @@ from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
 from .systems import specs
 from .tables import state_unit, visited_nodes, write_friction, write_json
 
-MISTAKES = (RigError, DataError, StoreError, FitError)
+MISTAKES = (RigError, DataError, StoreError, FitError, ExportError)
 WARNINGS = (RigWarning, DataWarning)
 GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
@@ -202,6 +203,12 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
     say(f"wrote {len(logs.files)} files to {args.out}")
 
 
+def run_export(args: argparse.Namespace, say: Say) -> None:
+    """Write the model for other programs."""
+    export(read(_model_file(args.model)).fitted, args.out)
+    say(f"wrote parameters.json, predictor.py and model.stablehlo to {args.out}")
+
+
 commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
     "simulate": run_simulate,
     "init": run_init,
@@ -210,6 +217,7 @@ commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
     "diagnose": run_diagnose,
     "predict": run_predict,
     "smooth": run_smooth,
+    "export": run_export,
 }
 
 

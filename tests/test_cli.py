@@ -79,7 +79,7 @@ def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys, time
 from nnap_em import cli
-for command in ("", "simulate", "identify", "predict", "smooth"):
+for command in ("", "simulate", "init", "check", "identify", "diagnose", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])
     except SystemExit as stop:
@@ -89,7 +89,7 @@ assert time.process_time() < 0.5
 """
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr
-    assert found.stdout.count("example") >= 5
+    assert found.stdout.count("example") >= 9
     for command in ("simulate bench", "identify bench --out fit", "predict fit bench/test", "smooth fit bench/test"):
         assert f"nnap-em {command}" in found.stdout
 

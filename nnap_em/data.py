@@ -26,6 +26,14 @@ class Dataset(NamedTuple):
     y: Float[Array, "*seq time obs"]  # rad, rad/s; NaN = not measured, also in the padding
     valid: Bool[Array, "*seq time"]
 
+    def __str__(self) -> str:
+        y, valid = np.asarray(self.y), np.asarray(self.valid)
+        count, gone = valid[..., 0].size, np.isnan(y[valid]).mean() if y[valid].size else 0.0
+        t = np.asarray(self.t)
+        longest, inputs = float(np.max(t[..., -1] - t[..., 0])), np.shape(self.u)[-1]
+        said = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
+        return f"Dataset: {said}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
+
 
 @dataclass(frozen=True)
 class Logs:
@@ -34,6 +42,9 @@ class Logs:
     files: tuple[str, ...]  # without folder, in the order of the sequences
     data: Dataset
     columns: tuple[str, ...]  # inputs, then measured
+
+    def __str__(self) -> str:
+        return f"Logs {self.files[0]} to {self.files[-1]}: {', '.join(self.columns)}; {self.data}"
 
 
 def read_logs(folder: Path, rig: Rig) -> Logs:

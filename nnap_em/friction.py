@@ -43,6 +43,10 @@ class FrictionNetwork(eqx.Module):
         self.knee = speed / resolution
         self.scale = scale
 
+    def __str__(self) -> str:
+        speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
+        return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
+
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         top = jnp.arcsinh(self.speed / self.knee)
         features = jnp.stack([v / self.speed, jnp.arcsinh(v / self.knee) / top], axis=-1)

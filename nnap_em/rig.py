@@ -50,6 +50,9 @@ class Declared:
     mean: float
     std: float
 
+    def __str__(self) -> str:
+        return f"{self.mean:.6g}" + (f" +- {self.std:.2g}" if self.std else "")
+
 
 @dataclass(frozen=True)
 class SystemSpec:
@@ -76,6 +79,20 @@ class Rig:
     measured: tuple[str, ...]
     noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
     start: Mapping[str, Declared]
+
+    def __str__(self) -> str:
+        inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
+        noise = {name: f"{std:.2g} {parameter_unit(name)}" for name, std in self.noise_std.items()}
+        reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
+        lines = [
+            f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} s",
+            f"parameters: {quantities(self.parameters)}",
+            f"inputs: {', '.join(inputs) or 'none'}",
+            f"reads: {', '.join(reads)}",
+            f"start: {quantities(self.start) or 'from the readings'}",
+            f"friction: {'to be learned' if self.friction else 'none'}",
+        ]
+        return "\n  ".join(lines)
 
 
 def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
@@ -300,6 +317,12 @@ def parameter_unit(name: str) -> str:
     exact = {"g": "m/s^2", "gr": "-", "x": "m", "dx": "m/s"}
     first = {"theta": "rad", "dtheta": "rad/s", "m": "kg", "l": "m", "I": "kg m^2"}
     return exact.get(name) or next((unit for start, unit in first.items() if name.startswith(start)), "SI")
+
+
+def quantities(values: Mapping[str, object]) -> str:
+    """Parameters or states as text, with their units."""
+    numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
+    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
 
 
 def _lines(values: Mapping[str, str]) -> list[str]:

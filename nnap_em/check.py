@@ -47,8 +47,11 @@ class Along(NamedTuple):
 
 
 def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[Finding]:
-    """Every finding on a data set; nothing is fitted."""
+    """Every finding on a data set, or what is missing where there is too little of it; nothing is fitted."""
     data = Dataset(*(np.asarray(part) for part in train.data))
+    amount = [*_amount(rig, data, test), *_missing(train, rig)]
+    if amount[0].mark == BAD:
+        return amount
     problem = build(rig, data, key=key)
     system = problem.model.system
     scales = measure_scales(rig, system, data)
@@ -57,8 +60,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     head = Dataset(*(part[:SEQUENCES, :rows] for part in horizon(data, rows)))
     along = Along(*(np.asarray(part) for part in _along(model, problem.bank, head)))
     return [
-        *_amount(rig, data, test),
-        *_missing(train, rig),
+        *amount,
         *_sampling(rig, along, scales),
         *_noise(rig, model, data),
         *torques(rig, system, data, scales),
@@ -93,7 +95,7 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[Finding]:
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, few)
     said = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield Finding(mark, "length", "; ".join(filter(None, (said, few, short, long, few or little))))
+    yield Finding(mark, "length", "; ".join(filter(None, (said, few or little, short, long))))
     if test is None:
         yield Finding(LOOK, "test", "no test sequences: no prediction error will be reported")
     else:
@@ -200,7 +202,9 @@ def _velocity(
         return np.asarray(data.y)[..., rig.measured.index(rate)], ""
     if position in rig.measured:
         y, lag = np.asarray(data.y)[..., rig.measured.index(position)], 5
-        return (y[:, lag:] - y[:, :-lag]) / (lag * rig.dt), ""
+        v = (y[:, lag:] - y[:, :-lag]) / (lag * rig.dt)
+        if np.isfinite(v).any():
+            return v, ""
     x = along.x[..., len(model.system.coordinates) + joint]
     return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
 

@@ -130,11 +130,17 @@ def test_a_filtered_log_is_noticed(slide):
     assert "was filtered" in answers[1][1]
 
 
-def test_slow_sampling_is_bad(slide):
-    """Every 40th row: a sweep of half a second is over in one."""
-    slow = Dataset(*(part[:, ::40] for part in slide.data))
-    found = _found(_logs(slow), _rig(dt=0.4))
-    assert found["sampling"][0][0] == "bad"
+def test_with_hardly_any_rows_nothing_else_is_asked(slide):
+    found = _found(_logs(Dataset(*(part[:, :2] for part in slide.data))))
+    assert list(found) == ["length", "test", "missing"]
+    assert found["length"][0][0] == "bad"
+
+
+def test_slow_sampling_is_noticed(slide):
+    """Every 10th row: half a second of a sweep is five rows."""
+    slow = Dataset(*(part[:, ::10] for part in slide.data))
+    found = _found(_logs(slow), _rig(dt=0.1))
+    assert found["sampling"][0][0] == "look"
     assert "sample faster" in found["sampling"][0][1]
 
 

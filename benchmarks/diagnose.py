@@ -1,7 +1,7 @@
 """How often the loop names the right effect: simulated rigs of a simulator that shares nothing with the catalogue.
 
     python benchmarks/diagnose.py --out out/diagnose                    # everything: hours on a laptop
-    python benchmarks/diagnose.py --out out/diagnose --only strong:*:hidden --jobs 2
+    python benchmarks/diagnose.py --out out/diagnose --only strong:*:hidden --share 1/2
     python benchmarks/diagnose.py --out out/diagnose --table docs/diagnose_table.md     # the table of what is there
 
 A case is group:effect:view:seed; a whole name with another seed runs too.  Each leaves one JSON file in --out; a case

@@ -28,11 +28,13 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(jax.vmap(model.unknown)(ends))
+    # what rises between .4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
+    viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
     return Around(
         model.system,
         scales.torque,
         speed,
-        np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed)),
+        viscous,
         low,
         high,
         np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),

@@ -1,5 +1,6 @@
 """The unknown term: one small network per joint from velocity to torque."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
@@ -8,8 +9,38 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .elementary import asinh
 
-class FrictionNetwork(eqx.Module):
+
+class AbstractJointMap(eqx.Module):
+    """Torques that each depend on their own joint's velocity only; their derivatives then cost one slope, not one pass
+    for every tangent.
+    """
+
+    @abstractmethod
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Torques [N m] at joint velocities [rad/s]."""
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        return _torque(self, v)
+
+
+@eqx.filter_custom_jvp
+def _torque(friction: AbstractJointMap, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    return friction.torque(v)
+
+
+@_torque.def_jvp
+def _torque_jvp(primals, tangents):
+    (friction, v), (by_weights, dv) = primals, tangents
+    torque, slope = jax.jvp(friction.torque, (v,), (jnp.ones_like(v),))
+    moved = jnp.zeros_like(torque) if dv is None else slope * dv
+    if jax.tree.leaves(by_weights):
+        moved = moved + eqx.filter_jvp(lambda f: f.torque(v), (friction,), (by_weights,))[1]
+    return torque, moved
+
+
+class FrictionNetwork(AbstractJointMap):
     """tau_f(v): joint velocities [rad/s] to joint torques [N m], a network for each joint.
 
     Each joint has features v / speed and asinh(v / knee), scaled to +-1 at `speed`, so that both the Stribeck
@@ -47,9 +78,9 @@ class FrictionNetwork(eqx.Module):
         speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
         return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
 
-    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        top = jnp.arcsinh(self.speed / self.knee)
-        features = jnp.stack([v / self.speed, jnp.arcsinh(v / self.knee) / top], axis=-1)
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        top = asinh(self.speed / self.knee)
+        features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)
         return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
 
     def nodes(self, count: int) -> Float[Array, "dof count"]:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .gaussian import Gaussian, cholesky, cubature, lower, spd_solve, symmetric
+from .gaussian import Gaussian, cholesky, lower, product, spd_solve, symmetric, upper_solve
 
 
 class Affine(NamedTuple):
@@ -63,7 +63,7 @@ class Tangent(eqx.Module):
             return y, y
 
         matrix, value = jax.jacfwd(both, has_aux=True)(about.mean)
-        return Affine(matrix, value - matrix @ about.mean, jnp.zeros_like(matrix))
+        return Affine(matrix, value - product(matrix, about.mean), jnp.zeros_like(matrix))
 
 
 TANGENT = Tangent()
@@ -77,15 +77,18 @@ class Cubature(eqx.Module):
     """
 
     def __call__(self, model, about: Gaussian, u: Float[Array, " input"]) -> Affine:
-        n = about.mean.shape[0]
-        factor = lower(cholesky(about.cov))
-        unit = cubature(n, about.mean.dtype)
-        y = jax.vmap(lambda x: model.transition(x, u))(about.mean[None] + unit @ factor.T)
+        rows = cholesky(about.cov)
+        reach = math.sqrt(len(rows))
+        spread = reach * lower(rows).T  # the points of `cubature` are opposite pairs along the columns of the factor
+        x = jnp.concatenate([about.mean[None] + spread, about.mean[None] - spread])
+        y = jax.vmap(lambda x: model.transition(x, u))(x)
+        ahead, behind = jnp.split(y, 2)
         mean = jnp.mean(y, axis=0)
-        slope = (y - mean[None]).T @ unit / (2 * n)  # matrix @ factor
-        matrix = jax.scipy.linalg.solve_triangular(factor, slope.T, lower=True, trans=1).T
-        noise = symmetric((y - mean[None]).T @ (y - mean[None]) / (2 * n) - slope @ slope.T)
-        return Affine(matrix, mean - matrix @ about.mean, noise)
+        slope = (ahead - behind).T / (2 * reach)  # matrix @ factor
+        matrix = upper_solve(rows, slope.T).T
+        bend = ((ahead + behind) / 2 - mean[None]) / reach
+        noise = product(bend.T, bend)
+        return Affine(matrix, mean - product(matrix, about.mean), noise)
 
 
 CUBATURE = Cubature()
@@ -99,7 +102,7 @@ def linear_reading(model, x: Float[Array, " state"], u: Float[Array, " input"]) 
         return y, y
 
     rows, value = jax.jacfwd(both, has_aux=True)(x)
-    return Reading(rows, value - rows @ x)
+    return Reading(rows, value - product(rows, x))
 
 
 def _condition(state: Gaussian, reading: Reading, r, y, observed):
@@ -108,10 +111,10 @@ def _condition(state: Gaussian, reading: Reading, r, y, observed):
     rows = reading.rows
     whitened, log_variance, gains = [], [], []
     for i in range(y.shape[0]):
-        pc = cov @ rows[i]
-        s = rows[i] @ pc + r[i]
+        pc = product(cov, rows[i])
+        s = jnp.sum(rows[i] * pc) + r[i]
         gain = jnp.where(observed[i], pc / s, 0.0)
-        e = y[i] - reading.offset[i] - rows[i] @ mean
+        e = y[i] - reading.offset[i] - jnp.sum(rows[i] * mean)
         mean = mean + gain * e
         cov = cov - gain[:, None] * pc[None, :]
         whitened.append(jnp.where(observed[i], e / jnp.sqrt(s), 0.0))
@@ -137,8 +140,10 @@ def _filter(log_q, log_r, start: Gaussian, y, observed, active, inputs, affine_a
         affine = affine_at(state, inputs)
         affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
         following = Gaussian(
-            affine.matrix @ state.mean + affine.offset,
-            symmetric(affine.matrix @ state.cov @ affine.matrix.T) + affine.noise + jnp.where(active, q, 0.0),
+            product(affine.matrix, state.mean) + affine.offset,
+            symmetric(product(product(affine.matrix, state.cov), affine.matrix.T))
+            + affine.noise
+            + jnp.where(active, q, 0.0),
         )
         return following, (state, predicted, whitened, log_variance, gain, affine, reading)
 
@@ -205,15 +210,16 @@ def rts(filtered: Filtered) -> Smoothed:
     """Rauch-Tung-Striebel smoother behind either filter."""
 
     def step(later: Gaussian, slices):
-        state, predicted, matrix = slices
-        gain = spd_solve(predicted.cov, matrix @ state.cov).T
-        mean = state.mean + gain @ (later.mean - predicted.mean)
-        cov = symmetric(state.cov + gain @ (later.cov - predicted.cov) @ gain.T)
-        return Gaussian(mean, cov), (Gaussian(mean, cov), gain)
+        state, predicted, gain = slices
+        mean = state.mean + product(gain, later.mean - predicted.mean)
+        cov = symmetric(state.cov + product(product(gain, later.cov - predicted.cov), gain.T))
+        return Gaussian(mean, cov), Gaussian(mean, cov)
 
     last = jax.tree.map(lambda a: a[-1], filtered.state)
     earlier = jax.tree.map(lambda a: a[:-1], filtered.state)
     predicted = jax.tree.map(lambda a: a[1:], filtered.predicted)
-    _, (states, gain) = jax.lax.scan(step, last, (earlier, predicted, filtered.affine.matrix[:-1]), reverse=True)
+    crossed = jax.vmap(product)(filtered.affine.matrix[:-1], earlier.cov)
+    gain = jnp.swapaxes(jax.vmap(spd_solve)(predicted.cov, crossed), 1, 2)  # all times at once
+    _, states = jax.lax.scan(step, last, (earlier, predicted, gain), reverse=True)
     mean, cov = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, last)
     return Smoothed(Gaussian(mean, cov), gain)

@@ -50,6 +50,10 @@ class Rules(NamedTuple):
     """Share of the winner's gain from which on another one is followed further too."""
     same: float = 0.01
     """Share of an effect's information, where it was found, that an equivalent one may leave unexplained."""
+    loud: float = 5.0
+    """Standard deviations of a kick with which a track begins to be lost."""
+    later: int = 8
+    """Rows after that which still count."""
     even: float = 5.0
     """Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 

@@ -56,7 +56,7 @@ class Closed(NamedTuple):
 
 
 def _followed(
-    now: Search, data: Dataset, before: Identified
+    now: Search, data: Dataset, before: Identified, rules: Rules
 ) -> tuple[Gaussian, Bool[np.ndarray, " seq"], Bool[np.ndarray, " seq"], Dataset]:
     """Smoothed paths, the sequences that are followed whole and those used, and the data of the latter.
 
@@ -69,19 +69,12 @@ def _followed(
         return posterior.state, whole, whole, data
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
-    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < LOUD)
+    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < rules.loud)
     first = np.where(loud.any(axis=1), loud.argmax(axis=1), data.t.shape[1])
     row = np.arange(data.t.shape[1])
-    cut = data._replace(valid=data.valid & jnp.asarray(whole[:, None] | (row < first[:, None] + LATER)))
+    cut = data._replace(valid=data.valid & jnp.asarray(whole[:, None] | (row < first[:, None] + rules.later)))
     posterior = e_step(now.model, cut, smoother, key=before.state.key)
     return posterior.state, whole, np.asarray(kept(posterior, cut)), cut
-
-
-LOUD = 5.0
-"""Standard deviations of a kick with which a track begins to be lost."""
-
-LATER = 8
-"""Rows after that which still count."""
 
 
 def _chi2_tail(x: float, df: int) -> float:
@@ -192,7 +185,7 @@ def _search(
 ) -> tuple[Search, EMState | None]:
     """Look at one horizon until nothing more is found; a fit to a longer one, where a playoff made it."""
     while len(now.found) < rules.most:
-        path, whole, used, part = _followed(now, every, before)
+        path, whole, used, part = _followed(now, every, before, rules)
         say(f"horizon {length * before.rig.dt:.2f} s: {whole.sum()} of {whole.size} sequences followed")
         step, sound, null = look(now, before, path, part, used, data.t.shape[1], rules, say)
         steps.append(step)

@@ -79,13 +79,21 @@ class Quadratic(NamedTuple):
     noise_information: Float[Array, "*seq noise noise"]
 
 
-def hats(nodes: Float[Array, " count"], v: Float[Array, ""]) -> Float[Array, " count"]:
-    """Piecewise-linear weights of v among the nodes, constant beyond the ends."""
-    v = jnp.clip(v, nodes[0], nodes[-1])
-    left = (v - nodes[:-1]) / (nodes[1:] - nodes[:-1])
-    rise = jnp.concatenate([jnp.ones(1, v.dtype), jnp.clip(left, 0.0, 1.0)])
-    fall = jnp.concatenate([jnp.clip(left, 0.0, 1.0), jnp.zeros(1, v.dtype)])
-    return rise - fall
+def spread(
+    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], amount: Float[Array, "node dof"]
+) -> Float[Array, "dof count"]:
+    """Sums of `amount`, each shared by the two nodes beside its speed as linear interpolation weighs them.
+
+    Beyond the ends the last node takes all.
+    """
+    count = nodes.shape[1]
+
+    def one(nodes, v, amount):
+        left = jnp.clip(jnp.searchsorted(nodes, v, side="right") - 1, 0, count - 2)
+        share = jnp.clip((v - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0) * amount
+        return jnp.zeros(count, v.dtype).at[left].add(amount - share).at[left + 1].add(share)
+
+    return jax.vmap(one, in_axes=(0, 1, 1))(nodes, speed, amount)
 
 
 class Local(NamedTuple):
@@ -177,11 +185,10 @@ def whitened_sensitivities(
 
 def friction_columns(
     nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], by_force: Float[Array, "state dof"]
-) -> tuple[Float[Array, "state phi"], Float[Array, "node dof count"]]:
-    """Sensitivity of the next state to the torques at the nodes, and the weights of the nodes."""
-    weights = jax.vmap(jax.vmap(hats), in_axes=(None, 0))(nodes, speed)
-    mean = jnp.mean(weights, axis=0)
-    return (by_force[:, :, None] * mean[None]).reshape(by_force.shape[0], -1), weights
+) -> Float[Array, "state phi"]:
+    """Sensitivity of the next state to the torques at the nodes, mean over some speeds."""
+    weights = spread(nodes, speed, jnp.full_like(speed, 1 / speed.shape[0]))
+    return (by_force[:, :, None] * weights[None]).reshape(by_force.shape[0], -1)
 
 
 def expand(
@@ -218,10 +225,10 @@ def quadratic(
     def columns(prev, following, kick, excess, by_force, by_parameter):
         """Mean sensitivity of x_{k+1} to phi, and expected score, over the nodes of one step."""
         speed = 0.5 * (prev + following - kick)[:, dof : 2 * dof]  # half the kick would count as signal
-        sensitivity, weights = friction_columns(nodes, speed, by_force)
+        sensitivity = friction_columns(nodes, speed, by_force)
         push = spd_solve(jnp.diag(q) + excess, kick.T).T
         pull = push @ by_force  # node dof
-        score = jnp.mean(pull[:, :, None] * weights, axis=0).ravel()
+        score = spread(nodes, speed, pull / speed.shape[0]).ravel()
         score = jnp.concatenate([score, jnp.mean(push, axis=0) @ by_parameter])
         expected = jnp.diag(spd_solve(jnp.diag(q) + excess, jnp.eye(q.shape[0], dtype=q.dtype)))
         square = 0.5 * q * (jnp.mean(push**2, axis=0) - expected)
@@ -432,7 +439,7 @@ class ScoringMStep(AbstractMStep):
     nodes: int = eqx.field(static=True, default=41)
     ridge: float = 1.0
     iterations: int = eqx.field(static=True, default=200)
-    stride: float = 1.5
+    stride: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
     """Largest change of a log variance in one step."""
     tie: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
     """Precision with which the ratios of the joints' process noises are held to those of the first model.

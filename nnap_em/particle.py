@@ -15,12 +15,13 @@ single precision is enough.  Arrays of particles have the particle axis last.
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower, symmetric
@@ -45,7 +46,7 @@ class ParticleHistory(NamedTuple):
     f: Float[Array, "time state particle"]
     """Mean of the next state, as seen from the next origin."""
     log_w: Float[Array, "time particle"]
-    """Normalised weights of p(x_k | y_{0:k})."""
+    """Log weights of p(x_k | y_{0:k}), up to a constant of each time."""
     log_ahead: Float[Array, "time particle"]
     """log psi~_{k+1}(f); the filter itself carries the weights exp(log_w + log_ahead)."""
     ancestors: Int[Array, "time particle"]
@@ -162,57 +163,153 @@ def _twist(
     return factor @ jnp.stack(solved).T, logdet
 
 
-def _apply(matrix: Float[Array, "row column"], x: Float[Array, "column particle"]) -> Float[Array, "row particle"]:
+Rows = list[Float[Array, " particle"]]
+"""The entries of a vector per particle: a list, because what is stacked does not fuse with what stands around it."""
+
+
+def _dot(row: Float[Array, " n"] | Rows, x: Rows) -> Float[Array, " particle"]:
+    s = row[0] * x[0]
+    for j in range(1, len(x)):
+        s = s + row[j] * x[j]
+    return s
+
+
+def _apply(matrix: Float[Array, "row column"], x: Rows) -> Rows:
     """matrix @ x, unrolled: it fuses with what stands around it, a batched matrix product does not."""
-    rows = []
-    for i in range(matrix.shape[0]):
-        s = matrix[i, 0] * x[0]
-        for j in range(1, matrix.shape[1]):
-            s = s + matrix[i, j] * x[j]
-        rows.append(s)
-    return jnp.stack(rows)
+    return [_dot(row, x) for row in matrix]
 
 
-class _Step(NamedTuple):
-    """What the particles need of the potential at one time; the fields carry a leading time axis."""
+class _Quadratic(NamedTuple):
+    """linear' x - x' precision x / 2 + constant, with a leading time axis."""
 
     precision: Float[Array, "*time state state"]
     linear: Float[Array, "*time state"]
+    constant: Float[Array, "*time"]
+
+    def __call__(self, x: Rows) -> Float[Array, " particle"]:
+        pull = [a - 0.5 * b for a, b in zip(self.linear, _apply(self.precision, x), strict=True)]
+        return _dot(pull, x) + self.constant
+
+
+class _Step(NamedTuple):
+    """What the particles need of the potential psi at one time; the fields carry a leading time axis.
+
+    With spread S, S S' = (V^-1 + precision)^-1 where V is the covariance of what moves the particles:
+    a particle of mean m moves to N(keep m + shift, S S').
+    """
+
+    log_psi: _Quadratic
+    log_ahead: _Quadratic
+    """Log of the integral of N(x; m, V) psi(x), of m."""
+    keep: Float[Array, "*time state state"]
+    shift: Float[Array, "*time state"]
     spread: Float[Array, "*time state state"]
-    logdet: Float[Array, "*time"]
 
-    def log_psi(self, x: Float[Array, "state particle"]) -> Float[Array, " particle"]:
-        return jnp.sum(x * (self.linear[:, None] - 0.5 * _apply(self.precision, x)), axis=0)
-
-    def look(
-        self, mean: Float[Array, "state particle"]
-    ) -> tuple[Float[Array, " particle"], Float[Array, "state particle"]]:
-        """Log of the integral of N(x; mean, L L') psi(x), and the pull S'(linear - precision mean)."""
-        drop = _apply(self.precision, mean)
-        pull = _apply(self.spread.T, self.linear[:, None] - drop)
-        log_ahead = jnp.sum(mean * (self.linear[:, None] - 0.5 * drop) + 0.5 * pull**2, axis=0)
-        return log_ahead - self.logdet, pull
+    def move(self, mean: Rows, noise: Rows) -> Rows:
+        kept, kicked = _apply(self.keep, mean), _apply(self.spread, noise)
+        return [a + b + c for a, b, c in zip(kept, self.shift, kicked, strict=True)]
 
 
 def _prepare(potentials: Potentials, start: Gaussian) -> _Step:
-    """Proposal spreads of all times; the first from the factor of the scaled prior, the others from I."""
+    """The steps of all times; the first from the scaled prior, the others from noise of covariance I."""
     time, n = potentials.linear.shape
-    factor = lower(cholesky(start.cov))
-    factors = jnp.concatenate([factor[None], jnp.tile(jnp.eye(n, dtype=factor.dtype)[None], (time - 1, 1, 1))])
-    spread, logdet = jax.vmap(_twist)(factors, potentials.precision)
-    return _Step(potentials.precision, potentials.linear, spread, logdet)
+    factor, eye = lower(cholesky(start.cov)), jnp.eye(n, dtype=start.cov.dtype)
+    factors = jnp.concatenate([factor[None], jnp.tile(eye[None], (time - 1, 1, 1))])
+
+    def one(factor, precision, linear):
+        spread, logdet = _twist(factor, precision)
+        cov = spread @ spread.T
+        keep = eye - cov @ precision
+        ahead = _Quadratic(symmetric(precision @ keep), keep.T @ linear, 0.5 * linear @ cov @ linear - logdet)
+        return _Step(_Quadratic(precision, linear, jnp.zeros_like(logdet)), ahead, keep, cov @ linear, spread)
+
+    return jax.vmap(one)(factors, potentials.precision, potentials.linear)
+
+
+def _threefry(key: UInt[Array, "2"], a: UInt[Array, "*counter"], b: UInt[Array, ""]) -> tuple[Array, Array]:
+    """Two random words per counter (a, b): Threefry-2x32 with 20 rounds [Salmon et al. 2011, sec. 4.1].
+
+    `jax.extend.random.threefry_2x32` unrolled, so that it fuses with the use of the words.
+    """
+    keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(0x1BD11BDA))
+    a, b = a + keys[0], b + keys[1]
+    for group in range(5):
+        for turn in ((13, 15, 26, 6), (17, 29, 16, 24))[group % 2]:
+            a = a + b
+            b = a ^ ((b << jnp.uint32(turn)) | (b >> jnp.uint32(32 - turn)))
+        a, b = a + keys[(group + 1) % 3], b + keys[(group + 2) % 3] + jnp.uint32(group + 1)
+    return a, b
+
+
+def uniforms(
+    key: PRNGKeyArray, time: Int[Array, ""], rows: int, count: int, dtype=jnp.float32
+) -> Float[Array, "{rows} {count}"]:
+    """Uniform numbers of one time in [0, 1), multiples of 2^-24; they do not depend on how many times there are."""
+    counter = jnp.arange(rows * count, dtype=jnp.uint32).reshape(rows, count)
+    word, _ = _threefry(jax.random.bits(key, (2,), jnp.uint32), counter, time.astype(jnp.uint32))
+    return (word >> jnp.uint32(8)).astype(dtype) * 2**-24
+
+
+def normals(key: PRNGKeyArray, time: Int[Array, ""], rows: int, count: int, dtype=jnp.float32) -> Rows:
+    """Standard normal numbers of one time, in single precision by the method of Box & Muller [1958].
+
+    The angle is half a turn, t in [-pi/2, pi/2] with sin t and cos t as Taylor series good to 4e-6, and a sign.
+    """
+    if dtype != jnp.float32:
+        return list(jax.random.normal(jax.random.fold_in(key, time), (rows, count), dtype))
+    words = jax.random.bits(key, (2,), jnp.uint32)
+
+    def two_rows(_, pair):
+        a, b = _threefry(words, pair * count + jnp.arange(count, dtype=jnp.uint32), time.astype(jnp.uint32))
+        radius = jnp.sqrt(-2 * jnp.log((a.astype(dtype) + 0.5) * 2**-32))
+        t = jax.lax.bitcast_convert_type(b, jnp.int32).astype(dtype) * (math.pi * 2**-32)
+        z = t * t
+        sine = t * (1 + z * (-1 / 6 + z * (1 / 120 + z * (-1 / 5040 + z / 362880))))
+        cosine = 1 + z * (-1 / 2 + z * (1 / 24 + z * (-1 / 720 + z * (1 / 40320 - z / 3628800))))
+        return None, (radius * sine, jnp.where(b & jnp.uint32(1), radius, -radius) * cosine)
+
+    # a loop, or XLA would draw the numbers anew wherever they are used
+    _, drawn = jax.lax.scan(two_rows, None, jnp.arange((rows + 1) // 2, dtype=jnp.uint32))
+    return [row for pair in zip(*drawn, strict=True) for row in pair][:rows]
+
+
+def _cumsum(x: Float[Array, "*batch n"], block: int = 32) -> Float[Array, "*batch n"]:
+    """`jnp.cumsum` along the last axis as triangular matrix products, within blocks and over them: faster."""
+    n = x.shape[-1]
+    padded = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % block)])
+    within = _before(padded.reshape(*x.shape[:-1], -1, block), 0)
+    total = within + _before(within[..., -1], 1)[..., None]
+    return total.reshape(padded.shape)[..., :n]
+
+
+def _before(x: Float[Array, "*batch n"], k: int) -> Float[Array, "*batch n"]:
+    """Sums of x over all places up to k before each."""
+    square = jnp.ones((x.shape[-1], x.shape[-1]), x.dtype)
+    return jnp.matmul(x, jnp.triu(square, k), precision=jax.lax.Precision.HIGHEST)
 
 
 def systematic(log_w: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
     """Sorted indices of `count` draws by one uniform `offset` [Kitagawa 1996]."""
-    reach = jnp.cumsum(jnp.exp(log_w - jnp.max(log_w)))
-    before = jnp.ceil(reach / reach[-1] * count - offset).astype(jnp.int32)  # draws among the particles up to here
-    drops = jnp.zeros(count, jnp.int32).at[before].add(1, mode="drop")
-    return jnp.minimum(jnp.cumsum(drops), log_w.shape[0] - 1)
+    return _sweep(_cumsum(jnp.exp(log_w - jnp.max(log_w))), offset, count)
+
+
+def _sweep(reach: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
+    """Where (j + offset) / count of the total falls among the cumulative weights, for each j."""
+    before = jnp.ceil(reach * (count / reach[-1]) - offset).astype(jnp.int32)  # draws among the particles up to here
+    drops = jnp.zeros(count + 1, reach.dtype).at[jnp.clip(before, 0, count)].add(1, mode="promise_in_bounds")
+    return jnp.minimum(_cumsum(drops[:count]).astype(jnp.int32), reach.shape[0] - 1)
 
 
 def _cast(tree, dtype):
     return jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, tree)
+
+
+def _where(condition: Bool[Array, ""], change: Callable, value):
+    """change(value) where the condition holds, or else value.
+
+    Unlike `lax.cond` it costs nothing under `vmap` where no element of the batch needs the change.
+    """
+    return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(c[0]), change(c[1])), (condition, value))[1]
 
 
 def particle_filter(
@@ -232,54 +329,67 @@ def particle_filter(
     steps = _cast(_prepare(potentials, start), dtype)
     model, scale_, u, y = _cast((model, scale, model.inputs(seq), y), dtype)
     r = jnp.exp(model.log_r)
-    size = jnp.asarray(num_particles, dtype)
+    size, flat = jnp.asarray(num_particles, dtype), jnp.full(num_particles, -math.log(num_particles), dtype)
+    everyone = jnp.arange(num_particles, dtype=jnp.int32)
+    states, readings = scale.shape[0], y.shape[1]
 
     def log_g(x, u, y, observed):
-        e = y[:, None] - jax.vmap(model.emission, in_axes=(1, None), out_axes=1)(x, u)
-        terms = -0.5 * (e**2 / r[:, None] + model.log_r[:, None] + math.log(2 * math.pi))
-        return jnp.sum(jnp.where(observed[:, None], terms, 0.0), axis=0)
+        g = jax.vmap(model.emission, in_axes=(1, None), out_axes=1)(x, u)
+        terms = [-0.5 * ((y[i] - g[i]) ** 2 / r[i] + model.log_r[i] + math.log(2 * math.pi)) for i in range(readings)]
+        return sum((jnp.where(observed[i], terms[i], 0.0) for i in range(readings)), jnp.zeros((), dtype))
 
     def step(carry, slices):
-        x, f, pull, log_w, ess = carry
-        offset, noise, arrive, leave, origin, origin_next, u, y, observed, now, following = slices
-        resample = arrive & (ess < 0.5 * size)
-        ancestors = jnp.where(
-            resample,
-            systematic(log_w, offset, num_particles),
-            jnp.arange(num_particles, dtype=jnp.int32),
-        )
-        moved = f[:, ancestors] + _apply(now.spread, pull[:, ancestors] + noise)
-        x = jnp.where(arrive, moved, x)
-        state = origin[:, None] + scale_[:, None] * x
-        f = jax.vmap(model.transition, in_axes=(1, None), out_axes=1)(state, u)
-        f = jnp.where(leave, (f - origin_next[:, None]) / scale_[:, None], x)
-        log_ahead, pull = following.look(f)
-        log_ahead = jnp.where(leave, log_ahead, 0.0)
-        filtered = jnp.where(resample, -jnp.log(size), log_w) + log_g(state, u, y, observed) - now.log_psi(x)
-        grown = filtered + log_ahead
-        total = jax.nn.logsumexp(grown)
-        log_w = jnp.where(arrive, grown - total, log_w)
-        ess = 1 / jnp.sum(jnp.exp(2 * log_w))
-        filtered = log_w - log_ahead
-        filtered = filtered - jax.nn.logsumexp(filtered)
-        out = (x, f, filtered, log_ahead, ancestors, ess, jnp.where(arrive, total, 0.0).astype(exact))
-        return (x, f, pull, log_w, ess), out
+        f, log_w, ess = carry
+        time, offset, arrive, leave, origin, origin_next, u, y, observed, now, following = slices
 
-    mean = jnp.tile(start.mean.astype(dtype)[:, None], (1, num_particles))
-    log_ahead, pull = jax.tree.map(lambda a: a[0], steps).look(mean)
-    flat = jnp.full(num_particles, -math.log(num_particles), dtype)
+        def resample(old):
+            f, log_w, _ = old
+            ancestors = systematic(log_w, offset, num_particles)
+            return [row[ancestors] for row in f], flat, ancestors
+
+        f, log_w, ancestors = _where(arrive & (ess < 0.5 * size), resample, (f, log_w, everyone))
+        noise = normals(key_noise, time, states, num_particles, dtype)
+        x = [jnp.where(arrive, a, b) for a, b in zip(now.move(f, noise), f, strict=True)]
+        state = jnp.stack([origin[i] + scale_[i] * x[i] for i in range(states)])
+        f = jax.vmap(model.transition, in_axes=(1, None), out_axes=1)(state, u)
+        f = [jnp.where(leave, (f[i] - origin_next[i]) / scale_[i], x[i]) for i in range(states)]
+        log_ahead = jnp.where(leave, following.log_ahead(f), 0.0)
+        grown = log_w + log_g(state, u, y, observed) - now.log_psi(x) + log_ahead
+        top = jnp.max(grown)
+        w = jnp.exp(grown - top)
+        mass = jnp.sum(w)
+        total = top + jnp.log(mass)
+        log_w = jnp.where(arrive, grown - total, log_w)
+        ess = jnp.where(arrive, mass**2 / jnp.sum(w**2), ess)
+        out = (jnp.stack(x), jnp.stack(f), log_w - log_ahead, log_ahead, ancestors, ess)
+        return (f, log_w, ess), (*out, jnp.where(arrive, total, 0.0).astype(exact))
+
+    mean = [jnp.full(num_particles, m, dtype) for m in start.mean.astype(dtype)]
+    log_ahead = jax.tree.map(lambda a: a[0], steps).log_ahead(mean)
     later = jax.tree.map(lambda a: jnp.concatenate([a[1:], a[-1:]]), (origin, steps))
     observed = observed & seq.valid[:, None]
-    # Drawn at once, time first: the numbers of a time do not depend on how many follow.
+    # Drawn time by time: the numbers of a time do not depend on how many follow.
+    times = jnp.arange(y.shape[0], dtype=jnp.int32)
     offset = jax.random.uniform(key_offset, y.shape[:1], dtype)
-    noise = jax.random.normal(key_noise, (y.shape[0], *mean.shape), dtype)
     _, (x, f, log_w, ahead, ancestors, ess, total) = jax.lax.scan(
         step,
-        (mean, mean, pull, flat, size),
-        (offset, noise, arrive, leave, origin, later[0], u, y, observed, steps, later[1]),
+        (mean, flat, size),
+        (times, offset, arrive, leave, origin, later[0], u, y, observed, steps, later[1]),
     )
     loglik = jnp.sum(total) + log_ahead[0].astype(exact)
     return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ahead, ancestors, leave, ess, loglik)
+
+
+def _exp2(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """2^x, in single precision to 4e-6 and at least 2^-126: a Taylor series times a power of two."""
+    if x.dtype != jnp.float32:
+        return jnp.exp2(x)
+    x = jnp.maximum(x, -126.0)
+    whole = jnp.round(x)
+    z = (x - whole) * math.log(2)
+    power = 1 + z * (1 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z / 120))))
+    shift = whole.astype(jnp.int32) << 23
+    return jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(power, jnp.int32) + shift, jnp.float32)
 
 
 class AbstractBackward(eqx.Module):
@@ -316,20 +426,30 @@ class ExactBackward(AbstractBackward):
     def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
         spare = -log_w.shape[0] % self.block
         centre = jnp.mean(f, axis=1, keepdims=True)  # or the squares below would cancel
-        x_next, f = x_next - centre, f - centre
-        logits = jnp.pad(log_w - 0.5 * jnp.sum(f**2, axis=0), (0, spare), constant_values=-jnp.inf)[None, :]
-        f = jnp.pad(f, ((0, 0), (0, spare)))
+        f = f - centre
+        x_next = (x_next - centre) / math.log(2)  # from here on logarithms are to base 2
+        level = jnp.maximum((log_w - 0.5 * jnp.sum(f**2, axis=0)) / math.log(2), -1e30)
+        level = jnp.pad(level, (0, spare), constant_values=-1e30).reshape(-1, self.block)
+        f = jnp.pad(f, ((0, 0), (0, spare))).reshape(f.shape[0], -1, self.block)
+
+        def weigh(_, particles):
+            f, level = particles
+            for i in range(f.shape[0]):
+                level = level + f[i][:, None] * x_next[i][None]
+            top = jnp.max(level, axis=0)
+            return None, (top, jnp.sum(_exp2(level - top[None]), axis=0))
+
+        _, (tops, sums) = jax.lax.scan(weigh, None, (jnp.swapaxes(f, 0, 1), level[:, :, None]))
+        top = jnp.max(tops, axis=0)
+        reach = _before((sums * _exp2(tops - top[None])).T, 0).T
+        target = uniform[0] * reach[-1]
+        outer = jnp.minimum(jnp.sum(reach <= target[None], axis=0), reach.shape[0] - 1)
+        before = jnp.take_along_axis(jnp.pad(reach, ((1, 0), (0, 0))), outer[None], axis=0)[0]
+        within = level[outer] - top[:, None]
         for i in range(f.shape[0]):
-            logits = logits + x_next[i][:, None] * f[i][None, :]
-        paths = x_next.shape[1]
-        w = jnp.exp(logits - jnp.max(logits, axis=1, keepdims=True)).reshape(paths, -1, self.block)
-        reach = jnp.cumsum(jnp.sum(w, axis=2), axis=1)
-        level = uniform[0] * reach[:, -1]
-        outer = jnp.minimum(jnp.sum(reach <= level[:, None], axis=1), reach.shape[1] - 1)
-        chosen = jnp.take_along_axis(w, outer[:, None, None], axis=1)[:, 0]
-        before = jnp.where(outer > 0, jnp.take_along_axis(reach, jnp.maximum(outer - 1, 0)[:, None], axis=1)[:, 0], 0.0)
-        within = jnp.cumsum(chosen, axis=1)
-        rest = jnp.minimum(level - before, within[:, -1] * (1 - jnp.finfo(level.dtype).eps))
+            within = within + f[i][outer] * x_next[i][:, None]
+        within = _before(_exp2(within), 0)
+        rest = jnp.minimum(target - before, within[:, -1] * (1 - jnp.finfo(target.dtype).eps))
         inner = jnp.sum(within <= rest[:, None], axis=1)
         return (outer * self.block + inner).astype(jnp.int32)
 
@@ -338,7 +458,8 @@ class MetropolisBackward(AbstractBackward):
     """A few independent Metropolis steps from the genealogical parent [Bunch & Godsill 2013; Dau & Chopin 2023].
 
     O(N) per step.  Candidates come from the weights that the filter carries, so that only the transition density and
-    psi~ are left in the ratio.
+    psi~ are left in the ratio.  A candidate is a random entry of a systematic draw that is made anew for each step:
+    each path sees independent draws from the weights, without a search per path.
     """
 
     steps: int = eqx.field(static=True, default=4)
@@ -350,19 +471,25 @@ class MetropolisBackward(AbstractBackward):
     def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
         choose, accept = jnp.split(uniform, 2)
         carried = log_w + log_ahead
-        reach = jnp.cumsum(jnp.exp(carried - jnp.max(carried)))
-        candidates = jnp.searchsorted(reach, (choose * reach[-1]).ravel(), side="right")
-        candidates = jnp.minimum(candidates, f.shape[1] - 1).astype(jnp.int32).reshape(choose.shape)
+        reach = _cumsum(jnp.exp(carried - jnp.max(carried)))
+        paths = parent.shape[0]
 
         def score(index):
-            return -0.5 * jnp.sum((x_next - f[:, index]) ** 2, axis=0) - log_ahead[index]
+            e = [x_next[i] - f[i][index] for i in range(f.shape[0])]
+            return -0.5 * _dot(e, e) - log_ahead[index]
 
-        index, value = parent, score(parent)
-        for i in range(self.steps):
-            proposed = score(candidates[i])
-            better = jnp.log(accept[i]) < proposed - value
-            index = jnp.where(better, candidates[i], index)
-            value = jnp.where(better, proposed, value)
+        def step(now, uniform):
+            index, value = now
+            choose, accept = uniform
+            place = choose * paths
+            whole = jnp.floor(place)
+            draws = _sweep(reach, place[0] - whole[0], paths)
+            candidate = draws[jnp.minimum(whole.astype(jnp.int32), paths - 1)]
+            proposed = score(candidate)
+            better = jnp.log(accept) < proposed - value
+            return (jnp.where(better, candidate, index), jnp.where(better, proposed, value)), None
+
+        (index, _), _ = jax.lax.scan(step, (parent, score(parent)), (choose, accept))
         return index
 
 
@@ -374,17 +501,18 @@ def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int
 
     def step(carry, slices):
         index, x_next = carry
-        uniform, active, x, f, log_w, log_ahead, ancestors = slices
-        parent = ancestors[index]
-        index = jnp.where(active, backward(x_next, f, log_w, log_ahead, parent, uniform), parent)
+        time, active, x, f, log_w, log_ahead, ancestors = slices
+        uniform = uniforms(key_steps, time, backward.draws, num_paths, dtype)
+        chosen = backward(x_next, f, log_w, log_ahead, ancestors[index], uniform)
+        index = jnp.where(active, chosen, index)  # nothing is resampled on arrival in the padding
         here = x[:, index]
         return (index, here), (here, x_next - f[:, index])
 
     h = history
-    uniform = jax.random.uniform(key_steps, (h.x.shape[0] - 1, backward.draws, num_paths), dtype)
+    times = jnp.arange(h.x.shape[0] - 1, dtype=jnp.int32)
     end = h.x[-1][:, last]
     before = jax.tree.map(lambda a: a[:-1], (h.active, h.x, h.f, h.log_w, h.log_ahead))
-    _, (x, kick) = jax.lax.scan(step, (last, end), (uniform, *before, h.ancestors[1:]), reverse=True)
+    _, (x, kick) = jax.lax.scan(step, (last, end), (times, *before, h.ancestors[1:]), reverse=True)
     x = jnp.swapaxes(jnp.concatenate([x, end[None]]), 1, 2).astype(exact)
     kick = jnp.swapaxes(kick, 1, 2).astype(exact)
     return Trajectories(h.origin[:, None] + h.scale[None, None] * x, h.scale[None, None] * kick)

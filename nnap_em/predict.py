@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian, cholesky, lower
 from .identify import Identified, phi_samples
-from .mstep import hats
 from .smoother import CubatureSmoother, GaussianSmoother, Posterior
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
@@ -76,7 +75,7 @@ def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key:
     parameters = prior.read(model)[None] + deviations[:, dof * count :]
 
     def advance(x, u, table, parameters):
-        force = jnp.sum(jax.vmap(hats)(nodes, x[dof : 2 * dof]) * table, axis=-1)
+        force = jax.vmap(jnp.interp)(x[dof : 2 * dof], nodes, table)
         now = prior.write(model, parameters)
         return now.transition(x, u, force), now.shown(x, u)
 

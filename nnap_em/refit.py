@@ -68,7 +68,7 @@ def refit(
 
     Without `noise` the process and reading noise stay as they are.
     """
-    rule = eqx.tree_at(lambda r: r.stride, m_step, jnp.asarray(m_step.stride if noise else 0.0))
+    rule = eqx.tree_at(lambda r: r.stride, m_step, m_step.stride if noise else jnp.zeros_like(m_step.stride))
     core = rule.core(model)
 
     def program(core: Core, path: Gaussian):

@@ -110,10 +110,12 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
 
     def one(scene, memory, acceleration):
         scene = _scene(base, scene)
+        extra = effect.force(scene, memory) + effect.friction(scene.friction, scene) - scene.friction
         true = effect.physics(system, scene.time)
-        body = system.bias(scene.q, scene.v) - true.bias(scene.q, scene.v)
-        body = body + (system.mass(scene.q) - true.mass(scene.q)) @ acceleration
-        return body + effect.force(scene, memory) + effect.friction(scene.friction, scene) - scene.friction
+        if true is system:
+            return extra
+        slow = (system.mass(scene.q) - true.mass(scene.q)) @ acceleration
+        return extra + slow + system.bias(scene.q, scene.v) - true.bias(scene.q, scene.v)
 
     force = jax.vmap(one)(driven, memory, track.acceleration) + drive - scenes.drive
 
@@ -169,7 +171,7 @@ def _sheet(log_q, log_r, start, nodes, here: Local, middle, found: Columns, data
         active = active_steps(jnp.asarray(seq.valid))
         filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, y, observed, active)
         moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-        torque, _ = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
+        torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
         of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
         states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
         readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, fill_missing
-from .gaussian import Gaussian, cholesky, cubature, lower
+from .gaussian import Gaussian, cholesky, cubature, lower, product
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, kalman_filter, linear_reading, rts
 from .model import AbstractModel
 
@@ -83,7 +83,7 @@ class GaussianSmoother(AbstractSmoother):
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses compete."""
     iterations: int = eqx.field(static=True, default=1)
-    """Relinearisations about the smoothed path, at least 1."""
+    """Relinearisations about the smoothed path."""
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
 
@@ -92,15 +92,7 @@ class GaussianSmoother(AbstractSmoother):
         y, observed = fill_missing(seq.y)
         observed = observed & seq.valid[:, None]
         u, active = model.inputs(seq), active_steps(jnp.asarray(seq.valid))
-        starts, log_weight = self.bank.hypotheses(model.start)
-        head = self.window
-
-        def loglik_from(start):
-            return ekf(model, start, u[:head], y[:head], observed[:head], active[:head], self.linearise).loglik
-
-        score = jax.vmap(loglik_from)(starts) + log_weight
-        best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
-        start = jax.tree.map(lambda a: a[best], starts)
+        start = self.likeliest(model, u, y, observed, active)
 
         def follow(inflation):
             loose = eqx.tree_at(lambda m: m.log_q, model, model.log_q + inflation)
@@ -115,6 +107,20 @@ class GaussianSmoother(AbstractSmoother):
         loglik = tracks[0].loglik
         best = jnp.argmax(jnp.where(jnp.isfinite(loglik), loglik, -jnp.inf))
         return jax.tree.map(lambda a: a[best], tracks)
+
+    def likeliest(self, model, u, y, observed, active) -> Gaussian:
+        """The start of the bank that the first samples speak for."""
+        starts, log_weight = self.bank.hypotheses(model.start)
+        if log_weight.shape[0] == 1:
+            return jax.tree.map(lambda a: a[0], starts)
+        head = self.window
+
+        def loglik_from(start):
+            return ekf(model, start, u[:head], y[:head], observed[:head], active[:head], self.linearise).loglik
+
+        score = jax.vmap(loglik_from)(starts) + log_weight
+        best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
+        return jax.tree.map(lambda a: a[best], starts)
 
     def relinearise(self, model, path: Gaussian, seq: Dataset) -> tuple[Filtered, Smoothed]:
         """One pass of the iterated smoother: all steps linearised about `path` at once [Bell 1994]."""
@@ -146,7 +152,7 @@ def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
     prev, following = pair_nodes(smoothed)
     endless = jnp.full_like(filtered.loglik, jnp.inf)
     affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-    kick = following - (jnp.squeeze(affine.matrix @ prev[..., None], -1) + affine.offset)
+    kick = following - (jnp.sum(affine.matrix * prev[..., None, :], axis=-1) + affine.offset)
     return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
 
 
@@ -157,10 +163,11 @@ def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Fl
         n = mean.shape[0]
         unit = cubature(2 * n, mean.dtype)
         later = lower(cholesky(cov_next))
-        rest = lower(cholesky(cov - gain @ cov_next @ gain.T + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
-        spread_next = unit[:, :n] @ later.T
+        left = cov - product(product(gain, cov_next), gain.T)
+        rest = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
+        spread_next = product(unit[:, :n], later.T)
         following = mean_next[None] + spread_next
-        return mean[None] + spread_next @ gain.T + unit[:, n:] @ rest.T, following
+        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], rest.T), following
 
     mean, cov = smoothed.state
     return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -18,8 +18,8 @@ _ELEMENTWISE = {  # primitive to NumPy
     "max": "np.maximum({}, {})", "min": "np.minimum({}, {})", "pow": "{} ** {}", "atan2": "np.arctan2({}, {})",
     "rem": "np.fmod({}, {})", "square": "{0} * {0}", "rsqrt": "1.0 / np.sqrt({})", "abs": "np.abs({})",
     "logistic": "1.0 / (1.0 + np.exp(-{}))", "clamp": "np.minimum(np.maximum({1}, {0}), {2})", "sign": "np.sign({})",
-    "select_n": "np.where({0}, {2}, {1})", "is_finite": "np.isfinite({})", "not": "np.logical_not({})",
-    "and": "np.logical_and({}, {})", "or": "np.logical_or({}, {})", "xor": "np.logical_xor({}, {})",
+    "select_n": "np.where({0}, {2}, {1})", "is_finite": "np.isfinite({})", "not": "~{}",
+    "and": "{} & {}", "or": "{} | {}", "xor": "{} ^ {}",
     "eq": "{} == {}", "ne": "{} != {}", "lt": "{} < {}", "le": "{} <= {}", "gt": "{} > {}", "ge": "{} >= {}",
     "asinh": "np.arcsinh({})", "acosh": "np.arccosh({})", "atanh": "np.arctanh({})", "asin": "np.arcsin({})",
     "acos": "np.arccos({})", "atan": "np.arctan({})", "round": "np.round({})",
@@ -187,7 +187,7 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
     if name in _SAME:
         return operands
     if name == "convert_element_type":
-        return [_each(writer, "{} * 1.0", operands) if given["new_dtype"].kind == "f" else operands[0]]
+        return [_each(writer, _converted(_dtype(equation.invars[0]).kind, given["new_dtype"].kind), operands)]
     if name == "integer_pow":
         return [_each(writer, f"{{}} ** {given['y']}", operands)]
     if name in _ELEMENTWISE:
@@ -197,6 +197,15 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
     if name == "dot_general":
         return [_dot(writer, operands[0], operands[1], given["dimension_numbers"])]
     return [_scatter(writer, equation, operands)] if name in _SCATTERED else _move(equation, operands)
+
+
+def _converted(old: str, new: str) -> str:
+    """The form of a conversion between kinds of numbers."""
+    if new == "f":
+        return "{} * 1.0"
+    if new == "i":
+        return "np.trunc({}).astype(int)" if old == "f" else "{} * 1"
+    return "{} != 0"
 
 
 def _constant(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:

@@ -15,14 +15,14 @@ from nnap_em.friction import FrictionNetwork, NoFriction
 from nnap_em.gaussian import Gaussian
 from nnap_em.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.model import StateSpaceModel
-from nnap_em.mstep import ParameterPrior, Quadratic, Weights, expand, hats
+from nnap_em.mstep import ParameterPrior, Quadratic, Weights, expand, spread
 from nnap_em.simulate import simulate
 from nnap_em.smoother import ExtendedKalmanSmoother, Posterior, StartBank, active_steps
 from nnap_em.systems.pendulum import Pendulum
 from nnap_em.systems.slide import Slide
 
 DT = 0.05
-NODES = jnp.asarray([[-8.0, -2.0, 0.5, 3.0, 9.0]])  # beyond all speeds, so that the hats interpolate v exactly
+NODES = jnp.asarray([[-8.0, -2.0, 0.5, 3.0, 9.0]])  # beyond all speeds, so that the nodes interpolate v exactly
 NO_FRICTION = NoFriction(jnp.ones(1))
 MASS = ParameterPrior(("m",), jnp.asarray([1.2]), jnp.asarray([0.1]))
 
@@ -151,7 +151,7 @@ def test_score_is_the_gradient_of_the_likelihood(name, request):
     gradient = _gradient(case)
     noise = jnp.concatenate([gradient.log_q, gradient.log_r])
     np.testing.assert_allclose(case.found.noise_score, noise, rtol=1e-6, atol=1e-6)  # differences of step 1e-4
-    # the hats sum to 1, so the sum of the node scores belongs to a constant force. On the slide all is linear: exact;
+    # the weights of the nodes sum to 1, so the sum of the node scores belongs to a constant force. On the slide exact;
     # the pendulum's Jacobian moves with force and mass, which the score takes at the mean only: 3 %
     rel = 1e-6 if name == "slide" else 0.03
     assert float(jnp.sum(case.found.score[:-1])) == pytest.approx(float(gradient.force), rel=rel)
@@ -159,7 +159,7 @@ def test_score_is_the_gradient_of_the_likelihood(name, request):
 
 
 def test_torque_score_at_the_nodes_is_that_of_viscous_friction(slide):
-    """The hats interpolate, so sum_i v_i score_i belongs to a force proportional to velocity."""
+    """The nodes interpolate, so sum_i v_i score_i belongs to a force proportional to velocity."""
     found = slide.found.score[:-1] @ NODES[0]
     expected = -_gradient(slide).damping
     inside = active_steps(slide.seq.valid)[:-1]
@@ -220,25 +220,28 @@ def test_noise_information_is_fishers_on_average(slides):
     np.testing.assert_allclose(score.T @ score / n, expected, atol=4.5 * np.diag(expected).max() * np.sqrt(2 / n))
 
 
-def test_hats_are_a_partition_of_unity_that_interpolates():
+def _weights(nodes, v):
+    """What one speed gives to every node."""
+    return np.asarray(jax.vmap(lambda v: spread(nodes[None], v[None, None], jnp.ones((1, 1)))[0])(jnp.asarray(v)))
+
+
+def test_weights_of_the_nodes_are_a_partition_of_unity_that_interpolates():
     nodes = NODES[0]
     v = jnp.linspace(-12.0, 12.0, 97)
-    weights = np.asarray(jax.vmap(lambda v: hats(nodes, v))(v))
+    weights = _weights(nodes, v)
     eps = np.finfo(float).eps
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=8 * eps)
     assert np.all(weights >= 0) and np.all((weights > 0).sum(1) <= 2)
     values = np.asarray([3.0, -1.0, 0.2, 5.0, 2.0])
     np.testing.assert_allclose(weights @ values, np.interp(v, nodes, values), atol=64 * eps)  # constant beyond the ends
-    np.testing.assert_allclose(jax.vmap(lambda v: hats(nodes, v))(nodes), np.eye(5), atol=eps)
+    np.testing.assert_allclose(_weights(nodes, nodes), np.eye(5), atol=eps)
 
 
 def _quadratic(seed: int, nodes, parameters: int = 0):
     """Score and information of phi as 400 readings of an interpolated torque would give."""
     rng = np.random.default_rng(seed)
     v = rng.normal(size=400) * np.asarray(nodes)[0, -1] / 2
-    rows = np.concatenate(
-        [np.asarray(jax.vmap(lambda v: hats(nodes[0], v))(jnp.asarray(v))), rng.normal(size=(400, parameters))], 1
-    )
+    rows = np.concatenate([_weights(nodes[0], v), rng.normal(size=(400, parameters))], 1)
     target = np.concatenate([-np.tanh(3 * np.asarray(nodes)[0]) - 0.1 * np.asarray(nodes)[0], np.full(parameters, 0.5)])
     information = rows.T @ rows / 0.1**2
     return jnp.asarray(target), jnp.asarray(information)

@@ -1,12 +1,13 @@
 """One sample interval: the order of the method, a reference integrator, and derivatives both ways."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from nnap_em.ode import integrate
+from nnap_em.ode import RK4, integrate
 
 X0 = jnp.asarray([1.2, -0.7])
 
@@ -67,3 +68,27 @@ def test_derivatives_agree():
         for e in jnp.eye(2)
     ]
     np.testing.assert_allclose(grad(X0), jnp.stack(number), atol=1e-8)
+
+
+class _Tableau(diffrax.AbstractERK):
+    """The method by its coefficients, as diffrax itself steps any Runge-Kutta method."""
+
+    tableau = diffrax.ButcherTableau(
+        a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+        b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+        b_error=np.zeros(4),
+        c=np.array([0.5, 0.5, 1.0]),
+    )
+    interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 4
+
+
+def test_one_loop_is_the_tableau():
+    term = diffrax.ODETerm(lambda t, y, args: _swing(y) + jnp.sin(3 * t) * args)
+    one, other = (
+        diffrax.diffeqsolve(term, solver, 0.1, 1.3, 0.1, X0, args=jnp.asarray([0.0, 2.0])).ys
+        for solver in (RK4(), _Tableau())
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-14)

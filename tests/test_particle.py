@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
+from jax.extend.random import threefry_2x32
 from jaxtyping import Array, Float
 
 from nnap_em.data import Dataset
@@ -16,9 +18,15 @@ from nnap_em.particle import (
     Lookahead,
     MetropolisBackward,
     ParticleSmoother,
+    _cumsum,
+    _exp2,
+    _threefry,
+    _where,
     ffbs,
+    normals,
     particle_filter,
     systematic,
+    uniforms,
 )
 from nnap_em.simulate import paper_experiment, paper_model
 from nnap_em.smoother import ExtendedKalmanSmoother, StartBank
@@ -241,3 +249,72 @@ def test_kick_is_the_process_noise_of_a_path():
     kick = exact.x[1:] - jax.jit(step)(exact.x[:-1], seq.u[:-1])
     # the cached f is good to single rounding of the state: some eps * |x| = 6e-7, against a process noise of 2e-4
     np.testing.assert_allclose(exact.kick, kick, atol=1e-5)
+
+
+def test_random_words_are_those_of_threefry():
+    key, counter = jnp.array([0x13198A2E, 0x03707344], jnp.uint32), jnp.array([0x243F6A88, 5], jnp.uint32)
+    a, b = _threefry(key, counter, jnp.uint32(7))
+    known = threefry_2x32(key, jnp.concatenate([counter, jnp.full(2, 7, jnp.uint32)]))
+    np.testing.assert_array_equal(jnp.concatenate([a, b]), known)
+
+
+@functools.cache
+def _noise():
+    """Three rows of normals at 10 times of 20 keys: [key time row particle]."""
+    draw = jax.vmap(lambda k, t: jnp.stack(normals(k, t, 3, 1001)), in_axes=(None, 0))
+    keys = jax.random.split(jax.random.key(21), 20)
+    return np.asarray(jax.jit(jax.vmap(draw, in_axes=(0, None)))(keys, jnp.arange(10)), float)
+
+
+def test_normals_are_normal():
+    z = _noise()
+    assert scipy.stats.kstest(z.ravel(), "norm").pvalue > 1e-3
+    error = 4 / np.sqrt(z.size)
+    # E z^2n = 1, 3, 15 with variances 2, 96, 10170
+    assert abs(np.mean(z)) < error and abs(np.mean(z**3)) < np.sqrt(15) * error
+    for power, mean, variance in ((2, 1, 2), (4, 3, 96), (6, 15, 10170)):
+        assert abs(np.mean(z**power) - mean) < np.sqrt(variance) * error
+    low, high = np.min(z), np.max(z)  # of 600 000: beyond 4, within 6.5
+    assert -6.5 < low < -4 and 4 < high < 6.5
+
+
+def test_normals_of_other_rows_times_and_keys_are_independent():
+    z = _noise()
+    pairs = [(z[:-1], z[1:]), (z[:, :-1], z[:, 1:]), (z[..., :-1], z[..., 1:])]
+    pairs += [(z[:, :, i], z[:, :, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    for a, b in pairs:
+        for f in (lambda x: x, lambda x: x**2 - 1, np.abs):
+            p, q = f(a) - np.mean(f(a)), f(b) - np.mean(f(b))
+            assert abs(np.mean(p * q)) < 4.5 * np.std(p) * np.std(q) / np.sqrt(p.size)
+
+
+def test_normals_keep_double_precision():
+    z = normals(jax.random.key(1), jnp.asarray(3), 3, 50, jnp.float64)
+    assert len(z) == 3 and z[0].dtype == jnp.float64
+
+
+def test_uniforms_are_uniform():
+    u = np.asarray(jax.vmap(lambda t: uniforms(jax.random.key(3), t, 2, 5000))(jnp.arange(20)), float)
+    assert scipy.stats.kstest(u.ravel(), "uniform").pvalue > 1e-3
+    assert u.min() >= 0 and u.max() < 1
+    assert abs(np.corrcoef(u.reshape(40, -1)) - np.eye(40)).max() < 5 / np.sqrt(5000)
+
+
+def test_cumulative_sum_of_blocks_is_the_plain_one():
+    x = jax.random.uniform(jax.random.key(2), (3, 1001), jnp.float32)
+    x = jnp.where(x < 0.3, 0.0, x)
+    ours = np.asarray(_cumsum(x))
+    np.testing.assert_allclose(ours, np.cumsum(np.asarray(x, float), axis=1), rtol=1e-6)
+    # no rounding gives a share to a weight of 0
+    assert np.all((np.diff(ours) == 0) == (np.asarray(x)[:, 1:] == 0))
+
+
+def test_power_of_two():
+    x = np.linspace(-126, 60, 10_001, dtype=np.float32)
+    np.testing.assert_allclose(_exp2(jnp.asarray(x)), 2.0 ** x.astype(float), rtol=4e-6)
+    assert 0 <= float(_exp2(jnp.float32(-np.inf))) < 1e-37
+
+
+def test_change_happens_where_it_is_due():
+    change = jax.jit(jax.vmap(lambda due, x: _where(due, lambda x: x + 1, x)))
+    np.testing.assert_array_equal(change(jnp.array([True, False, True]), jnp.arange(3)), [1, 1, 3])

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..elementary import cos, sin
 from .base import AbstractSystem
 
 Scalar = Float[Array, ""]
@@ -70,23 +71,21 @@ class TwoLinkArm(AbstractSystem):
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         rotor = self.gr**2 * self.Ir
         m22 = self.I2 + self.m2 * self.lc2**2
-        coupling = self.m2 * self.l1 * self.lc2 * jnp.cos(q[1])
+        coupling = self.m2 * self.l1 * self.lc2 * cos(q[1])
         m11 = self.I1 + self.m1 * self.lc1**2 + m22 + self.m2 * self.l1**2 + 2 * coupling + rotor + self.Ir
         m12 = m22 + coupling - self.gr * self.Ir
         return jnp.stack([jnp.stack([m11, m12]), jnp.stack([m12, m22 + rotor])])
 
     def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        h = self.m2 * self.l1 * self.lc2 * jnp.sin(q[1])
-        gravity2 = self.m2 * self.lc2 * self.g * jnp.sin(q[0] + q[1])
-        gravity1 = (self.m1 * self.lc1 + self.m2 * self.l1) * self.g * jnp.sin(q[0]) + gravity2
+        h = self.m2 * self.l1 * self.lc2 * sin(q[1])
+        gravity2 = self.m2 * self.lc2 * self.g * sin(q[0] + q[1])
+        gravity1 = (self.m1 * self.lc1 + self.m2 * self.l1) * self.g * sin(q[0]) + gravity2
         return jnp.stack([gravity1 - h * v[1] * (2 * v[0] + v[1]), gravity2 + h * v[0] ** 2])
 
     def tip(self, q: Float[Array, " dof"]) -> Float[Array, " axis"]:
         outer = q[0] + q[1]
-        return jnp.stack(
-            [self.l1 * jnp.sin(q[0]) + self.l2 * jnp.sin(outer), -self.l1 * jnp.cos(q[0]) - self.l2 * jnp.cos(outer)]
-        )
+        return jnp.stack([self.l1 * sin(q[0]) + self.l2 * sin(outer), -self.l1 * cos(q[0]) - self.l2 * cos(outer)])
 
     def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        outer = self.m2 * self.lc2 * jnp.cos(q[0] + q[1])
-        return -jnp.stack([(self.m1 * self.lc1 + self.m2 * self.l1) * jnp.cos(q[0]) + outer, outer])
+        outer = self.m2 * self.lc2 * cos(q[0] + q[1])
+        return -jnp.stack([(self.m1 * self.lc1 + self.m2 * self.l1) * cos(q[0]) + outer, outer])

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..elementary import cos, sin
 from .base import AbstractSystem
 
 
@@ -36,7 +37,7 @@ class Pendulum(AbstractSystem):
         return (self.I + self.m * self.lc**2)[None, None] + jnp.zeros_like(q)[:, None]
 
     def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        return self.m * self.g * self.lc * jnp.sin(q)
+        return self.m * self.g * self.lc * sin(q)
 
     def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        return -self.m * self.lc * jnp.cos(q)
+        return -self.m * self.lc * cos(q)

@@ -1,0 +1,309 @@
+"""How fast the smoothers are, beside their peers and beside the limit of the machine: docs/throughput.md.
+
+    python benchmarks/throughput.py [--quick] [--only filter growth ...]
+
+Peers come with `pip install .[bench]`; a peer that is not installed has no row.  The C transition needs gcc.  All rows
+run on one core, except where a number of cores is given; rows of a table are timed in turn in one process.
+"""
+
+import argparse
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+root = Path(__file__).resolve().parents[1]
+titles = {
+    "extended": "Extended Kalman filter + RTS",
+    "sigma-point": "Sigma-point filter + RTS",
+    "filter": "Particle filter, and the transition alone",
+    "backward": "Particle filter + MCMC backward sampling, as many trajectories as particles",
+    "exact": "Particle filter + exact backward sampling, as many trajectories as particles",
+}
+axes = {"particles": "particles", "steps": "steps of a sequence", "sequences": "sequences"}
+peers = ("dynamax", "cuthbert", "particles")
+
+
+def child(order: dict, cpus: Sequence[int], cache: str, *, measure_memory: bool = False):
+    """What benchmarks/throughput_rows.py answers to an order, run on `cpus`."""
+    print(order, file=sys.stderr, flush=True)
+    threads = str(len(cpus))
+    env = os.environ | {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads, "JAX_PLATFORMS": "cpu"}
+    env["PYTHONPATH"] = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
+    env["JAX_COMPILATION_CACHE_DIR"] = cache
+    env["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if len(cpus) == 1:
+        env["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
+    if measure_memory:
+        env["MALLOC_MMAP_THRESHOLD_"] = str(1 << 20)  # freed arrays go back to the system
+    done = subprocess.run(
+        [sys.executable, Path(__file__).with_name("throughput_rows.py"), json.dumps(order)],
+        env=env,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        preexec_fn=lambda: os.sched_setaffinity(0, cpus),
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+
+
+def work(row: dict) -> float:
+    """Sequence-steps of a row."""
+    return row["size"][0] * row["size"][1]
+
+
+def pace(row: dict) -> float:
+    """Sequence-steps per second, by the median time."""
+    return work(row) / float(np.median(row["times"]))
+
+
+def speed_table(rows: list[dict], memory: list[dict]) -> list[str]:
+    """One group: time, throughput, ratio to the best peer of the same size, compile time, memory, errors."""
+    peaks = {(m["who"], m["what"]): m["memory"] for m in memory}
+    lines = []
+    for row in rows:
+        count = row["size"][2]
+        rivals = [pace(r) for r in rows if r["who"] in peers and r["size"][2] == count]
+        ratio = f"{pace(row) / max(rivals):.2f}" if rivals and row["who"] == "nnap_em" else ""
+        error = [f"{e:.3g}" for e in row.get("rmse", [])] or [""] * 4
+        lines.append(
+            [
+                row["who"],
+                row["what"],
+                f"{row['size'][0]} x {row['size'][1]}",
+                f"{1e3 * np.median(row['times']):.4g}",
+                f"{pace(row):.3g}",
+                f"{pace(row) * count:.3g}" if count else "",
+                ratio,
+                f"{row['compile']:.1f}",
+                f"{peaks[row['who'], row['what']] / 1e6:.0f}",
+                *error,
+                str(row.get("lost", "")),
+            ]
+        )
+    head = [
+        "",
+        "row",
+        "work",
+        "time [ms]",
+        "sequence-steps/s",
+        "particle-steps/s",
+        "x best peer",
+        "compile [s]",
+        "peak memory [MB]",
+    ]
+    return table([*head, "θ₁ [rad]", "θ₂ [rad]", "ω₁ [rad/s]", "ω₂ [rad/s]", "lost"], lines)
+
+
+def limit_lines(rows: list[dict]) -> list[str]:
+    """How far the filter is from the transition, and the transition from C."""
+    rate = {row["what"]: pace(row) * row["size"][2] for row in rows if row["who"] in ("nnap_em", "limit")}
+    most = max(row["size"][2] for row in rows if row["who"] == "nnap_em")
+    own = rate["our transition alone"]
+    pairs = {
+        "our transition / C transition": own / rate["C transition"],
+        "our transition / C transition, 512-bit vectors": own / rate["C transition, 512-bit vectors"],
+        "our transition / natural transition": own / rate["natural transition alone"],
+        "bootstrap filter / our transition": rate[f"bootstrap filter, {most}"] / own,
+        "bootstrap filter / C transition": rate[f"bootstrap filter, {most}"] / rate["C transition"],
+        "guided filter / our transition": rate[f"guided filter, {most}"] / own,
+    }
+    return ["", *table(["particle-steps/s of", "ratio"], [[k, f"{v:.2f}"] for k, v in pairs.items()])]
+
+
+def start_up(repeats: int) -> list[str]:
+    """What a user waits for before anything is computed."""
+    names = "import nnap_em; [getattr(nnap_em, name) for name in nnap_em.__all__]"
+    cli = "from nnap_em.cli import parser; parser().format_help()"
+    programs = {
+        "python alone": "",
+        "import jax": "import jax",
+        "import nnap_em": "import nnap_em",
+        "import jax, nnap_em and all its public names": f"import jax; {names}",
+        "nnap-em --help": cli,
+    }
+    env = os.environ | {"PYTHONPATH": str(root)}
+    median = {}
+    for name, program in programs.items():
+        times = []
+        for _ in range(repeats + 1):  # the first reads the files
+            began = time.perf_counter()
+            subprocess.run([sys.executable, "-c", program], env=env, check=True)
+            times.append(time.perf_counter() - began)
+        median[name] = float(np.median(times[1:]))
+    loaded = f"{cli}; import sys; print('jax' in sys.modules)"
+    jax_loaded = subprocess.check_output([sys.executable, "-c", loaded], env=env, text=True).strip() == "True"
+    median["nnap_em beyond jax"] = median["import jax, nnap_em and all its public names"] - median["import jax"]
+    lines = table(["program", "time [s]"], [[name, f"{value:.2f}"] for name, value in median.items()])
+    return [*lines, "", f"`nnap-em --help` {'loads' if jax_loaded else 'does not load'} JAX."]
+
+
+def growth_figure(curves: dict[str, dict[str, list[dict]]], base: Sequence[int]):
+    """Time and memory against the size of the work."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    sys.path.insert(0, str(root))
+    from nnap_em.plots import BLUE, STYLE, VERMILION
+
+    colours = {"extended": BLUE, "particle": VERMILION}
+    with rc_context(STYLE):
+        figure = Figure(figsize=(3.2 * len(curves), 4.6), layout="constrained")
+        grid = figure.subplots(2, len(curves), squeeze=False, sharex="col", sharey="row")
+        for (axis, lines), (top, bottom) in zip(curves.items(), grid.T, strict=True):
+            for name, rows in lines.items():
+                at = [row["point"] for row in rows]
+                top.loglog(at, [row["time"] for row in rows], "o-", ms=4, color=colours[name], label=f"{name} smoother")
+                bottom.loglog(at, [row["memory"] / 1e6 for row in rows], "o-", ms=4, color=colours[name])
+                last = rows[-1]
+                ideal = [last["time"] * p / last["point"] for p in at]
+                top.loglog(at, ideal, ls=(0, (2, 2)), lw=0.8, color=colours[name])
+            bottom.set_xlabel(f"{axes[axis]} [-]")
+        grid[0, 0].set_ylabel("time of the E-step [s]")
+        grid[1, 0].set_ylabel("peak memory [MB]")
+        grid[0, -1].legend(loc="upper left")
+        note = f"{base[0]} sequences, {base[1]} steps, {base[2]} particles where not on the axis; dotted: linear growth"
+        figure.suptitle(note, x=0.01, ha="left", fontsize=9)
+    return figure
+
+
+def machine() -> str:
+    """Where and with what this ran."""
+    cpu = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+    commit = subprocess.check_output(["git", "describe", "--always", "--dirty"], cwd=root, text=True).strip()
+    versions = []
+    for name in ("jax", *peers):
+        try:
+            versions.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            versions.append(f"{name} not installed: no rows")
+    cpus, load = len(os.sched_getaffinity(0)), os.getloadavg()[1]
+    lines = (f"{date.today()}, {cpu.split(':')[1].strip()}, {cpus} cores, load of the last 5 minutes {load:.1f}",)
+    return f"{lines[0]}; Python {sys.version.split()[0]}, {', '.join(versions)}; commit {commit}"
+
+
+preface = """\
+# Throughput
+
+From `python benchmarks/throughput.py`, after `pip install .[bench]`.
+
+The work: the acrobot with a 1-16-16-1 tanh network of friction in each joint, one Runge-Kutta step per 10 ms, 20
+sequences of 500 steps, 32 bits; angle and rate of joint 1 read with .01 rad and .05 rad/s of noise, process noise
+2e-4 rad and .01 rad/s per step. The logs come from the same model. Every row is given that model and the same prior of
+the start, .05 rad and .05 rad/s about the arm held out level: from a wide one a bootstrap filter of this size loses
+most sequences, whoever wrote it.
+
+One core. The rows of a table take turns in one process; the time is the median of 3 to 7 runs after compilation (which
+includes tracing). Memory is the peak of one run beyond the loaded program and the logs. θ and ω are root mean square
+errors against the simulated states: smoothed in the tables of smoothers, filtered in that of filters. Lost are
+sequences with θ₂ off by more than .3 rad.
+
+"One start, one pass" does what the peer does; "as the library sets it" tries 13 starts and relinearises once more.
+Peers get the transition as their user would write it in jax.numpy, with the closed form of the 2 x 2 mass matrix and
+one matrix product per layer, and ours in the rows marked "our transition". dynamax takes the points of the cubature
+rule. cuthbert and particles resample systematically below half the sample size, as we do; cuthbert's backward sampler
+evaluates the transition again for every pair. particles is numpy in 64 bits; it and the exact backward samplers run on
+the first 2 sequences. Our particle rows include the extended smoother about whose path the particles are stored.
+
+Not measured: other models, devices other than the CPU, and peers in other languages.
+"""
+
+
+def main() -> None:
+    """Run what is asked for and write docs/throughput.md, or print a quick run."""
+    kinds = [*titles, "growth", "cores", "epoch", "import"]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a small size of everything, to see that it runs")
+    parser.add_argument("--only", nargs="+", choices=kinds, default=kinds)
+    parser.add_argument("--out", type=Path, help="of the text; the whole of a full run goes to docs/throughput.md")
+    args = parser.parse_args()
+    size = (3, 60, 200) if args.quick else (20, 500, 1000)
+    repeats, budget = (3, 0.0) if args.quick else (7, 5.0)
+    cpus = sorted(os.sched_getaffinity(0))
+    full = not args.quick and set(args.only) == set(kinds)
+    out = args.out or (root / "docs" / "throughput.md" if full else None)
+    began = time.perf_counter()
+    lines = [preface, machine() + "."]
+    with tempfile.TemporaryDirectory() as cache:
+        for group in (g for g in titles if g in args.only):
+            order = {"group": group, "size": size, "quick": args.quick}
+            rows = child({"task": "speed", **order, "repeats": repeats, "budget": budget}, cpus[:1], cache)
+            memory = child({"task": "memory", **order}, cpus[:1], cache, measure_memory=True)
+            lines += ["", f"## {titles[group]}", "", *speed_table(rows, memory)]
+            lines += limit_lines(rows) if group == "filter" else []
+        if "growth" in args.only:
+            lines += growth(args.quick, cpus[:1], cache, out)
+        if "cores" in args.only:
+            lines += cores(size, cpus, cache)
+        if "epoch" in args.only:
+            two = cpus[:2]
+            found = child({"task": "epoch", "size": size, "repeats": 3}, two, cache)
+            rows = [[name, f"{v['time']:.2f}", f"{v['compile']:.1f}"] for name, v in found.items()]
+            head = ["smoother", "time [s]", "compile [s]"]
+            title = f"## One EM epoch of `nnap-em identify` on {len(two)} cores, 64 bits"
+            lines += ["", title, "", *table(head, rows)]
+    if "import" in args.only:
+        lines += ["", "## The first seconds", "", *start_up(1 if args.quick else 5)]
+    lines += ["", f"The whole run took {(time.perf_counter() - began) / 60:.0f} min."]
+    text = "\n".join(lines) + "\n"
+    print(text)
+    if out:
+        out.write_text(text)
+
+
+def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> list[str]:
+    """Section and figure of how time and memory grow."""
+    base = (2, 500, 100)
+    points = {
+        "particles": [100, 300, 1000, 3000, 10000],
+        "steps": [500, 2000, 10000, 50000],
+        "sequences": [1, 10, 100, 1000],
+    }
+    if quick:
+        base, points = (2, 50, 20), {"particles": [20, 40], "steps": [50, 100], "sequences": [1, 2]}
+    curves: dict[str, dict[str, list[dict]]] = {}
+    rows = []
+    for axis, at in points.items():
+        curves[axis] = {}
+        for smoother in ("particle",) if axis == "particles" else ("extended", "particle"):
+            order = {"task": "growth", "smoother": smoother, "axis": axis, "points": at, "base": base}
+            found = curves[axis][smoother] = child(order, cpus, cache, measure_memory=True)
+            rows += [
+                [smoother, f"{r['point']} {axes[axis]}", f"{r['time']:.3g}", f"{r['memory'] / 1e6:.0f}"] for r in found
+            ]
+    lines = ["", "## How time and memory grow", ""]
+    lines.append(f"`e_step` as the library sets it, {base[0]} sequences x {base[1]} steps, {base[2]} particles and")
+    lines += ["25 trajectories where nothing else is said; one core.", ""]
+    if out:
+        picture = out.parent / "figures" / "throughput.png"
+        growth_figure(curves, base).savefig(picture)
+        lines += [f"![Time and memory of the E-step](figures/{picture.name})", ""]
+    return [*lines, *table(["smoother", "work", "time [s]", "peak memory [MB]"], rows)]
+
+
+def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
+    """Section of the speed-up by cores."""
+    counts = [n for n in (1, 2, 4) if n <= len(cpus)]
+    found = {n: child({"task": "cores", "size": size, "repeats": 5}, cpus[:n], cache) for n in counts}
+    rows = [
+        [name, *(f"{found[n][name]:.3g} ({found[1][name] / found[n][name]:.2f})" for n in counts)] for name in found[1]
+    ]
+    head = ["smoother", *(f"{n} core{'s' * (n > 1)} [s] (speed-up)" for n in counts)]
+    return ["", f"## Cores: `e_step` on {size[0]} x {size[1]}, as the library sets it", "", *table(head, rows)]
+
+
+if __name__ == "__main__":
+    main()

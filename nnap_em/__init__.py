@@ -11,16 +11,19 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .data import DataError, Dataset, Logs, pad, read_logs
+    from .check import Finding, check
+    from .data import Dataset, Logs, pad, read_logs
     from .diagnose import findings
     from .em import EMState, FitError, Schedule
+    from .export import ExportError, export
+    from .formats import DataError, DataWarning
     from .friction import FrictionNetwork
     from .identify import Identified, friction_table, identify, parameter_table
     from .loop import Closed, close_the_loop
     from .model import StateSpaceModel
     from .particle import ParticleSmoother
     from .predict import Prediction, horizon_errors, predict, smooth
-    from .rig import Rig, RigError, read_rig, write_rig
+    from .rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .smoother import ExtendedKalmanSmoother, Posterior
     from .store import StoreError, load, save
@@ -30,10 +33,13 @@ __all__ = [
     "AbstractSystem",
     "Closed",
     "DataError",
+    "DataWarning",
     "Dataset",
     "EMState",
     "Experiment",
+    "ExportError",
     "ExtendedKalmanSmoother",
+    "Finding",
     "FitError",
     "FrictionNetwork",
     "Identified",
@@ -43,12 +49,15 @@ __all__ = [
     "Prediction",
     "Rig",
     "RigError",
+    "RigWarning",
     "Schedule",
     "StateSpaceModel",
     "StoreError",
     "__version__",
+    "check",
     "close_the_loop",
     "examples",
+    "export",
     "findings",
     "friction_table",
     "horizon_errors",
@@ -68,16 +77,19 @@ __all__ = [
     "write_rig",
 ]
 _homes = {
-    "data": ("DataError", "Dataset", "Logs", "pad", "read_logs"),
+    "check": ("Finding", "check"),
+    "data": ("Dataset", "Logs", "pad", "read_logs"),
     "diagnose": ("findings",),
     "em": ("EMState", "FitError", "Schedule"),
+    "export": ("ExportError", "export"),
+    "formats": ("DataError", "DataWarning"),
     "friction": ("FrictionNetwork",),
     "identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "loop": ("Closed", "close_the_loop"),
     "model": ("StateSpaceModel",),
     "particle": ("ParticleSmoother",),
     "predict": ("Prediction", "horizon_errors", "predict", "smooth"),
-    "rig": ("Rig", "RigError", "read_rig", "write_rig"),
+    "rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
     "simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother": ("ExtendedKalmanSmoother", "Posterior"),
     "store": ("StoreError", "load", "save"),
@@ -87,7 +99,7 @@ _home = {name: home for home, names in _homes.items() for name in names}
 
 
 class _Package(ModuleType):
-    """A package in which `identify`, `predict` and `simulate` mean the functions, not the modules that they are in.
+    """A package in which names such as `identify` and `predict` mean the functions, not the modules that they are in.
 
     Importing a submodule binds it in its package; which would hide the function.
     """

@@ -13,10 +13,13 @@ from . import __version__
 _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
+  nnap-em init bench/train/01.csv --system acrobot  a first rig.toml from the log, to be filled in
+  nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
+  nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """
@@ -27,6 +30,22 @@ examples:
   nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
 
 OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
+_INIT = """\
+examples:
+  nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
+  nnap-em init log.csv --out bench
+
+Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
+filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
+"""
+_CHECK = """\
+example:
+  nnap-em check bench
+
+One line per question: ok, look (it may do, but look at it) or bad (a fit would be in vain).  Length, missing samples,
+sampling rate, noise, torques, the velocities that each joint visits, and whether the readings tell the whole state.
+Nothing is fitted and nothing is written.  Exit status 1 where something is bad.
 """
 _IDENTIFY = """\
 examples:
@@ -59,6 +78,14 @@ example:
 
 DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
 """
+_EXPORT = """\
+examples:
+  nnap-em export fit --out exported
+  nnap-em export found/after.npz --out exported
+
+OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
+python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
+"""
 SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
 SMOOTHERS = ("cubature", "ekf", "particle")
 
@@ -89,6 +116,16 @@ def parser() -> argparse.ArgumentParser:
             help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
         )
 
+    init = command("init", "write a first rig.toml for a log", _INIT)
+    init.add_argument("csv", metavar="CSV", type=Path, help="a log with a header")
+    init.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    init.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
+    )
+
+    check = command("check", "say whether the logs can identify what is asked", _CHECK)
+    check.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+
     identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
     identify.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
     identify.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
@@ -115,11 +152,15 @@ def parser() -> argparse.ArgumentParser:
         use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
+
+    export = command("export", "write a fitted model for other programs", _EXPORT)
+    export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
+    export.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the files")
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; 0 is done, 2 is refused with one line on stderr, 130 is stopped by Ctrl-C."""
+    """Run one command: 0 is done, 1 a check that found something bad, 2 refused with one line on stderr, 130 Ctrl-C."""
     arguments = parser()
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
@@ -129,10 +170,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            warnings.simplefilter("default", commands.DataWarning)
+            for kind in commands.WARNINGS:
+                warnings.simplefilter("always", kind)
             commands.set_up()
             say = _silent if getattr(args, "quiet", False) else _say
-            commands.commands[args.command](args, say)
+            return commands.commands[args.command](args, say) or 0
     except KeyboardInterrupt as stopped:
         _say(str(stopped) or "stopped")
         return 130
@@ -142,7 +184,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _say(f"error: {line}")
         return 2
-    return 0
 
 
 def _line(error: Exception) -> str | None:

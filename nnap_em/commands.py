@@ -22,9 +22,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from . import __version__
-from .data import DataError, DataWarning, Logs, check_split, read_logs, write_csv
+from .build import build_system, measure_scales
+from .check import BAD, check, torques
+from .data import Logs, check_split, read_logs
 from .diagnose import findings
+from .draft import draft
 from .em import EMState, FitError
+from .export import ExportError, export
+from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
 from .law import PARAMETERS, UNITS, describe, fit_law
 from .loop import close_the_loop
@@ -33,14 +38,15 @@ from .parallel import use_every_device
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
-from .rig import Declared, Rig, RigError, nearest, parameter_unit, read_rig, write_rig
+from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, replace_text, write_rig
 from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
 from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
 from .systems import specs
 from .tables import state_unit, visited_nodes, write_friction, write_json
 
-MISTAKES = (RigError, DataError, StoreError, FitError)
+MISTAKES = (RigError, DataError, StoreError, FitError, ExportError)
+WARNINGS = (RigWarning, DataWarning)
 GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
 MOST = 64
@@ -113,10 +119,35 @@ def run_simulate(args: argparse.Namespace, say: Say) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
+def run_init(args: argparse.Namespace, say: Say) -> None:
+    """Write a first rig.toml for a log, to be filled in; one that is there stays as it is."""
+    home = args.csv.parent.parent if args.csv.parent.name in ("train", "test") else args.csv.parent
+    path = (args.out or home) / "rig.toml"
+    if path.exists():
+        raise DataError(f"{path}: is there already; give another --out, or remove it")
+    found = draft(args.csv, args.system, specs)
+    replace_text(path, found.text)
+    for note in found.notes:
+        say(f"in the log: {note}")
+    say(f"wrote {path}" + (f"; fill in {', '.join(found.missing)}" if found.missing else ""))
+
+
+def run_check(args: argparse.Namespace, say: Say) -> int:
+    """Say whether the logs can identify what is asked, a line per question; 1 where they cannot."""
+    rig, train, test = _read(args.folder)
+    found = check(rig, train, test, key=jax.random.key(0))
+    for finding in found:
+        print(f"{finding.mark:4}  {finding.subject:8}  {finding.text}")
+    bad = sum(finding.mark == BAD for finding in found)
+    say(f"{bad} of {len(found)} answers are bad" if bad else "nothing speaks against a fit")
+    return int(bad > 0)
+
+
 def run_identify(args: argparse.Namespace, say: Say) -> None:
     """Fit the declared unknowns to the training logs; the test logs serve for the reported error alone."""
     began = time.perf_counter()
     rig, train, test = _read(args.folder)
+    _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
     if args.resume:
@@ -148,6 +179,7 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
     """Find what the declared model lacks, and report it; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
     rig, train, test = _read(args.folder)
+    _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     with _folder(args.out):
         count, rows = train.data.valid.shape
@@ -178,12 +210,21 @@ def run_smooth(args: argparse.Namespace, say: Say) -> None:
     say(f"wrote {len(logs.files)} files to {args.out}")
 
 
-commands: dict[str, Callable[[argparse.Namespace, Say], None]] = {
+def run_export(args: argparse.Namespace, say: Say) -> None:
+    """Write the model for other programs."""
+    export(read(_model_file(args.model)).fitted, args.out)
+    say(f"wrote parameters.json, predictor.py and model.stablehlo to {args.out}")
+
+
+commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
     "simulate": run_simulate,
+    "init": run_init,
+    "check": run_check,
     "identify": run_identify,
     "diagnose": run_diagnose,
     "predict": run_predict,
     "smooth": run_smooth,
+    "export": run_export,
 }
 
 
@@ -191,10 +232,17 @@ def _read(folder: Path) -> tuple[Rig, Logs, Logs | None]:
     """A data set; test logs only where there are any."""
     rig = read_rig(folder / "rig.toml", specs)
     train = read_logs(folder / "train", rig)
-    test = read_logs(folder / "test", rig) if any(folder.glob("test/*.csv")) else None
-    if test:
-        check_split(train, test)
+    test = read_logs(folder / "test", rig) if has_logs(folder / "test") else None
+    check_split(train, test)
     return rig, train, test
+
+
+def _warn_of_torques(folder: Path, rig: Rig, train: Logs) -> None:
+    """Warn where the inputs cannot be those of the declared bodies."""
+    system = build_system(rig)
+    for finding in torques(rig, system, train.data, measure_scales(rig, system, train.data)):
+        if finding.mark == BAD:
+            warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
 
 
 # --- simulate
@@ -456,4 +504,4 @@ def _write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> No
             values = np.where(np.isfinite(values), values, np.nan)
         names = (*states, *(f"{name}_std" for name in states))
         time_ = {"time": np.asarray(logs.data.t[i])[rows]}
-        write_csv(folder / file, time_ | dict(zip(names, values.T, strict=True)))
+        write_csv((folder / file).with_suffix(".csv"), time_ | dict(zip(names, values.T, strict=True)))

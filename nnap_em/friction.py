@@ -74,6 +74,10 @@ class FrictionNetwork(AbstractJointMap):
         self.knee = speed / resolution
         self.scale = scale
 
+    def __str__(self) -> str:
+        speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
+        return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
+
     def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         top = asinh(self.speed / self.knee)
         features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)

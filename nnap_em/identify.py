@@ -15,7 +15,7 @@ from .effects import AbstractEffect
 from .em import SCHEDULE, EMState, Schedule, fit, start_state
 from .model import StateSpaceModel, with_effects
 from .mstep import ScoringMStep
-from .rig import Rig
+from .rig import Declared, Rig, quantities
 from .smoother import AbstractSmoother, CubatureSmoother, StartBank
 
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
@@ -34,6 +34,11 @@ class Identified(NamedTuple):
         """The likeliest model."""
         return cast(StateSpaceModel, self.state.best)
 
+    def __str__(self) -> str:
+        estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
+        found = f"\n  estimated: {quantities(estimated)}" if estimated else ""
+        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{found}\n  {self.model}"
+
 
 class FrictionTable(NamedTuple):
     """The learned map with its uncertainty, over the visited velocities."""
@@ -49,6 +54,14 @@ class FrictionTable(NamedTuple):
     def std(self) -> Float[Array, "dof node"]:
         """Standard deviation of the torque [N m]."""
         return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
+
+    def __str__(self) -> str:
+        lines = [
+            f"joint {j + 1}: {t.min():.3g} to {t.max():.3g} N m over {v.min():.3g} to {v.max():.3g} rad/s, std up to"
+            f" {s.max():.2g} N m"
+            for j, (v, t, s) in enumerate(zip(*map(np.asarray, (self.velocity, self.torque, self.std)), strict=True))
+        ]
+        return "\n  ".join(["FrictionTable (on a slide: N and m/s)", *lines])
 
 
 def begin(rig: Rig, data: Dataset, *, key: PRNGKeyArray, effects: tuple[AbstractEffect, ...] = ()) -> Identified:

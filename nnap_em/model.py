@@ -6,12 +6,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .data import Dataset
 from .effects.base import AbstractEffect, Scene
 from .gaussian import Gaussian, spd_solve
 from .ode import integrate
+from .rig import parameter_unit
 from .systems.base import AbstractSystem
 
 
@@ -64,6 +66,17 @@ class StateSpaceModel(AbstractModel):
     substeps: int = eqx.field(static=True, default=2)
     effects: tuple[AbstractEffect, ...] = ()
     """What the declared physics lacks."""
+
+    def __str__(self) -> str:
+        names = self.system.coordinates + self.system.rates
+        noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)
+        reads = ", ".join(f"{name} (noise {std:.2g} {parameter_unit(name)})" for name, std in noise)
+        found = [
+            f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}"
+            + "".join(f", {name} = {float(value):.4g} {effect.units[name]}" for name, value in effect.values().items())
+            for effect in self.effects
+        ]
+        return "\n  ".join([f"{self.system}, a row every {self.dt:g} s", f"reads: {reads}", *found])
 
     def inputs(self, seq: Dataset) -> Float[Array, "time input"]:
         """The inputs; with effects: what reaches the joints, the clock in the middle of the step [s], what reached the

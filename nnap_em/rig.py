@@ -5,6 +5,7 @@ import json
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,12 +39,19 @@ class RigError(ValueError):
     """A mistake in rig.toml: the message names the file, the table and key, what was found and the mend."""
 
 
+class RigWarning(UserWarning):
+    """Something in rig.toml that is possible but seldom meant."""
+
+
 @dataclass(frozen=True)
 class Declared:
     """A number as its owner believes it: mean and standard deviation, both in its SI unit; std = 0 is trusted."""
 
     mean: float
     std: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.6g}" + (f" +- {self.std:.2g}" if self.std else "")
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,20 @@ class Rig:
     measured: tuple[str, ...]
     noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
     start: Mapping[str, Declared]
+
+    def __str__(self) -> str:
+        inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
+        noise = {name: f"{std:.2g} {parameter_unit(name)}" for name, std in self.noise_std.items()}
+        reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
+        lines = [
+            f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} s",
+            f"parameters: {quantities(self.parameters)}",
+            f"inputs: {', '.join(inputs) or 'none'}",
+            f"reads: {', '.join(reads)}",
+            f"start: {quantities(self.start) or 'from the readings'}",
+            f"friction: {'to be learned' if self.friction else 'none'}",
+        ]
+        return "\n  ".join(lines)
 
 
 def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
@@ -110,13 +132,19 @@ def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    lines = ["format = 1", f"name = {_text(rig.name)}"]
-    lines += ["", "[model]", f"type = {_text(rig.system)}", *_lines(parameters)]
+    lines = ["format = 1", f"name = {toml_text(rig.name)}"]
+    lines += ["", "[model]", f"type = {toml_text(rig.system)}", *_lines(parameters)]
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
-    lines += ["", "[input]", f"columns = [{', '.join(map(_text, rig.input_columns))}]    # N m, or N on a slide"]
+    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
     lines += [f"joints = {list(rig.input_joints)}"]
-    lines += ["", "[sampling]", f"dt = {rig.dt!r}    # s", 'input_hold = "zero-order"', f"clock = {_text(rig.clock)}"]
-    lines += ["", "[measurement]", f"columns = [{', '.join(map(_text, rig.measured))}]"]
+    lines += [
+        "",
+        "[sampling]",
+        f"dt = {rig.dt!r}    # s",
+        'input_hold = "zero-order"',
+        f"clock = {toml_text(rig.clock)}",
+    ]
+    lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
     lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
     lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
     replace_text(path, "\n".join(lines) + "\n")
@@ -131,6 +159,11 @@ def replace_text(path: Path, text: str) -> None:
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def toml_text(text: str) -> str:
+    """A text as TOML writes it."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL
 
 
 def nearest(word: str, known: Collection[str]) -> str:
@@ -238,6 +271,10 @@ def _parameter(model: _Table, key: str) -> Declared:
         model.refuse(
             key, mend=f"write 0 or more [{parameter_unit(key)}]: directions are in the equations, not in the signs"
         )
+    large, unit = (100.0, "mm/s^2") if key == "g" else (50.0, "mm") if key.startswith("l") else (math.inf, "")
+    if value.mean > large:
+        found = f"{model.path}: [model] {key}: found {value.mean:g}"
+        warnings.warn(f"{found}; is it in {unit}? write it in {parameter_unit(key)}", RigWarning, 2)
     return value
 
 
@@ -282,13 +319,15 @@ def parameter_unit(name: str) -> str:
     return exact.get(name) or next((unit for start, unit in first.items() if name.startswith(start)), "SI")
 
 
+def quantities(values: Mapping[str, object]) -> str:
+    """Parameters or states as text, with their units."""
+    numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
+    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
+
+
 def _lines(values: Mapping[str, str]) -> list[str]:
     return [f"{name} = {value}    # {parameter_unit(name)}" for name, value in values.items()]
 
 
 def _pair(value: Declared) -> str:
     return f"{{ mean = {value.mean!r}, std = {value.std!r} }}"
-
-
-def _text(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .data import write_csv
+from .formats import write_csv
 from .rig import replace_text
 from .systems import AbstractSystem
 

@@ -213,6 +213,7 @@ _fields = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.filterwarnings("ignore::nnap_em.rig.RigWarning")  # of a link of a mile
 @settings(deadline=None)  # it writes files
 @given(fields=_fields)
 def test_what_is_written_is_read_back(tmp_path_factory, fields):

@@ -1,5 +1,6 @@
 """What a machine must give to become a model: names, mass matrix and bias force."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -7,6 +8,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from ..rig import quantities
 
 
 class AbstractSystem(eqx.Module):
@@ -26,6 +29,11 @@ class AbstractSystem(eqx.Module):
 
     joints: eqx.AbstractVar[tuple[int, ...]]
     """The joint (counted from 1) that each input drives."""
+
+    def __str__(self) -> str:
+        values = {f.name: float(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "joints"}
+        driven = ", ".join(map(str, self.joints)) or "none"
+        return f"{type(self).__name__}: {quantities(values)}; driven joints: {driven}"
 
     @abstractmethod
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:

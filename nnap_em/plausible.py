@@ -1,0 +1,184 @@
+"""What numbers of a right form betray: wrong units and signs, wrapped angles, swapped columns, dead sensors, copies."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Columns = Mapping[str, Float[np.ndarray, " time"]]
+IMPLAUSIBLE = 30.0  # rad/s, as the median speed of a joint
+STRETCH = 20  # rows that two sequences do not have in common by chance
+_DEGREES = "it looks like degrees: write rad and rad/s"
+_ANGLE = (  # by what an angle's rate of change exceeds its rate column, which of the two is wrong, and the mend
+    (math.degrees(1), "", _DEGREES),
+    (math.radians(1), "d", _DEGREES),
+    (1 / (2 * math.pi), "", "it looks like turns: write rad"),
+    (2 * math.pi, "d", "it looks like turns/s: write rad/s"),
+    (math.pi / 30, "d", "it looks like rpm: write rad/s"),
+)
+_ANY = (
+    (1e3, "", "it looks like thousandths (mm, mrad): write SI units"),
+    (1e-3, "d", "it looks like thousandths (mm/s, mrad/s), or time and dt are in ms: write SI units"),
+)
+
+
+class Doubt(NamedTuple):
+    """What is doubtful in a column, from which row on, and how to mend it."""
+
+    ruins: bool
+    """True where a fit would be wrong without a word; False where it may be meant."""
+    column: str
+    row: int | None
+    found: str
+    mend: str
+
+
+class Repeat(NamedTuple):
+    """Rows that stand in two sequences, their clocks aside."""
+
+    name: str
+    row: int
+    other: str
+    there: int
+    whole: bool
+    """True where the sequences are the same from end to end."""
+
+
+def doubts(inputs: Columns, readings: Columns, dt: float) -> Iterator[Doubt]:
+    """What is doubtful in the columns of one sequence, sampled every `dt` [s]."""
+    for name, values in readings.items():
+        observed = values[np.isfinite(values)]
+        if not observed.size:
+            mend = "take the file out, or the column out of [measurement]"
+            yield Doubt(True, name, None, "no sample at all", mend)
+            return
+        if observed.size > 1 and np.ptp(observed) == 0:
+            yield Doubt(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
+    yield from _copies(inputs, readings)
+    for name in readings:
+        if f"d{name}" in readings:
+            yield from _pair(name, {**inputs, **readings}, dt)
+    for name, values in readings.items():
+        if name.startswith("theta"):
+            yield from _wrapped(name, values)
+        if "theta" in name and (speed := _speed(name, values, dt)) > IMPLAUSIBLE:
+            yield Doubt(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
+
+
+def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]]) -> Iterator[Repeat]:
+    """The first stretch of each sequence that an earlier one holds too; standstill is no copy."""
+    seen: dict[bytes, tuple[str, int]] = {}
+    wholes: dict[bytes, str] = {}
+    for name, rows in sequences.items():
+        rows = np.asarray(rows) + 0.0  # no -0
+        own = dict(_stretches(rows))
+        whole = rows.tobytes() if own else None
+        if whole in wholes:
+            yield Repeat(name, 0, wholes[whole], 0, True)
+        elif found := next((content for content in own if content in seen), None):
+            yield Repeat(name, own[found], *seen[found], False)
+        for content, row in own.items():
+            seen.setdefault(content, (name, row))
+        if whole:
+            wholes.setdefault(whole, name)
+
+
+def bridge(values: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+    """Missing samples by straight lines between their neighbours."""
+    k = np.flatnonzero(np.isfinite(values))
+    return np.interp(np.arange(values.size), k, values[k])
+
+
+def _stretches(rows: Float[np.ndarray, "time column"]) -> Iterator[tuple[bytes, int]]:
+    """Every stretch of the sequence as its content and first row, those aside in which half the rows are the same."""
+    length = min(STRETCH, len(rows))
+    kinds = np.unique(rows, axis=0, return_inverse=True, equal_nan=False)[1].ravel() if rows.size else np.zeros(0)
+    for k, window in enumerate(np.lib.stride_tricks.sliding_window_view(kinds, length)):
+        if len(set(window.tolist())) > length / 2:
+            yield np.ascontiguousarray(rows[k : k + length]).tobytes(), k
+
+
+def _copies(inputs: Columns, readings: Columns) -> Iterator[Doubt]:
+    """A reading that is another column over again."""
+    columns = [*inputs.items(), *readings.items()]
+    for i, (name, values) in enumerate(columns[len(inputs) :], len(inputs)):
+        for other, others in columns[:i]:
+            if np.nanmax(values) > np.nanmin(values) and np.array_equal(values, others, equal_nan=True):
+                found = f"the same numbers as column {other!r}"
+                yield Doubt(True, name, None, found, "write what each sensor reads, or take the column out")
+
+
+def _pair(name: str, columns: Columns, dt: float) -> Iterator[Doubt]:
+    """A coordinate against the integral of its rate: units, sign, and what is swapped."""
+    rate = f"d{name}"
+    fit, ratio = _follows(columns[name], columns[rate], dt)
+    found = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
+    for factor, wrong, mend in (*(_ANGLE if name.startswith("theta") else ()), *_ANY):
+        close = (0.7, 0.7 < ratio / factor < 1.4) if mend == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
+        if fit > close[0] and close[1]:
+            yield Doubt(True, wrong + name, None, found, mend)
+            return
+    ways = "units, signs and names of the two"
+    if fit > 0.9 and not 0.8 < ratio < 1.25:
+        yield Doubt(False, rate, None, found, f"it should be once: check {ways}")
+    elif fit < -0.7 and 0.7 < ratio < 1.4:
+        found = f"the rate of {name!r} is minus column {rate!r}"
+        yield Doubt(True, rate, None, found, "turn the sign of the wrong one: both count in the same direction")
+    elif fit < 0.5:
+        for one, two, wrong, other in (
+            (rate, name, name, rate),
+            *((other, rate, name, other) for other in columns if other not in (name, rate)),
+            *((name, other, rate, other) for other in columns if other not in (name, rate)),
+        ):
+            fit, ratio = _follows(columns[one], columns[two], dt)
+            if fit > 0.95 and 0.8 < ratio < 1.25:
+                found = f"{two!r} is the rate of {one!r}, and {rate!r} is not that of {name!r}"
+                yield Doubt(True, wrong, None, found, f"columns {wrong!r} and {other!r} look swapped: name them right")
+                return
+        if _moves(columns[name]) and _moves(columns[rate]):
+            yield Doubt(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")
+
+
+def _moves(values: np.ndarray) -> bool:
+    """Whether a signal is more than noise: its steps are small beside its range."""
+    observed = values[np.isfinite(values)]
+    return observed.size > STRETCH and float(np.std(np.diff(observed))) < 0.2 * float(np.std(observed))
+
+
+def _follows(position: np.ndarray, rate: np.ndarray, dt: float) -> tuple[float, float]:
+    """Correlation of the way of a coordinate with the integral of its rate, and how many times as long it is."""
+    if np.isnan(position).all() or np.isnan(rate).all():
+        return 0.0, 0.0
+    moved, expected = _advance(position, dt), _advance(np.cumsum(bridge(rate)) * dt, dt)
+    size, wanted = math.sqrt(moved @ moved), math.sqrt(expected @ expected)
+    return float(moved @ expected) / max(size * wanted, 1e-300), size / max(wanted, 1e-300)
+
+
+def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " way"]:
+    """How far it goes in 0.1 s: long enough to see past the noise of single readings."""
+    span = min(max(round(0.1 / dt), 1), values.size - 1)
+    values = bridge(values)
+    return values[span:] - values[:-span]
+
+
+def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
+    """Jumps by a turn."""
+    rows = np.flatnonzero(np.isfinite(theta))
+    step = np.diff(theta[rows])
+    for turn, unit in ((2 * math.pi, ""), (360.0, " and convert degrees to rad")):
+        jumps = (np.abs(np.abs(step) - turn) < 0.15 * turn) & (np.diff(rows) <= 2)
+        if jumps.any() and np.median(np.abs(step)) < 0.1 * turn:
+            k, row = step[jumps][0], int(rows[1:][jumps][0])
+            mend = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
+            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", mend)
+            return
+
+
+def _speed(name: str, values: np.ndarray, dt: float) -> float:
+    """Median speed of an angle or of the rate of one."""
+    if name.startswith("d"):
+        return float(np.nanmedian(np.abs(values)))
+    span = min(max(round(0.1 / dt), 1), values.size - 1)
+    return float(np.median(np.abs(_advance(values, dt)))) / (span * dt)

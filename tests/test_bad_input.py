@@ -1,0 +1,428 @@
+"""Bad input, from end to end: each ends in one line that names file, row, column and the mend, and writes nothing."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from test_data import _field, _swing, _text
+
+from nnap_em import cli, commands
+from nnap_em.em import FitError
+from nnap_em.formats import LARGEST, DataError, read_csv
+
+RIG = """\
+format = 1
+name = "bench"
+
+[model]
+type = "pendulum"
+m = 0.5
+lc = 0.4
+I = 0.002
+g = 9.81
+friction = "unknown"
+actuated_joint = 1
+
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+
+[measurement]
+columns = ["theta1", "dtheta1"]
+
+[measurement.noise_std]
+theta1 = 0.005
+dtheta1 = 0.05
+"""
+
+
+def _log(phase: float, rows: int = 201) -> dict[str, np.ndarray]:
+    """Two rad to and fro, with its exact rate; at phase 0 that of test_data."""
+    t = 0.01 * np.arange(rows)
+    theta, rate = 2.0 * np.sin(3.0 * t + phase), 6.0 * np.cos(3.0 * t + phase)
+    return {"time": t, "u": 0.1 * np.sin(t + phase), "theta1": theta, "dtheta1": rate}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("good")
+    (folder / "rig.toml").write_text(RIG)
+    for name, phase in (("train/00", 0.5), ("train/01", 0.0), ("test/00", 1.0)):
+        path = folder / f"{name}.csv"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(_text(_log(phase)))
+    return folder
+
+
+def _log_file(change: Callable[[str], str | bytes]) -> Callable[[Path], object]:
+    """A change of train/01.csv."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "train/01.csv"
+        found = change(path.read_text())
+        path.write_bytes(found if isinstance(found, bytes) else found.encode())
+
+    return apply
+
+
+def _columns(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Callable[[str], str]:
+    """A change of the columns of train/01.csv before they are written."""
+    return lambda _: _text(_log(0.0) | change(_log(0.0)))
+
+
+def _column(name: str, change) -> Callable[[str], str]:
+    return _columns(lambda log: {name: change(log[name])})
+
+
+def _rig(old: str, new: str) -> Callable[[Path], object]:
+    """A change of rig.toml."""
+
+    def apply(folder: Path) -> None:
+        assert old in RIG
+        (folder / "rig.toml").write_text(RIG.replace(old, new, 1))
+
+    return apply
+
+
+def _only(name: str) -> Callable[[Path], object]:
+    """One reading alone is declared."""
+    other = {"theta1": "dtheta1", "dtheta1": "theta1"}[name]
+    text = re.sub(rf"(?m)^{other} = .*\n", "", RIG).replace('["theta1", "dtheta1"]', f'["{name}"]')
+    return lambda folder: (folder / "rig.toml").write_text(text)
+
+
+def _both(*changes: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda folder: [change(folder) for change in changes]
+
+
+def _swap(one: str, two: str) -> Callable[[str], str]:
+    return _columns(lambda log: {one: log[two], two: log[one]})
+
+
+def _huge(folder: Path) -> None:
+    with (folder / "train/01.csv").open("r+b") as file:
+        file.truncate(LARGEST + 2**20)  # sparse: it takes no place on the disk
+
+
+def _everywhere(name: str, change) -> Callable[[Path], object]:
+    """A change of one column of all files."""
+
+    def apply(folder: Path) -> None:
+        for path in folder.glob("t*/*.csv"):
+            log = np.genfromtxt(path, delimiter=",", names=True)
+            columns = {other: log[other] for other in log.dtype.names}
+            path.write_text(_text(columns | {name: change(columns[name])}))
+
+    return apply
+
+
+def _cut(first: int, last: int) -> Callable[[Path], object]:
+    """test/01.csv: some rows of train/01.csv, their clock set back."""
+
+    def apply(folder: Path) -> None:
+        rows = {name: values[first:last] for name, values in _log(0.0).items()}
+        (folder / "test/01.csv").write_text(_text(rows | {"time": rows["time"] - rows["time"][0]}))
+
+    return apply
+
+
+def _wrap(theta):
+    return (theta + 1.0) % (2.0 * np.pi)
+
+
+def _jitter(t):
+    return t + 0.0002 * (np.arange(t.size) == 7)
+
+
+LOGS = {  # name: (the change of train/01.csv, then the words of the message: place, finding, mend)
+    "empty file": (lambda _: "", "line 1", "empty", "write a header"),
+    "blank file": (lambda _: "\n \n", "line 1", "empty", "write a header"),
+    "header only": (lambda s: s.splitlines()[0], "line 1", "found 0 rows", "2 rows or more"),
+    "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 rows", "2 rows or more"),
+    "no header": (lambda s: s.split("\n", 1)[1], "line 1, column 'time'", "missing", "possible here: 0, 0, 0, 6"),
+    "column missing": (lambda s: s.replace("dtheta1", "speed"), "column 'dtheta1'", "missing", "possible here: speed"),
+    "column misspelt": (lambda s: s.replace("dtheta1", "dteta1"), "'dtheta1'", "missing", "did you mean 'dteta1'?"),
+    "column in capitals": (lambda s: s.replace("u,", "U,"), "column 'u'", "missing", "did you mean 'U'?"),
+    "column twice": (lambda s: s.replace("dtheta1", "theta1"), "column 'theta1'", "2 times", "keep one"),
+    "semicolons": (lambda s: s.replace(",", ";").replace(".", ","), "line 1", "missing", "not ';'"),
+    "tabs": (lambda s: s.replace(",", "\t"), "line 1", "missing", "by ',' (not '\\t')"),
+    "decimal commas": (lambda s: s.replace(".", ","), "line 3", "found 8 fields under 4 names", "decimals with '.'"),
+    "text": (_field(12, "u", "n/a"), "line 12, column 'u'", "'n/a'", "write a number"),
+    "text in a reading": (
+        _field(9, "theta1", "0.1 rad"),
+        "line 9, column 'theta1'",
+        "'0.1 rad'",
+        "leave the field empty",
+    ),
+    "inf": (_field(9, "theta1", "inf"), "line 9, column 'theta1'", "'inf'", "leave the field empty"),
+    "minus infinity": (_field(9, "u", "-Infinity"), "line 9, column 'u'", "'-Infinity'", "write a number"),
+    "nan in an input": (_field(9, "u", "nan"), "line 9, column 'u'", "'nan'", "never empty"),
+    "minus nan in an input": (_field(9, "u", "-NaN"), "line 9, column 'u'", "'-NaN'", "never empty"),
+    "empty input": (_field(9, "u", ""), "line 9, column 'u'", "found ''", "never empty"),
+    "blank time": (_field(202, "time", " "), "line 202, column 'time'", "found ''", "never empty"),
+    "row too short": (lambda s: s.replace("\n0.03,", "\n"), "line 5", "3 fields under 4 names", "every column a field"),
+    "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
+    "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
+    "gap": (lambda s: s.replace(s.splitlines()[6] + "\n", ""), "line 7, column 'time'", "a gap: 0.04", "empty field"),
+    "row twice": (
+        lambda s: s.replace("\n0.04,", "\n0.03,"),
+        "line 6, column 'time'",
+        "does not run on",
+        "(dt = 0.01 s)",
+    ),
+    "jitter": (
+        _column("time", _jitter),
+        "line 9, column 'time'",
+        "jitter: 0.06 s, then 0.0702 s (2 places",
+        "resample",
+    ),
+    "another dt": (_column("time", lambda t: 2 * t), "column 'time'", "0.02 s apart", "correct [sampling] dt"),
+    "milliseconds": (_column("time", lambda t: 1000 * t), "column 'time'", "10 s apart", "one of the two is in ms"),
+    "time backwards": (_column("time", lambda t: -t), "column 'time'", "-0.01 s apart", "correct [sampling] dt"),
+    "late start": (_column("time", lambda t: t + 5), "line 2, column 'time'", "starts at 5 s", 'clock = "session"'),
+    "never measured": (_column("theta1", lambda x: x * np.nan), "column 'theta1'", "no sample", "[measurement]"),
+    "rate never measured": (_column("dtheta1", lambda x: x * np.nan), "column 'dtheta1'", "no sample", "[measurement]"),
+    "wrapped": (_column("theta1", _wrap), "line 125, column 'theta1'", "jumps by 6.2", "unwrap"),
+    "wrapped degrees": (_column("theta1", lambda x: np.degrees(_wrap(x))), "line 125", "jumps by 35", "degrees to rad"),
+    "angle in degrees": (_column("theta1", np.degrees), "column 'theta1'", "57.3 times", "write rad"),
+    "rate in degrees": (_column("dtheta1", np.degrees), "column 'dtheta1'", "0.0175 times", "write rad and rad/s"),
+    "utf-16": (lambda s: s.encode("utf-16"), "line 1", "not UTF-8", "save the file as plain UTF-8"),
+    "latin-1": (
+        lambda s: s.replace("\n", ",\n").replace(",\n", ",note_°\n", 1).encode("latin-1"),
+        "line 1",
+        "not UTF-8",
+        "plain UTF-8",
+    ),
+    "a picture": (lambda _: bytes(range(256)) * 9, "line", "not UTF-8", "plain UTF-8"),
+    "zero bytes": (_field(9, "u", "\0\0"), "line 9, column 'u'", "\\x00", "write a number"),
+    "thousands": (_field(9, "u", '"1,000.5"'), "line 9", "5 fields under 4 names", "decimals with '.'"),
+    "underscore": (_field(9, "u", "1_0"), "line 9, column 'u'", "'1_0'", "write a number"),
+    "hexadecimal": (_field(9, "u", "0x1p-3"), "line 9, column 'u'", "'0x1p-3'", "write a number"),
+    "formula": (_field(9, "theta1", "#REF!"), "line 9, column 'theta1'", "'#REF!'", "leave the field empty"),
+    "date": (_field(2, "time", "2026-01-01"), "line 2, column 'time'", "'2026-01-01'", "write a number"),
+    "angle in turns": (
+        _column("theta1", lambda x: x / (2 * np.pi)),
+        "column 'theta1'",
+        "0.159 times",
+        "turns: write rad",
+    ),
+    "angle in mrad": (_column("theta1", lambda x: 1e3 * x), "column 'theta1'", "1e+03 times", "write SI units"),
+    "rate in rpm": (
+        _column("dtheta1", lambda x: x * 30 / np.pi),
+        "column 'dtheta1'",
+        "0.105 times",
+        "rpm: write rad/s",
+    ),
+    "rate in mrad/s": (_column("dtheta1", lambda x: 1e3 * x), "column 'dtheta1'", "0.001 times", "write SI units"),
+    "sign": (_column("dtheta1", np.negative), "column 'dtheta1'", "minus column 'dtheta1'", "turn the sign"),
+    "angle and rate swapped": (_swap("theta1", "dtheta1"), "column 'theta1'", "is the rate of 'dtheta1'", "swapped"),
+    "input and angle swapped": (_swap("u", "theta1"), "column 'theta1'", "is the rate of 'u'", "'u' look swapped"),
+    "input and rate swapped": (_swap("u", "dtheta1"), "column 'dtheta1'", "'u' is the rate", "look swapped"),
+    "angle twice": (_columns(lambda log: {"dtheta1": log["theta1"]}), "'dtheta1'", "same numbers", "each sensor reads"),
+    "input as rate": (_columns(lambda log: {"dtheta1": log["u"]}), "'dtheta1'", "as column 'u'", "each sensor reads"),
+}
+FOLDERS = {  # name: (the change of the folder, the file, then the words of the message)
+    "no rig": (lambda f: (f / "rig.toml").unlink(), "rig.toml", "cannot be read", "a folder with a rig.toml"),
+    "rig in another encoding": (
+        lambda f: (f / "rig.toml").write_bytes(RIG.replace("bench", "Prüfstand").encode("latin-1")),
+        "rig.toml",
+        "line 2: not UTF-8",
+        "plain UTF-8",
+    ),
+    "rig no TOML": (_rig("m = 0.5", "m = 0,5"), "rig.toml", "line 6", "not TOML", "key = value"),
+    "unknown key": (_rig("friction =", "fricton ="), "rig.toml", "[model] fricton", "did you mean 'friction'?"),
+    "unknown table": (_rig("[sampling]", "[samplign]"), "rig.toml", "samplign", "did you mean 'sampling'?"),
+    "unknown system": (_rig('"pendulum"', '"pendelum"'), "rig.toml", "[model] type", "did you mean 'pendulum'?"),
+    "parameter missing": (_rig("lc = 0.4\n", ""), "rig.toml", "[model] lc", "missing", "write lc ="),
+    "negative mass": (_rig("m = 0.5", "m = -0.5"), "rig.toml", "[model] m", "-0.5", "mass above 0 [kg]"),
+    "mass a text": (_rig("m = 0.5", 'm = "0.5 kg"'), "rig.toml", "[model] m", "'0.5 kg'", "finite number"),
+    "noise 0": (_rig("theta1 = 0.005", "theta1 = 0"), "rig.toml", "noise_std] theta1", "found 0", "above 0"),
+    "negative noise": (_rig("theta1 = 0.005", "theta1 = -1"), "rig.toml", "noise_std] theta1", "found -1", "above 0"),
+    "dt 0": (_rig("dt = 0.01", "dt = 0"), "rig.toml", "[sampling] dt", "found 0", "above 0"),
+    "dt a text": (_rig("dt = 0.01", 'dt = "10 ms"'), "rig.toml", "[sampling] dt", "'10 ms'", "finite number"),
+    "joint that is not there": (_rig("joint = 1", "joint = 2"), "rig.toml", "actuated_joint", "from 1 to 1"),
+    "column that is no state": (
+        _rig('["theta1", "dtheta1"]', '["theta1", "omega1"]'),
+        "rig.toml",
+        "[measurement] columns",
+        "'omega1'",
+        "possible here: theta1, dtheta1",
+    ),
+    "no train": (lambda f: shutil.rmtree(f / "train"), "train", "is no folder", "one CSV file per sequence"),
+    "empty train": (
+        lambda f: [path.unlink() for path in f.glob("train/*")],
+        "train",
+        "holds no *.csv",
+        "one CSV file per sequence",
+    ),
+    "spreadsheets": (
+        lambda f: [path.rename(path.with_suffix(".xlsx")) for path in f.glob("train/*")],
+        "train",
+        "found there: 00.xlsx, 01.xlsx",
+        "one CSV file per sequence",
+    ),
+    "a sequence in two formats": (
+        lambda f: (f / "train/00.mat").write_bytes(b""),
+        "train/00.mat",
+        "there is a 00.csv beside it",
+        "remove or rename one",
+    ),
+    "a folder for a file": (
+        lambda f: [(f / "train/01.csv").unlink(), (f / "train/01.csv").mkdir()],
+        "train/01.csv",
+        "cannot be read",
+        "check the path",
+    ),
+    "huge": (_huge, "train/01.csv", "257 MB", "cut it into sequences"),
+    "bad test file": (
+        lambda f: (f / "test/00.csv").write_text(_text(_log(1.0)).replace("time", "tme")),
+        "test/00.csv",
+        "line 1, column 'time'",
+        "did you mean 'tme'?",
+    ),
+    "time and dt in ms": (
+        _both(_rig("dt = 0.01", "dt = 10"), _everywhere("time", lambda t: 1000 * t)),
+        "train/00.csv",
+        "column 'dtheta1'",
+        "times column",
+        "time and dt are in ms",
+    ),
+    "test in train": (_cut(0, 201), "test file 01.csv", "same content as train file 01.csv", "remove one"),
+    "a part of train in test": (
+        _cut(100, 150),
+        "test file 01.csv",
+        "row 1 and those after it are also in train file 01.csv, from row 101",
+        "remove one",
+    ),
+    "a sequence twice": (
+        lambda f: shutil.copy(f / "train/01.csv", f / "train/02.csv"),
+        "train file 02.csv",
+        "same content as train file 01.csv",
+        "remove one",
+    ),
+}
+ERRORS = FOLDERS | {name: (_log_file(change), "train/01.csv", *words) for name, (change, *words) in LOGS.items()}
+WARNINGS = {  # what may be meant: name: (the change of the folder, then the words of the warning)
+    "constant": (
+        _log_file(_column("theta1", lambda x: 0 * x + 0.25)),
+        "train/01.csv",
+        "column 'theta1'",
+        "constant at 0.25",
+        "is the sensor alive?",
+    ),
+    "degrees without a rate": (
+        _both(_only("theta1"), _log_file(_column("theta1", np.degrees))),
+        "train/01.csv",
+        "column 'theta1'",
+        "turns at",
+        "is it in degrees?",
+    ),
+    "degrees/s without an angle": (
+        _both(_only("dtheta1"), _log_file(_column("dtheta1", np.degrees))),
+        "train/01.csv",
+        "column 'dtheta1'",
+        "turns at",
+        "is it in degrees?",
+    ),
+    "another scale": (
+        _log_file(_column("dtheta1", lambda x: 1.6 * x)),
+        "train/01.csv",
+        "column 'dtheta1'",
+        "0.625 times",
+        "check units",
+    ),
+    "another motion": (
+        _log_file(_column("dtheta1", lambda x: np.sin(np.arange(x.size) / 11))),
+        "train/01.csv",
+        "column 'dtheta1'",
+        "not the rate of 'theta1'",
+        "check units",
+    ),
+    "overlapping sequences": (
+        lambda f: (f / "train/02.csv").write_text(_text(_log(0.0, 150))),
+        "train file 02.csv",
+        "row 1 and those after it are also in train file 01.csv",
+        "cut sequences without overlap",
+    ),
+    "input in N mm": (
+        _everywhere("u", lambda x: 1e4 * x),
+        "train: column u",
+        "gravity and inertia of joint 1",
+        "look at its unit (N m)",
+    ),
+    "mass in g": (_rig("m = 0.5", "m = 500e3"), "train: column u", "ask for", "masses (kg)"),
+    "gravity in mm/s^2": (_rig("g = 9.81", "g = 9810"), "rig.toml", "[model] g", "9810", "write it in m/s^2"),
+    "length in mm": (_rig("lc = 0.4", "lc = 400"), "rig.toml", "[model] lc", "400", "write it in m"),
+}
+
+
+def _identify(good: Path, change: Callable[[Path], object], place: Path) -> Path:
+    """`nnap-em identify` on a broken copy; it must be refused and write nothing."""
+    folder = place / "bench"
+    shutil.copytree(good, folder)
+    change(folder)
+    before = sorted(place.rglob("*"))
+    assert cli.main(["identify", str(folder), "--out", str(place / "out")]) == 2
+    assert sorted(place.rglob("*")) == before
+    return folder
+
+
+@pytest.mark.parametrize("change, file, words", [(c, f, w) for c, f, *w in ERRORS.values()], ids=ERRORS)
+def test_bad_input_is_refused_in_one_line(good, tmp_path, capsys, change, file, words):
+    _identify(good, change, tmp_path)
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = (line for line in said.err.splitlines() if "warning: " not in line)
+    assert line.startswith("nnap-em: error: ")
+    for word in (file, *words):
+        assert word in line
+
+
+@pytest.mark.parametrize("change, words", [(c, w) for c, *w in WARNINGS.values()], ids=WARNINGS)
+def test_what_is_doubtful_is_said_before_the_fit(good, tmp_path, capsys, monkeypatch, change, words):
+    def stop(*_, **__):
+        raise FitError("the fit would begin here")
+
+    monkeypatch.setattr(commands, "begin", stop)
+    _identify(good, change, tmp_path)
+    *warnings, last = capsys.readouterr().err.splitlines()
+    assert last == "nnap-em: error: the fit would begin here"
+    assert any(line.startswith("nnap-em: warning: ") and all(word in line for word in words) for line in warnings)
+
+
+def test_good_input_is_read_without_a_word(good, tmp_path, capsys, monkeypatch):
+    def stop(*_, **__):
+        raise FitError("the fit would begin here")
+
+    monkeypatch.setattr(commands, "begin", stop)
+    _identify(good, lambda _: None, tmp_path)
+    assert capsys.readouterr().err == "nnap-em: error: the fit would begin here\n"
+
+
+def _no_number(text: str) -> bool:
+    try:
+        return "_" in text or np.isinf(float(text))
+    except ValueError:
+        return bool(text.strip())  # an empty field is a missing sample
+
+
+_corrupt = st.sampled_from(["x", "-inf", "1e999", "--1", "0x10", "1_0", "1;5", "true", "1 2", "=A1"])
+
+
+@settings(deadline=None, max_examples=60)  # it writes files
+@given(row=st.integers(0, 19), column=st.integers(0, 3), bad=_corrupt | st.text("abefnx+-.e 1").filter(_no_number))
+@example(row=0, column=0, bad="nan")
+@example(row=19, column=1, bad="")
+def test_any_corrupted_field_is_named_with_its_line_and_column(tmp_path_factory, row, column, bad):
+    path = tmp_path_factory.getbasetemp() / "corrupted.csv"
+    name = list(_swing())[column]
+    path.write_text(_field(row + 2, name, bad)(_text(_swing(20))))
+    with pytest.raises(DataError) as refused:
+        read_csv(path, ("time", "u"), ("theta1", "dtheta1"))
+    assert f"line {row + 2}, column {name!r}: found {bad.strip()!r}" in str(refused.value)

@@ -1,0 +1,185 @@
+"""The check before a fit: closed forms where there are any, and data sets that are bad in one known way."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em import cli
+from nnap_em.check import check, gramian
+from nnap_em.data import Dataset, Logs
+from nnap_em.rig import Declared, Rig
+from nnap_em.simulate import examples, sweep_experiment
+
+ROWS, COUNT = 201, 6
+
+
+def _rig(measured: tuple[str, ...] = ("x", "dx"), noise: dict[str, float] | None = None, dt: float = 0.01) -> Rig:
+    declared = {"x": 1e-3, "dx": 5e-3} if noise is None else noise
+    declared = {name: std for name, std in declared.items() if name in measured}
+    return Rig("s", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), dt, "sequence", measured, declared, {})
+
+
+@pytest.fixture(scope="module")
+def slide() -> Logs:
+    """Slides with both states read at the noise that `_rig` declares."""
+    model, sweep = examples["slide"]()
+    experiment = sweep_experiment(model, sweep, COUNT, ROWS - 1, key=jax.random.key(0))
+    noise = np.random.default_rng(0).normal(size=experiment.x.shape) * [1e-3, 5e-3]
+    data = Dataset(*(np.asarray(a) for a in experiment.data))
+    return _logs(data._replace(y=np.asarray(experiment.x) + noise))
+
+
+def _logs(data: Dataset) -> Logs:
+    return Logs(tuple(f"{i:03d}.csv" for i in range(len(data.t))), data, ("u", "x", "dx"))
+
+
+def _found(logs: Logs, rig: Rig | None = None, test: Logs | None = None) -> dict[str, list[tuple[str, str]]]:
+    found: dict[str, list[tuple[str, str]]] = {}
+    for mark, subject, text in check(rig or _rig(), logs, test, key=jax.random.key(0)):
+        found.setdefault(subject, []).append((mark, text))
+    return found
+
+
+def _changed(logs: Logs, **parts) -> Logs:
+    return _logs(logs.data._replace(**{name: change(getattr(logs.data, name)) for name, change in parts.items()}))
+
+
+def test_a_good_data_set_is_all_ok(slide):
+    found = _found(slide, test=slide)
+    assert {mark for answers in found.values() for mark, _ in answers} == {"ok"}
+    assert list(found) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
+    assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in found["length"][0][1]
+    assert "2 of 2 directions" in found["states"][0][1]
+
+
+def test_the_gramian_of_a_double_integrator():
+    """Positions alone, read at k dt: sum [[1, k dt], [k dt, (k dt)^2]]."""
+    dt, rows = 0.1, 7
+    a = np.tile([[1.0, dt], [0.0, 1.0]], (rows, 1, 1))
+    c = np.tile([[2.0, 0.0]], (rows, 1, 1))
+    t = dt * np.arange(rows)
+    wanted = 4 * np.array([[rows, t.sum()], [t.sum(), (t**2).sum()]])
+    np.testing.assert_allclose(gramian(a, c, np.ones(2)), wanted, rtol=1e-12)
+    np.testing.assert_allclose(gramian(a, c, np.array([3.0, 0.5])), wanted * np.outer([3, 0.5], [3, 0.5]), rtol=1e-12)
+
+
+def test_a_place_that_nothing_tells_is_named(slide):
+    """A slide knows no place: its rate tells nothing of it, and friction does not mind."""
+    found = _found(_changed(slide, y=lambda y: y[..., 1:]), _rig(("dx",)))
+    ((mark, text),) = found["states"]
+    assert mark == "look"
+    assert "1 of 2 directions" in text
+    assert "do not tell x" in text
+
+
+def test_readings_that_tell_no_velocity_are_bad(slide):
+    found = _found(slide, _rig(noise={"x": 50.0, "dx": 50.0}))
+    assert found["states"][0][0] == "bad"
+    assert "0 of 2" in found["states"][0][1]
+    assert found["noise"][0][0] == "bad"
+    assert "the motion hardly rises above it" in found["noise"][0][1]
+
+
+CASES = {  # name: (change, subject, mark, words)
+    "few rows": (dict(valid=lambda v: v & (np.arange(ROWS) < 15)), "length", "bad", "too few"),
+    "short sequences": (dict(valid=lambda v: v & (np.arange(ROWS) < 50)), "length", "look", "0.5 s"),
+    "gaps": (
+        dict(y=lambda y: np.where((np.arange(ROWS) % 3 > 0)[None, :, None], np.nan, y)),
+        "missing",
+        "look",
+        "x: 67 %",
+    ),
+    "hardly any reading": (
+        dict(y=lambda y: np.where((np.arange(ROWS) % 20 > 3)[None, :, None], np.nan, y)),
+        "missing",
+        "bad",
+        "x: 80 %",
+    ),
+    "forces in mN": (dict(u=lambda u: 1000 * u), "torque", "bad", "look at its unit (N)"),
+    "forces in kN": (dict(u=lambda u: u / 1e5), "torque", "bad", "look at its unit (N)"),
+    "one way": (dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)), "motion", "look", "one direction only"),
+    "no motion": (dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)), "motion", "bad", "hardly moves"),
+    "rest": (
+        dict(y=lambda y: y * np.where(np.arange(ROWS) < 20, 1.0, 1e-3)[None, :, None]),
+        "motion",
+        "look",
+        "it rests most of the time",
+    ),
+    "more noise than declared": (
+        dict(y=lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0]),
+        "noise",
+        "look",
+        "declare more",
+    ),
+}
+
+
+@pytest.mark.parametrize("change, subject, mark, words", CASES.values(), ids=CASES)
+def test_what_is_bad_is_found(slide, change, subject, mark, words):
+    answers = _found(_changed(slide, **change))[subject]
+    assert any(found == mark and words in text for found, text in answers), answers
+
+
+def test_a_filtered_log_is_noticed(slide):
+    answers = _found(slide, _rig(noise={"x": 1e-3, "dx": 0.1}))["noise"]
+    assert answers[1][0] == "look"
+    assert "was filtered" in answers[1][1]
+
+
+def test_with_hardly_any_rows_nothing_else_is_asked(slide):
+    found = _found(_logs(Dataset(*(part[:, :2] for part in slide.data))))
+    assert list(found) == ["length", "test", "missing"]
+    assert found["length"][0][0] == "bad"
+
+
+def test_slow_sampling_is_noticed(slide):
+    """Every 10th row: half a second of a sweep is five rows."""
+    slow = Dataset(*(part[:, ::10] for part in slide.data))
+    found = _found(_logs(slow), _rig(dt=0.1))
+    assert found["sampling"][0][0] == "look"
+    assert "sample faster" in found["sampling"][0][1]
+
+
+def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):
+    folder = tmp_path / "bench"
+    argv = ["simulate", str(folder), "--system", "slide", "--sequences", "4", "--test", "1", "--steps", "150"]
+    assert cli.main(argv) == 0
+    before = sorted(tmp_path.rglob("*"))
+    capsys.readouterr()
+    assert cli.main(["check", str(folder)]) == 0
+    good = capsys.readouterr()
+    assert "nothing speaks against a fit" in good.err
+    assert all(re.match(r"(ok|look)   *[a-z]+ +\S", line) for line in good.out.splitlines())
+    _heavier(folder)
+    assert cli.main(["check", str(folder)]) == 1
+    bad = capsys.readouterr()
+    assert "1 of 8 answers are bad" in bad.err
+    assert re.search(r"(?m)^bad   torque    u: up to .* look at its unit", bad.out)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def _heavier(folder: Path) -> None:
+    """The mass in mg."""
+    rig = (folder / "rig.toml").read_text()
+    assert "m = 1.0 " in rig
+    (folder / "rig.toml").write_text(rig.replace("m = 1.0 ", "m = 1e6 "))
+
+
+def test_the_acrobot_with_a_hidden_joint_passes():
+    """The paper's experiment: joint 1 tells all four states."""
+    model, sweep = examples["acrobot"]()
+    data = sweep_experiment(model, sweep, 4, 150, key=jax.random.key(0)).data
+    parameters = {n: Declared(float(getattr(model.system, n)), 0.0) for n in ("m1", "m2", "l1", "l2", "lc1", "lc2")}
+    parameters |= {n: Declared(float(getattr(model.system, n)), 0.0) for n in ("I1", "I2", "g")}
+    measured = tuple(("theta1", "theta2", "dtheta1", "dtheta2")[i] for i in model.measured)
+    rig = Rig("a", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", measured, {}, {})
+    data = Dataset(*(np.asarray(part) for part in data))
+    found = _found(Logs(tuple("abcd"), data, ("u", *measured)), rig)
+    assert "bad" not in {mark for answers in found.values() for mark, _ in answers}
+    assert "4 of 4 directions" in found["states"][0][1]
+    assert any("joint 2 (never seen, by the declared model)" in text for _, text in found["motion"])
+    assert jnp.isfinite(data.y).all()

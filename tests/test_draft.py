@@ -1,0 +1,160 @@
+"""The first rig.toml: what a log tells is right, what it does not is asked for by name, and nothing is overwritten."""
+
+import re
+
+import numpy as np
+import pytest
+
+from nnap_em import cli
+from nnap_em.draft import draft
+from nnap_em.formats import DataError, write_csv
+from nnap_em.rig import RigError, read_rig
+from nnap_em.systems import specs
+
+DT, ROWS = 0.02, 400
+NOISE = {"theta1": 2e-3, "theta2": 1e-3, "dtheta1": 0.02, "dtheta2": 0.05, "x": 1e-3, "dx": 5e-3}
+
+
+def _log(*names: str, t0: float = 0.0) -> dict[str, np.ndarray]:
+    """Smooth signals, with white noise on those that are states."""
+    t = DT * np.arange(ROWS)
+    rng = np.random.default_rng(0)
+    columns = {"time": t0 + t}
+    for i, name in enumerate(names):
+        columns[name] = np.sin((1 + 0.3 * i) * t + i) + rng.normal(size=ROWS) * NOISE.get(name, 0.0)
+    return columns
+
+
+def _draft(tmp_path, *names: str, system: str | None = None, t0: float = 0.0):
+    path = tmp_path / "bench" / "01.csv"
+    write_csv(path, _log(*names, t0=t0))
+    return draft(path, system, specs)
+
+
+def _filled(text: str) -> str:
+    return re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", text)
+
+
+SYSTEMS = {  # columns, system given, the system, inputs and joints that must be told
+    "slide": (("f", "x", "dx"), None, "slide", {"f": 1}),
+    "pendulum": (("u", "theta1"), "pendulum", "pendulum", {"u": 1}),
+    "acrobot": (("tau2", "theta1", "theta2"), None, "acrobot", {"tau2": 2}),
+    "pendubot": (("tau1", "theta1", "theta2", "dtheta2"), None, "pendubot", {"tau1": 1}),
+    "both driven": (("u1", "u2", "theta2", "dtheta2", "note"), None, "acrobot", {"u1": 1, "u2": 2}),
+    "hidden joint": (("u", "theta1", "dtheta1"), "acrobot", "acrobot", {"u": 2}),
+}
+
+
+@pytest.mark.parametrize("names, given, system, inputs", SYSTEMS.values(), ids=SYSTEMS)
+def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
+    found = _draft(tmp_path, *names, system=given)
+    assert not found.notes
+    assert found.missing == [name for name in specs[system].parameters if name != "g"]
+    (tmp_path / "rig.toml").write_text(_filled(found.text))
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert (rig.system, rig.name, rig.dt, rig.clock, rig.friction) == (system, "bench", DT, "sequence", True)
+    assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == inputs
+    assert rig.measured == tuple(name for name in names if name in specs[system].states)
+    for name, std in rig.noise_std.items():
+        # the median of 397 third differences, correlated over three: about 8 %
+        assert std == pytest.approx(NOISE[name], rel=0.25)
+    assert set(rig.noise_std) == set(rig.measured)
+
+
+@pytest.mark.parametrize("key", [name for name in specs["acrobot"].parameters if name != "g"])
+def test_a_line_that_is_not_filled_in_is_refused_by_name(tmp_path, key):
+    text = _draft(tmp_path, "tau2", "theta1", "theta2").text
+    rest = re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text)
+    (tmp_path / "rig.toml").write_text(rest)
+    with pytest.raises(RigError, match=rf"rig.toml: \[model\] {key}: missing .*write {key} = 0.2"):
+        read_rig(tmp_path / "rig.toml", specs)
+
+
+NOTES = {  # columns, then the notes
+    "degrees": (("u", "theta1_deg"), "column 'theta1_deg': name it 'theta1' and convert it from deg to rad"),
+    "brackets": (("u", "theta1 [deg]"), "column 'theta1 [deg]': name it 'theta1' and convert it from deg to rad"),
+    "other names": (("u", "q1", "qdot1"), "column 'q1': name it 'theta1'; column 'qdot1': name it 'dtheta1'"),
+    "dots": (("u", "theta1", "theta1_dot"), "column 'theta1_dot': name it 'dtheta1'"),
+    "rpm": (("u", "theta1", "speed1_rpm"), "column 'speed1_rpm': name it 'dtheta1' and convert it from rpm to rad/s"),
+    "torque": (("tau1_mNm", "theta1"), "column 'tau1_mNm': convert it from mnm to N m"),
+    "SI in the name": (("tau1 [Nm]", "theta1"), ""),
+    "twice": (("u", "theta1", "angle1"), ""),
+}
+
+
+@pytest.mark.parametrize("names, notes", NOTES.values(), ids=NOTES)
+def test_columns_to_rename_or_convert_are_named(tmp_path, names, notes):
+    assert "; ".join(_draft(tmp_path, *names, system="pendulum").notes) == notes
+
+
+def test_a_clock_in_ms_and_no_clock_are_noticed(tmp_path):
+    path = tmp_path / "01.csv"
+    columns = _log("u", "x")
+    write_csv(path, {"t_ms" if n == "time" else n: v * (1000 if n == "time" else 1) for n, v in columns.items()})
+    found = draft(path, None, specs)
+    assert found.notes == ("column 't_ms': name it 'time' and convert it from ms to s",)
+    assert f"dt = {DT}" in found.text
+    write_csv(path, {name: columns[name] for name in ("u", "x")})
+    found = draft(path, None, specs)
+    assert found.notes == ("no column 'time': add one [s]",)
+    assert found.missing == ["m", "dt"]
+
+
+def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
+    path = tmp_path / "01.csv"
+    columns = _log("note", t0=5.0)
+    columns["time"][7] += 0.1 * DT
+    write_csv(path, columns)
+    found = draft(path, "slide", specs)
+    assert found.missing == ["m", "columns", "joints", "dt", "columns"]
+    assert "0.018 to 0.022 s apart: resample" in found.text
+    assert 'clock = "session"' in found.text
+
+
+def test_noise_without_a_signal_is_not_declared(tmp_path):
+    path = tmp_path / "01.csv"
+    rest = np.random.default_rng(0).normal(size=ROWS)
+    write_csv(path, _log("u") | {"x": rest, "dx": 0 * rest})
+    text = draft(path, None, specs).text
+    assert re.search(r"(?m)^# x = ", text)
+    assert re.search(r"(?m)^# dx = 0 ", text)
+
+
+@pytest.mark.parametrize(
+    "names, reason", [(("u", "theta1"), "hidden joint"), (("a", "b"), "no column is named as a state")]
+)
+def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
+    with pytest.raises(DataError, match=rf"01.csv: line 1: .*{reason}.*; give --system acrobot"):
+        _draft(tmp_path, *names)
+
+
+def test_the_command_writes_once_and_never_over(tmp_path, capsys):
+    write_csv(tmp_path / "bench/train/01.csv", _log("u", "x_mm"))
+    argv = ["init", str(tmp_path / "bench/train/01.csv")]
+    assert cli.main(argv) == 0
+    said = capsys.readouterr().err
+    assert "in the log: column 'x_mm': name it 'x' and convert it from mm to m" in said
+    assert f"wrote {tmp_path / 'bench/rig.toml'}; fill in m, columns" in said
+    first = (tmp_path / "bench/rig.toml").read_bytes()
+    assert cli.main([*argv, "--system", "slide"]) == 2
+    assert "rig.toml: is there already; give another --out" in capsys.readouterr().err
+    assert (tmp_path / "bench/rig.toml").read_bytes() == first
+    assert cli.main([*argv, "--out", str(tmp_path / "new")]) == 0
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["rig.toml"]
+    assert cli.main(["init", str(tmp_path / "log.txt"), "--out", str(tmp_path / "other")]) == 2
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_path):
+    paths = sorted((shared / "data").glob("*/*/rig.toml"))
+    assert paths
+    for path in paths:
+        owner = read_rig(path, specs)
+        found = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
+        assert not found.notes
+        (tmp_path / "rig.toml").write_text(_filled(found.text))
+        rig = read_rig(tmp_path / "rig.toml", specs)
+        assert (rig.dt, rig.clock, rig.measured) == (owner.dt, owner.clock, owner.measured)
+        assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == dict(
+            zip(owner.input_columns, owner.input_joints, strict=True)
+        )

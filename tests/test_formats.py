@@ -1,0 +1,153 @@
+"""Logs in other formats: the same numbers as in CSV, and the same refusals, by row and column."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nnap_em import commands
+from nnap_em.data import read_logs
+from nnap_em.formats import DataError, read_table, write_csv
+from nnap_em.identify import Identified
+from nnap_em.rig import Rig
+
+RIG = Rig("bench", "acrobot", {}, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
+
+
+def _log(rows: int = 50) -> dict[str, np.ndarray]:
+    t = 0.01 * np.arange(rows)
+    theta = np.sin(3 * t)
+    theta[::7] = np.nan
+    return {"time": t, "u": np.cos(t), "theta1": theta, "dtheta1": 3 * np.cos(3 * t)}
+
+
+def _parquet(path: Path, columns) -> None:
+    pq.write_table(pa.table(columns), path)
+
+
+def _struct(path: Path, columns) -> None:
+    scipy.io.savemat(path, {"run1": columns}, oned_as="column")
+
+
+def _mat(path: Path, columns) -> None:
+    scipy.io.savemat(path, columns, oned_as="row")
+
+
+WRITERS = {
+    "csv": (".csv", write_csv),
+    "parquet": (".parquet", _parquet),
+    "mat": (".mat", _mat),
+    "struct": (".mat", _struct),
+}
+
+
+@pytest.mark.parametrize("suffix, write", WRITERS.values(), ids=WRITERS)
+def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
+    write(tmp_path / f"01{suffix}", _log())
+    logs = read_logs(tmp_path, RIG)
+    columns = _log()
+    assert logs.files == (f"01{suffix}",)
+    np.testing.assert_allclose(logs.data.t[0], columns["time"], rtol=1e-11)
+    np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], rtol=1e-11)
+    np.testing.assert_allclose(logs.data.y[0].T, [columns["theta1"], columns["dtheta1"]], rtol=1e-11)
+
+
+_values = st.floats(allow_infinity=False, width=64)
+
+
+@pytest.mark.parametrize("suffix, write", [WRITERS["parquet"], WRITERS["mat"]], ids=["parquet", "mat"])
+@settings(deadline=None, max_examples=40)  # it writes files
+@given(rows=st.lists(st.tuples(_values, _values), min_size=2, max_size=30))
+def test_any_finite_table_comes_back_to_the_bit(tmp_path_factory, suffix, write, rows):
+    path = tmp_path_factory.getbasetemp() / f"written{suffix}"
+    a, b = np.array(rows).T
+    write(path, {"time": np.arange(len(rows), dtype=float), "a": a, "b": b})
+    np.testing.assert_array_equal(read_table(path, ("time",), ("b", "a"))[:, 1:].T, [b, a])
+
+
+@pytest.mark.parametrize("suffix, write", [WRITERS["parquet"], WRITERS["mat"]], ids=["parquet", "mat"])
+@settings(deadline=None, max_examples=30)  # it writes files
+@given(row=st.integers(0, 49), name=st.sampled_from(list(_log())), bad=st.sampled_from([np.inf, -np.inf, np.nan]))
+def test_any_corrupted_field_is_named_with_its_row_and_column(tmp_path_factory, suffix, write, row, name, bad):
+    path = tmp_path_factory.getbasetemp() / f"corrupted{suffix}"
+    columns = _log()
+    columns[name][row] = bad
+    write(path, columns)
+    if np.isnan(bad) and "theta" in name:
+        assert np.isnan(read_table(path, ("time", "u"), ("theta1", "dtheta1"))[row]).any()
+        return
+    with pytest.raises(DataError) as refused:
+        read_table(path, ("time", "u"), ("theta1", "dtheta1"))
+    assert f"row {row + 1}, column {name!r}: found {bad:g}; write a number" in str(refused.value)
+
+
+def _shorter(columns):
+    return columns | {"u": columns["u"][:-1]}
+
+
+MISTAKES = {  # name: (suffix, the bytes or the columns, then the words of the message)
+    "parquet: column missing": (".parquet", lambda c: {n: c[n] for n in ("time", "theta1", "dtheta1")}, "'u': missing"),
+    "parquet: text": (".parquet", lambda c: c | {"u": ["0.1"] * 50}, "column 'u'", "holds object", "floating point"),
+    "parquet: one row": (".parquet", lambda c: {n: v[:1] for n, v in c.items()}, "found 1 rows", "2 rows or more"),
+    "parquet: no such file": (".parquet", b"PAR1 and nothing", "no Parquet file, or damaged", "another copy"),
+    "parquet: empty": (".parquet", b"", "no Parquet file, or damaged", "another copy"),
+    "parquet: gap": (
+        ".parquet",
+        lambda c: {n: np.delete(v, 9) for n, v in c.items()},
+        "row 10, column 'time'",
+        "a gap",
+    ),
+    "mat: column misspelt": (".mat", lambda c: {n.replace("dth", "d_th"): v for n, v in c.items()}, "did you mean"),
+    "mat: another length": (".mat", _shorter, "column 'u'", "is 49, the first has 50 rows", "one length"),
+    "mat: a matrix": (".mat", lambda c: c | {"u": np.ones((50, 2))}, "column 'u'", "is 50 x 2", "one length"),
+    "mat: complex": (".mat", lambda c: c | {"u": c["u"] + 1j}, "column 'u'", "holds complex128, no numbers"),
+    "mat: text": (".mat", lambda c: c | {"u": "0.1"}, "column 'u'", "no numbers", "floating point"),
+    "mat: cut short": (".mat", b"MATLAB 5.0 MAT-file, Platform" + 40 * b" ", "no MAT file, or damaged", "another copy"),
+    "mat: noise": (".mat", bytes(range(256)) * 4, "no MAT file, or damaged", "as CSV"),
+    "mat: version 7.3": (".mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF" * 99, "7.3", "'-v7'"),
+}
+
+
+@pytest.mark.parametrize("suffix, content, words", [(s, c, w) for s, c, *w in MISTAKES.values()], ids=MISTAKES)
+def test_a_mistake_is_refused(tmp_path, suffix, content, words):
+    path = tmp_path / f"01{suffix}"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        dict([WRITERS["parquet"], WRITERS["mat"]])[suffix](path, content(_log()))
+    with pytest.raises(DataError) as refused, warnings.catch_warnings(action="ignore"):
+        read_logs(tmp_path, RIG)
+    for word in (str(path), *words):
+        assert word in str(refused.value)
+
+
+@pytest.mark.parametrize("suffix, module", [(".parquet", "pyarrow.parquet"), (".mat", "scipy.io")])
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, suffix, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / f"01{suffix}").write_bytes(b"any")
+    with pytest.raises(DataError, match=r"cannot be read without \w+; pip install 'nnap-em\[formats\]'"):
+        read_logs(tmp_path, RIG)
+
+
+def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):
+    columns = _log() | {"u": np.arange(50, dtype=np.int32), "dtheta1": np.arange(50, dtype=np.float32)}
+    table = pa.table(columns | {"theta1": pa.array([None, *range(49)], pa.float64()), "note": ["x"] * 50})
+    pq.write_table(table, tmp_path / "01.parquet")
+    found = read_table(tmp_path / "01.parquet", ("u",), ("theta1", "dtheta1"))
+    np.testing.assert_array_equal(found.T, [np.arange(50), [np.nan, *range(49)], np.arange(50)])
+
+
+def test_predictions_of_such_logs_are_csv_files(tmp_path):
+    (tmp_path / "logs").mkdir()
+    _parquet(tmp_path / "logs/01.parquet", _log())
+    logs = read_logs(tmp_path / "logs", RIG)
+    values = np.zeros((1, 50, 4))
+    commands._write_states(tmp_path / "out", logs, Identified(RIG, *[None] * 3), values, values)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["01.csv"]

@@ -1,0 +1,60 @@
+"""What the public objects say of themselves: in words, with units, in a few lines."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nnap_em
+from nnap_em.data import Dataset, Logs
+from nnap_em.effects import catalogue
+from nnap_em.identify import begin
+from nnap_em.predict import Prediction
+from nnap_em.rig import Declared, Rig
+
+RIG = Rig(
+    "bench", "pendulum",
+    {"m": Declared(0.5, 0.05), "lc": Declared(0.2, 0.0), "I": Declared(0.002, 0.0), "g": Declared(9.81, 0.0)},
+    True, ("u",), (1,), 0.02, "sequence", ("theta1", "dtheta1"), {"theta1": 1e-3}, {"theta1": Declared(0.0, 0.1)},
+)  # fmt: skip
+ROWS = 50
+Y = np.sin(np.arange(2.0 * ROWS)).reshape(1, ROWS, 2).repeat(3, axis=0)
+Y[0, :15, 0] = np.nan
+DATA = Dataset(np.tile(0.02 * np.arange(ROWS), (3, 1)), np.zeros((3, ROWS, 1)), Y, np.ones((3, ROWS), bool))
+FITTED = begin(RIG, DATA, key=jax.random.key(0), effects=(catalogue["torque_offset"](jnp.asarray(0.25), 1),))
+TABLE = nnap_em.friction_table(FITTED._replace(state=FITTED.state._replace(best=FITTED.state.model)), jnp.ones((1, 3)))
+SYSTEM = "Pendulum: m = 0.5 kg, lc = 0.2 m, I = 0.002 kg m^2, g = 9.81 m/s^2; driven joints: 1"
+SAID = {
+    "rig": (RIG, "Rig 'bench': pendulum, a row every 0.02 s", "m = 0.5 +- 0.05 kg, lc = 0.2 m", "u on joint 1"),
+    "rig noise": (RIG, "theta1 (noise 0.001 rad)", "dtheta1 (noise to be estimated)", "start: theta1 = 0 +- 0.1 rad"),
+    "data": (DATA, "Dataset: 3 sequences, 150 rows, the longest 0.98 s; 1 inputs, 2 readings, 5 % missing"),
+    "sequence": (Dataset(*(part[1] for part in DATA)), "1 sequence, 50 rows, the longest 0.98 s", "0 % missing"),
+    "logs": (Logs(("a.csv", "b.csv", "c.csv"), DATA, ("u", "x")), "Logs a.csv to c.csv: u, x; Dataset: 3 sequences"),
+    "system": (FITTED.model.system, SYSTEM),
+    "model": (
+        FITTED.model,
+        SYSTEM,
+        "a row every 0.02 s",
+        "theta1 (noise 0.001 rad)",
+        "torque_offset at joint 1",
+        "N m",
+    ),
+    "fitted": (FITTED, "Identified 'bench' after 0 epochs", "estimated: m = 0.5 +- ", " kg", SYSTEM),
+    "friction": (FITTED.model.unknown, "FrictionNetwork of 1 joints, up to ", " rad/s"),
+    "table": (TABLE, "joint 1: ", " N m over 1 to 1 rad/s, std up to "),
+    "prediction": (
+        Prediction(jnp.zeros((2, 9, 2)), jnp.full((2, 9, 2), 0.5), jnp.arange(18).reshape(2, 9) > 13),
+        "2 sequences, 4 rows ahead",
+        "[rad and rad/s, or m and m/s]: 0.5, 0.5",
+    ),
+    "experiment": (nnap_em.Experiment(DATA, jnp.zeros((3, ROWS, 2))), "all 2 states known; Dataset: 3 sequences"),
+}
+
+
+@pytest.mark.parametrize("thing, words", [(thing, words) for thing, *words in SAID.values()], ids=SAID)
+def test_an_object_says_what_it_is_with_units(thing, words):
+    said = str(thing)
+    for word in words:
+        assert word in said
+    assert said.count("\n") < 8
+    assert max(map(len, said.splitlines())) < 160

@@ -45,6 +45,9 @@ from .refit import Trial, refit
 from .rig import Rig
 from .smoother import CubatureSmoother
 
+Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
+"""State of a fit at the end of each of its horizons, and the sequences used."""
+
 
 class Closed(NamedTuple):
     """The outcome."""
@@ -128,7 +131,7 @@ def now_rule(old: ScoringMStep, new: ScoringMStep) -> ScoringMStep:
 
 def close(
     before: Identified,
-    stages: dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]],
+    stages: Stages,
     data: Dataset,
     *,
     rules: Rules = RULES,
@@ -139,7 +142,7 @@ def close(
     longest = _longest(data)
     now, steps = Search(before.model, before.m_step, ()), []
     # steps in a reading come first: they spoil the noise that all else leans on
-    now, state = _quantised(now, before, data, rules, say)
+    now, state = _quantised(now, before, stages, data, rules, say)
     last = longest if state else 0
     for length in [longest] if state else _lengths(stages, longest):
         if now.found and (state is None or last < length):
@@ -262,9 +265,13 @@ def _longest(data: Dataset) -> int:
     return int(np.max(np.sum(np.asarray(data.valid), axis=1)))
 
 
-def _quantised(now: Search, before: Identified, data: Dataset, rules: Rules, say: Say):
-    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise."""
+def _quantised(now: Search, before: Identified, stages: Stages, data: Dataset, rules: Rules, say: Say):
+    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise.
+
+    A fit that took the steps for motion has lost its way: it begins again where it was short.
+    """
     rig, state = before.rig, None
+    first = min(stages)
     for i, channel in enumerate(rig.measured):
         y = np.asarray(data.y)[..., i]
         step = grid_step(y.ravel())
@@ -278,12 +285,13 @@ def _quantised(now: Search, before: Identified, data: Dataset, rules: Rules, say
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        full, rule = augment(model, now.m_step, effect, candidate)
+        early = cast(StateSpaceModel, state.best if state else stages[first][0].best)
+        full, rule = augment(early, now.m_step, effect, candidate)
         if told:
             log_r = full.log_r.at[i].set(math.log(told**2 + step**2 / 12))
             full = eqx.tree_at(lambda m: m.log_r, full, log_r)
         now = Search(full, rule, (*now.found, Found(candidate, float(gain), float(gain), 0.0, data.t.shape[1])))
-        state = _grow(now, data, before, _longest(data), _longest(data), say)
+        state = _grow(now, data, before, first, _longest(data), say)
     return now, state
 
 
@@ -345,7 +353,7 @@ def close_the_loop(
 
     Raises FitError when no sequence can be followed.
     """
-    stages: dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]] = {}
+    stages: Stages = {}
 
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
         stages[seen] = (state, used)

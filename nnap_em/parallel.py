@@ -86,7 +86,7 @@ def _run(function: Callable, mesh: Mesh | None, group: int, common, batch):
         size = jax.tree.leaves(batch)[0].shape[0]
         if size == group:
             return one(batch)
-        out = jax.lax.map(one, jax.tree.map(lambda a: a.reshape(-1, group, *a.shape[1:]), batch))
+        out = jax.lax.map(one, jax.tree.map(lambda a: a.reshape(size // group, group, *a.shape[1:]), batch))
         return jax.tree.map(lambda a: a.reshape(size, *a.shape[2:]), out)
 
     if mesh is None:

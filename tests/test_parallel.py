@@ -25,15 +25,16 @@ ENVIRONMENT = os.environ | {
 
 
 def _weigh(common, one):
-    scale, key = one
-    return common["a"] @ scale, jax.random.normal(key, (3,))
+    scale, key, nothing = one
+    return common["a"] @ scale, jax.random.normal(key, (3,)), nothing
 
 
 @pytest.mark.parametrize("together", [None, 1, 3, 100])
 def test_groups_change_nothing(together):
     common, scales = {"a": jnp.arange(6.0).reshape(2, 3)}, jnp.arange(21.0).reshape(7, 3)
     keys = jax.random.split(jax.random.key(0), 7)
-    product, draw = each(_weigh, common, (scales, keys), together=together)
+    product, draw, nothing = each(_weigh, common, (scales, keys, jnp.zeros((7, 4, 0))), together=together)
+    assert nothing.shape == (7, 4, 0)
     np.testing.assert_allclose(product, scales @ common["a"].T, rtol=1e-15)
     np.testing.assert_array_equal(draw, jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys))
 
@@ -46,7 +47,8 @@ def test_mesh_of_other_axes_is_refused():
 
 def test_over_one_device():
     with over(all_devices()):
-        product, _ = each(_weigh, {"a": jnp.ones((2, 3))}, (jnp.ones((5, 3)), jax.random.split(jax.random.key(0), 5)))
+        batch = jnp.ones((5, 3)), jax.random.split(jax.random.key(0), 5), jnp.zeros((5, 0))
+        product, *_ = each(_weigh, {"a": jnp.ones((2, 3))}, batch)
     np.testing.assert_array_equal(product, np.full((5, 2), 3.0))
 
 

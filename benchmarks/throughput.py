@@ -248,6 +248,7 @@ def main() -> None:
             lines += growth(args.quick, cpus[:1], cache, out)
         if "cores" in args.only:
             lines += cores(size, cpus, cache)
+            lines += large((10, 50, 100) if args.quick else (1000, 500, 1000), cpus, cache)
         if "epoch" in args.only:
             two = cpus[:2]
             found = child({"task": "epoch", "size": size, "repeats": 3}, two, cache)
@@ -303,6 +304,16 @@ def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
     ]
     head = ["smoother", *(f"{n} core{'s' * (n > 1)} [s] (speed-up)" for n in counts)]
     return ["", f"## Cores: `e_step` on {size[0]} x {size[1]}, as the library sets it", "", *table(head, rows)]
+
+
+def large(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
+    """Sentence on work whose whole history would not fit into memory."""
+    found = child({"task": "large", "size": size}, cpus, cache, measure_memory=True)
+    return [
+        "",
+        f"{size[0]} sequences x {size[1]} steps x {size[2]} particles with exact backward sampling of 25 trajectories, "
+        f"on {len(cpus)} cores: {found['time']:.0f} s with compilation, peak memory {found['memory'] / 1e9:.1f} GB.",
+    ]
 
 
 if __name__ == "__main__":

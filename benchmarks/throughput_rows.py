@@ -6,7 +6,6 @@ python benchmarks/throughput_rows.py ORDER, a JSON object that benchmarks/throug
 import gc
 import importlib.util
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -175,7 +174,7 @@ def growth(smoother: str, axis: str, points: list[int], base: list[int]) -> list
 
 def cores(size: list[int], repeats: int) -> dict[str, float]:
     """Time of `e_step` on the cores that this process was given [s]."""
-    every_core()
+    use_every_device()
     logs = common_logs(Size(*size)).data
     rules = {"extended": ExtendedKalmanSmoother(wide_bank), "particle": particle_default()}
     out = {}
@@ -189,7 +188,7 @@ def cores(size: list[int], repeats: int) -> dict[str, float]:
 
 def large(size: list[int]) -> dict[str, float]:
     """Time [s] and peak memory [B] of the particle smoother on more than fits into memory at once."""
-    every_core()
+    use_every_device()
     whole = Size(*size)
     logs = common_logs(whole).data
     before = forget_peak()
@@ -198,18 +197,12 @@ def large(size: list[int]) -> dict[str, float]:
     return {"time": spent, "memory": resident("VmHWM") - before}
 
 
-def every_core() -> None:
-    """A device for every core that this process was given."""
-    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
-    use_every_device()
-
-
 def epoch(size: list[int], repeats: int) -> dict[str, dict]:
     """Time of one EM epoch, as `nnap-em identify` runs it on the paper's acrobot, in 64 bits [s]."""
     from identify import paper_rig
 
     jax.config.update("jax_enable_x64", True)
-    every_core()
+    use_every_device()
     key = jax.random.key(0)
     data = paper_experiment(paper_model(), size[0], size[1], key=key).data
     first = begin(paper_rig(0.5), data, key=key)

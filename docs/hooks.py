@@ -70,9 +70,7 @@ def effects() -> str:
             if isinstance(kind, ast.ClassDef) and "name" in (said := _class_variables(kind)):
                 law = " ".join((ast.get_docstring(kind) or "").split("\n\n")[0].split()).rstrip(".").replace("|", BAR)
                 units = ", ".join(f"`{name}` [{unit}]" for name, unit in said.get("units", {}).items())
-                rows.append(
-                    f"| `{said['name']}` | {law} | {units} | {said.get('confirm', '')} |"
-                )
+                rows.append(f"| `{said['name']}` | {law} | {units} | {said.get('confirm', '')} |")
     return "\n".join(rows)
 
 

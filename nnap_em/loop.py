@@ -230,7 +230,7 @@ def _plain(
     model, rule = without(now.model, now.m_step, place)
     bare = refit(model, rule.early(), path, part, used, passes=rules.passes)
     whole, own = (trimmed((trial.loglik - bare.loglik)[used]) for trial in (winner.trial, null))
-    if own > rules.named * whole:
+    if own > rules.says * whole:
         return None
     model, rule = augment(bare.model, rule, winner.effect, winner.candidate)
     trial = refit(model, rule.early(), bare.path, part, used, passes=rules.passes)

@@ -1,22 +1,25 @@
-# make demo | make test: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
+# make demo | make test | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
 PYTHON ?= python3
 PYTEST_FLAGS ?= -n 2
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
 
-test: lint
+test: lint docs
 	$(BIN)/pytest $(PYTEST_FLAGS)
 
 lint: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+
+docs: .venv/.test
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf .venv .cache .pytest_cache .ruff_cache .hypothesis build dist
@@ -32,5 +35,5 @@ $(BIN)/python:
 	@touch $@
 
 .venv/.test: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable '.[test]'
+	$(PIP) --editable '.[test,docs]'
 	@touch $@ .venv/.demo

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .smoother import ExtendedKalmanSmoother, Posterior
     from .store import StoreError, load, save
-    from .systems import AbstractSystem, specs
+    from .systems import AbstractSystem, register, specs
 
 __all__ = [
     "AbstractSystem",
@@ -73,6 +73,7 @@ __all__ = [
     "predict",
     "read_logs",
     "read_rig",
+    "register",
     "save",
     "simulate",
     "smooth",
@@ -97,7 +98,7 @@ _homes = {
     "simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother": ("ExtendedKalmanSmoother", "Posterior"),
     "store": ("StoreError", "load", "save"),
-    "systems": ("AbstractSystem", "specs"),
+    "systems": ("AbstractSystem", "register", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}
 

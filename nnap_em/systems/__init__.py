@@ -27,4 +27,16 @@ def spec(system: type[AbstractSystem]) -> SystemSpec:
 
 specs: dict[str, SystemSpec] = {name: spec(system) for name, system in systems.items()}
 
-__all__ = ["AbstractSystem", "specs", "systems"]
+
+def register(name: str, system: type[AbstractSystem]) -> None:
+    """Make a machine of yours known as `type = name` in `rig.toml`, in this process; a name that is taken is refused.
+
+    Call it before `read_rig` and before `load` of a model of this machine.
+    """
+    if systems.get(name, system) is not system:
+        raise ValueError(f"{name!r} is the name of {systems[name].__name__}; give the machine another one")
+    systems[name] = system
+    specs[name] = spec(system)
+
+
+__all__ = ["AbstractSystem", "register", "specs", "systems"]

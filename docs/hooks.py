@@ -1,0 +1,85 @@
+"""What the site adds to the Markdown: formulas as MathML (no script), the commands' help, the table of effects."""
+
+import argparse
+import ast
+import os
+import re
+from html import unescape
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+from xml.etree.ElementTree import tostring
+
+from latex2mathml.converter import convert_to_element
+
+from nnap_em.cli import parser
+
+EFFECTS = Path(__file__).resolve().parents[1] / "nnap_em" / "effects"
+BAR = r"\|"
+"""In a table."""
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">\s*\\([(\[])(.*?)\\[)\]]\s*</\1>', re.DOTALL)
+_FIRST = {"script": 0x1D49C, "double-struck": 0x1D538}
+_LETTERS = {("script", letter): known for letter, known in zip("BEFHILMR", "ℬℰℱℋℐℒℳℛ", strict=True)}
+_FUNCTIONS = {"log", "ln", "sin", "cos", "tanh", "exp", "tr"}
+_ACCENTS = set("¨˙¯~^")
+
+
+def on_page_markdown(markdown: str, **_) -> str:
+    """Put what is made from the code in the place of its marker."""
+    for marker, made in (("<!-- commands -->", commands), ("<!-- effects -->", effects)):
+        if marker in markdown:
+            markdown = markdown.replace(marker, made())
+    return markdown
+
+
+def on_page_content(html: str, **_) -> str:
+    """Turn every formula into MathML."""
+    return _FORMULA.sub(lambda m: _mathml(unescape(m[3]), "inline" if m[2] == "(" else "block"), html)
+
+
+def _mathml(latex: str, display: str) -> str:
+    formula = convert_to_element(latex.strip(), display=display)
+    for node in formula.iter():
+        node.text = unescape(node.text) if node.text else None
+        style = node.attrib.get("mathvariant", "")
+        if style in _FIRST and node.text:  # browsers know these letters as characters of their own, not as a style
+            node.text = _LETTERS.get((style, node.text)) or chr(_FIRST[style] + ord(node.text) - ord("A"))
+            del node.attrib["mathvariant"]
+        if node.tag == "mi" and node.text in _FUNCTIONS:
+            node.tag = "mo"
+            node.attrib.update(form="prefix", lspace="0.1em", rspace="0.1em")
+    for node in formula.iter("mover"):
+        if node[1].text in _ACCENTS:
+            node.set("accent", "true")  # else dots are half as large, and far above
+    return tostring(formula, encoding="unicode")
+
+
+def commands() -> str:
+    """A section for each command."""
+    top = parser()
+    under = next(a for a in top._actions if isinstance(a, argparse._SubParsersAction))
+    with patch.dict(os.environ, COLUMNS="100"):
+        return "\n\n".join(f"## {name}\n\n```text\n{p.format_help()}```" for name, p in under.choices.items())
+
+
+def effects() -> str:
+    """A row for each class of the catalogue: the law, its parameters, and how to confirm it on the machine."""
+    rows = ["| name | law | parameters | to be sure |", "| --- | --- | --- | --- |"]
+    for path in sorted(EFFECTS.glob("*.py")):
+        for kind in ast.parse(path.read_text()).body:
+            if isinstance(kind, ast.ClassDef) and "name" in (said := _class_variables(kind)):
+                law = " ".join((ast.get_docstring(kind) or "").split("\n\n")[0].split()).rstrip(".").replace("|", BAR)
+                units = ", ".join(f"`{name}` [{unit}]" for name, unit in said.get("units", {}).items())
+                rows.append(f"| `{said['name']}` | {law} | {units} | {said.get('confirm', '')} |")
+    return "\n".join(rows)
+
+
+def _class_variables(kind: ast.ClassDef) -> dict[str, Any]:
+    said = {}
+    for line in kind.body:
+        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and line.value is not None:
+            try:
+                said[line.target.id] = ast.literal_eval(line.value)
+            except ValueError:
+                continue  # a field, not a text
+    return said

@@ -192,14 +192,17 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
         journal.check()
         say(f"resumed with {len(journal)} finished steps" if len(journal) else _nothing(args))
     with _folder(args.out), _telling(lambda: _how_to_go_on_finding(args, journal)):
-        if not args.resume:
+        if args.resume:
+            sweep(journal.folder)
+        else:
             journal.clear()
         count, rows = train.data.valid.shape
         say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
             closed = close_the_loop(rig, train.data, key=jax.random.key(args.seed), say=say)
         found = findings(closed)
-        (args.out / REPORT).unlink(missing_ok=True)  # an older one is not of the models that are written now
+        for name in (REPORT, "report.html"):  # older ones are not of the models that are written now
+            (args.out / name).unlink(missing_ok=True)
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes={"settings": {"seed": args.seed}})
         write_diagnosis(args.out, closed, found, train, test, seed=args.seed, began=began, say=say)
@@ -439,9 +442,9 @@ def _folder(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if new:
-            with suppress(OSError):  # not empty
-                path.rmdir()
+        for empty in (path / UNFINISHED, path) if new else ():
+            with suppress(OSError):  # it is not
+                empty.rmdir()
 
 
 def _report(

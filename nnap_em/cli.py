@@ -2,10 +2,14 @@
 
 import argparse
 import math
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TypeVar
 
 from . import __version__
@@ -170,12 +174,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from . import commands  # loads JAX
 
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:
             warnings.showwarning = _warn
             for kind in commands.WARNINGS:
                 warnings.simplefilter("always", kind)
             commands.set_up()
-            say = _silent if getattr(args, "quiet", False) else _say
             return commands.commands[args.command](args, say) or 0
     except KeyboardInterrupt as stopped:
         _say(str(stopped) or "stopped; the files that were written are whole")
@@ -186,6 +189,32 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _say(f"error: {line}")
         return 2
+
+
+@contextmanager
+def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """`say`, which ends a command that lost its Ctrl-C: Python drops what is raised amid a garbage collection."""
+    asked = False
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.default_int_handler(number, frame)
+
+    def line(text: str) -> None:
+        say(text)
+        if asked:
+            raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
+    if ours:
+        signal.signal(signal.SIGINT, handle)
+    try:
+        yield line
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _line(error: Exception) -> str | None:

@@ -4,6 +4,7 @@ The commands run in processes of their own and are really killed: between writes
 drawn from a seed.
 """
 
+import contextlib
 import json
 import os
 import random
@@ -21,7 +22,7 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em import cli, files, journal
+from nnap_em import cli, commands, files, journal
 from nnap_em.effects import catalogue
 from nnap_em.files import StoreError, sweep
 from nnap_em.journal import HERE, Journal, digest, keeping, step
@@ -324,6 +325,19 @@ def test_ctrl_c_leaves_no_half_data_set(tmp_path, monkeypatch, capsys):
     assert cli.main(order) == 130
     assert _told(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
     assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_path, monkeypatch, capsys):
+    def lost(args, say):
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        say("one line")
+        raise AssertionError
+
+    monkeypatch.setitem(commands.commands, "check", lost)
+    assert cli.main(["check", str(tmp_path)]) == 130
+    assert _told(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 # --- the journal itself

@@ -165,7 +165,7 @@ def filter_case(name: str, proposal, size: Size) -> Case:
         return particle_history(model, seq, proposal, size.particles, key)
 
     def states(history):
-        mean = jnp.einsum("stxp,stp->stx", history.x, jnp.exp(history.log_w))
+        mean = jnp.einsum("stxp,stp->stx", history.x, jax.nn.softmax(history.log_w, axis=-1))
         return history.origin + history.scale[:, None] * mean
 
     return Case("nnap_em", f"{name} filter, {size.particles}", size, lambda: _each(one, size), states)

@@ -68,9 +68,8 @@ def broken(command: str, rig: Path, out: Path, length: float, rng: random.Random
         except subprocess.TimeoutExpired:
             run.send_signal(signal.Signals[kind])
         _, said = run.communicate()
-        if run.returncode == 0 or "nnap-em: wrote" in "".join(
-            said.splitlines()[-1:]
-        ):  # its work was done when the fault came
+        last = "".join(said.splitlines()[-1:])
+        if run.returncode == 0 or "nnap-em: wrote" in last:  # its work was done when the fault came
             return tried, told
         tried[kind] += 1
         if kind == "SIGINT":

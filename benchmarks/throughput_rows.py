@@ -27,8 +27,9 @@ from common_work import (
 from limits import c_case, transition_case
 from peers import cuthbert_case, cuthbert_exact, cuthbert_mcmc, dynamax_case, natural_transition, particles_case
 
-from nnap_em.em import em_step
+from nnap_em.em import e_step, em_step
 from nnap_em.identify import begin
+from nnap_em.parallel import use_every_device
 from nnap_em.particle import Bootstrap, ExactBackward, Guided, MetropolisBackward, ParticleSmoother
 from nnap_em.simulate import paper_experiment, paper_model
 from nnap_em.smoother import CubatureSmoother, ExtendedKalmanSmoother
@@ -173,15 +174,27 @@ def growth(smoother: str, axis: str, points: list[int], base: list[int]) -> list
 
 def cores(size: list[int], repeats: int) -> dict[str, float]:
     """Time of `e_step` on the cores that this process was given [s]."""
-    plain = Size(*size)._replace(particles=0)
+    use_every_device()
+    logs = common_logs(Size(*size)).data
     rules = {"extended": ExtendedKalmanSmoother(wide_bank), "particle": particle_default()}
     out = {}
     for name, rule in rules.items():
-        run = smoother_case(name, rule, plain).prepare()
+        run = lambda rule=rule: e_step(common_model(), logs, rule, key=jax.random.key(2))  # noqa: E731
         seconds(run)
         out[name] = float(np.median([seconds(run)[0] for _ in range(repeats)]))
         say(f"  {name}: {out[name]:.2f} s")
     return out
+
+
+def large(size: list[int]) -> dict[str, float]:
+    """Time [s] and peak memory [B] of the particle smoother on more than fits into memory at once."""
+    use_every_device()
+    whole = Size(*size)
+    logs = common_logs(whole).data
+    before = forget_peak()
+    rule = particle_default(whole.particles, 25)
+    spent, _ = seconds(lambda: e_step(common_model(), logs, rule, key=jax.random.key(2)))
+    return {"time": spent, "memory": resident("VmHWM") - before}
 
 
 def epoch(size: list[int], repeats: int) -> dict[str, dict]:
@@ -189,6 +202,7 @@ def epoch(size: list[int], repeats: int) -> dict[str, dict]:
     from identify import paper_rig
 
     jax.config.update("jax_enable_x64", True)
+    use_every_device()
     key = jax.random.key(0)
     data = paper_experiment(paper_model(), size[0], size[1], key=key).data
     first = begin(paper_rig(0.5), data, key=key)
@@ -203,7 +217,7 @@ def epoch(size: list[int], repeats: int) -> dict[str, dict]:
     return out
 
 
-tasks = {"speed": speed, "memory": memory, "growth": growth, "cores": cores, "epoch": epoch}
+tasks = {"speed": speed, "memory": memory, "growth": growth, "cores": cores, "large": large, "epoch": epoch}
 
 if __name__ == "__main__":
     order = json.loads(sys.argv[1])

@@ -8,6 +8,7 @@ Gaussian (RTS) and with a particle smoother.  Written into `out/acrobot_em/`: th
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from nnap_em.build import build
 from nnap_em.data import Dataset
 from nnap_em.em import EMState, Schedule, e_step, fit, start_state
 from nnap_em.mstep import AbstractMStep
+from nnap_em.parallel import use_every_device
 from nnap_em.particle import Guided, ParticleSmoother
 from nnap_em.plots import Band, Curve, Record, friction_epochs_figure, prediction_figure, states_figure
 from nnap_em.predict import given_samples
@@ -341,6 +343,8 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    use_every_device()
     jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".cache" / "jax"))
     effort = QUICK if options.quick else Effort()
     key_train, key_test, key_model, key_fit, key_judge = jax.random.split(jax.random.key(options.seed), 5)

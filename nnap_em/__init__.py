@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .identify import Identified, friction_table, identify, parameter_table
     from .loop import Closed, close_the_loop
     from .model import StateSpaceModel
+    from .parallel import all_devices, over
     from .particle import ParticleSmoother
     from .predict import Prediction, horizon_errors, predict, smooth
     from .rig import Rig, RigError, RigWarning, read_rig, write_rig
@@ -55,6 +56,7 @@ __all__ = [
     "StateSpaceModel",
     "StoreError",
     "__version__",
+    "all_devices",
     "check",
     "close_the_loop",
     "examples",
@@ -64,6 +66,7 @@ __all__ = [
     "horizon_errors",
     "identify",
     "load",
+    "over",
     "pad",
     "paper_experiment",
     "paper_model",
@@ -89,6 +92,7 @@ _homes = {
     "identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "loop": ("Closed", "close_the_loop"),
     "model": ("StateSpaceModel",),
+    "parallel": ("all_devices", "over"),
     "particle": ("ParticleSmoother",),
     "predict": ("Prediction", "horizon_errors", "predict", "smooth"),
     "rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),

@@ -46,6 +46,8 @@ class Rules(NamedTuple):
     """Effects at most."""
     named: float = 0.6
     """Share of the gain of an unnamed law that a named one must reach to be preferred."""
+    says: float = 0.8
+    """Share of a force that a named law must say to stay when its rest is found."""
     rivals: float = 0.6
     """Share of the winner's gain from which on another one is followed further too."""
     same: float = 0.01

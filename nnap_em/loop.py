@@ -149,9 +149,9 @@ def close(
             state = _grow(now, data, before, last, length, say, state)
         own = stages[length][0].best if length < longest else before.model
         now = now._replace(model=state.best if state else own)
-        part, last, known = _part(data, length), length, len(now.found)
+        part, last, known = _part(data, length), length, now.found
         now, further = _search(now, before, part, length, data, steps, rules, say)
-        if steps[-1].accepted or len(now.found) > known:
+        if now.found is not known:  # one more, or one in the place of another
             state = further
             last = _further(length, longest) if further is not None else length
     if now.found and state is None:
@@ -162,7 +162,7 @@ def close(
         now = now._replace(model=state.best if state else before.model)
         part = _part(data, longest)
         more, trial = _search(now, before, part, longest, data, steps, rules, say)
-        if len(more.found) > len(now.found):
+        if more.found is not now.found:
             now, state = more, trial or _grow(more, data, before, longest, longest, say)
             now, state = _needed(now, state, before, data, rules, say)
     if state is None:
@@ -230,7 +230,7 @@ def _plain(
     model, rule = without(now.model, now.m_step, place)
     bare = refit(model, rule.early(), path, part, used, passes=rules.passes)
     whole, own = (trimmed((trial.loglik - bare.loglik)[used]) for trial in (winner.trial, null))
-    if own > rules.named * whole:
+    if own > rules.says * whole:
         return None
     model, rule = augment(bare.model, rule, winner.effect, winner.candidate)
     trial = refit(model, rule.early(), bare.path, part, used, passes=rules.passes)

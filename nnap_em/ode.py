@@ -37,10 +37,13 @@ class RK4(diffrax.AbstractSolver):
         def stage(carry, slices):
             y, y1 = carry
             t, ahead, share = slices
-            slope = terms.vf(t, y, args)
-            return (y0 + ahead * slope, y1 + share * slope), None
+            slope = terms.vf(t, jnp.stack(y), args)
+            now = [a + ahead * slope[i] for i, a in enumerate(start)]
+            return (now, [a + share * slope[i] for i, a in enumerate(y1)]), None
 
-        (_, y1), _ = jax.lax.scan(stage, (y0, y0), (times, ahead, share))
+        start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
+        (_, y1), _ = jax.lax.scan(stage, (start, start), (times, ahead, share))
+        y1 = jnp.stack(y1)
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 

@@ -79,7 +79,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         out = _run(function, None, group, common, batch)
     else:
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
-        out = jax.tree.map(_gather, _run(function, mesh, group, common, batch))
+        out = _gather(_run(function, mesh, group, common, batch))
     return jax.tree.map(lambda a: a[:count], out) if whole > count else out
 
 
@@ -104,22 +104,23 @@ def _run(function: Callable, mesh: Mesh | None, group: int, common, batch):
 
 def _place(tree, sharding: NamedSharding):
     """Arrays that this process holds whole, where its devices' shares of them belong."""
+    arrays, rest = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
+    leaves, structure = jax.tree.flatten(arrays)
+    kinds = [jax.random.key_impl(a) if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else None for a in leaves]
+    plain = [a if kind is None else jax.random.key_data(a) for a, kind in zip(leaves, kinds, strict=True)]
+    if jax.process_count() == 1:
+        placed = jax.device_put(plain, sharding)  # all in one call: each takes its time
+    else:
+        whole = [np.asarray(a) for a in plain]
+        placed = [jax.make_array_from_callback(a.shape, sharding, a.__getitem__) for a in whole]
+    keyed = [
+        a if kind is None else jax.random.wrap_key_data(a, impl=kind) for a, kind in zip(placed, kinds, strict=True)
+    ]
+    return eqx.combine(jax.tree.unflatten(structure, keyed), rest)
 
-    def place(a):
-        if not isinstance(a, jax.Array | np.ndarray):
-            return a
-        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(place(jax.random.key_data(a)), impl=jax.random.key_impl(a))
-        if jax.process_count() == 1:
-            return jax.device_put(a, sharding)
-        whole = np.asarray(a)
-        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 
-    return jax.tree.map(place, tree)
-
-
-def _gather(a):
-    """All of a sharded array, on this process's first device."""
+def _gather(tree):
+    """All of sharded arrays, on this process's first device."""
     if jax.process_count() > 1:
-        return jnp.asarray(multihost_utils.process_allgather(a, tiled=True))
-    return jax.device_put(a, jax.local_devices()[0])
+        return jax.tree.map(jnp.asarray, multihost_utils.process_allgather(tree, tiled=True))
+    return jax.device_put(tree, jax.local_devices()[0])

@@ -73,7 +73,7 @@ def broken(command: str, rig: Path, out: Path, length: float, rng: random.Random
             return tried, told
         tried[kind] += 1
         if kind == "SIGINT":
-            well = run.returncode == 130 and said.splitlines()[-1].startswith("nnap-em: stopped")
+            well = run.returncode == 130 and last.startswith("nnap-em: stopped")
             told = told and well
             if not well:
                 print(f"status {run.returncode}: {said}", file=sys.stderr)

@@ -31,9 +31,10 @@ import plant
 from nnap_em.commands import set_up
 from nnap_em.data import read_logs
 from nnap_em.diagnose import entry, findings
+from nnap_em.files import replace_text
 from nnap_em.loop import close_the_loop
 from nnap_em.predict import horizon_errors, predict
-from nnap_em.rig import read_rig, replace_text
+from nnap_em.rig import read_rig
 from nnap_em.systems import specs
 
 OUTSIDE: dict[str, tuple[dict[str, Any], ...]] = {

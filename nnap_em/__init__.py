@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .diagnose import findings
     from .em import EMState, FitError, Schedule
     from .export import ExportError, export
+    from .files import StoreError
     from .formats import DataError, DataWarning
     from .friction import FrictionNetwork
     from .identify import Identified, friction_table, identify, parameter_table
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from .rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .smoother import ExtendedKalmanSmoother, Posterior
-    from .store import StoreError, load, save
+    from .store import load, save
     from .systems import AbstractSystem, register, specs
 
 __all__ = [
@@ -86,6 +87,7 @@ _homes = {
     "diagnose": ("findings",),
     "em": ("EMState", "FitError", "Schedule"),
     "export": ("ExportError", "export"),
+    "files": ("StoreError",),
     "formats": ("DataError", "DataWarning"),
     "friction": ("FrictionNetwork",),
     "identify": ("Identified", "friction_table", "identify", "parameter_table"),
@@ -97,7 +99,7 @@ _homes = {
     "rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
     "simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother": ("ExtendedKalmanSmoother", "Posterior"),
-    "store": ("StoreError", "load", "save"),
+    "store": ("load", "save"),
     "systems": ("AbstractSystem", "register", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}

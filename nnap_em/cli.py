@@ -2,10 +2,14 @@
 
 import argparse
 import math
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TypeVar
 
 from . import __version__
@@ -57,8 +61,9 @@ OUT gets model.npz, report.json, friction.csv (joint,velocity,torque,torque_std)
 test/ serves for the reported prediction error only, never for the fit.
 """
 _DIAGNOSE = """\
-example:
+examples:
   nnap-em diagnose bench --out found
+  nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
 
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
 report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
@@ -135,13 +140,14 @@ def parser() -> argparse.ArgumentParser:
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
     identify.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-    identify.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.npz")
+    identify.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.npz, if it is there")
     identify.add_argument("--quiet", action="store_true", help="no lines of progress")
 
     diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
     diagnose.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
     diagnose.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
     diagnose.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    diagnose.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
     diagnose.add_argument("--quiet", action="store_true", help="no lines of progress")
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
@@ -168,15 +174,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from . import commands  # loads JAX
 
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:
             warnings.showwarning = _warn
             for kind in commands.WARNINGS:
                 warnings.simplefilter("always", kind)
             commands.set_up()
-            say = _silent if getattr(args, "quiet", False) else _say
             return commands.commands[args.command](args, say) or 0
     except KeyboardInterrupt as stopped:
-        _say(str(stopped) or "stopped")
+        _say(str(stopped) or "stopped; the files that were written are whole")
         return 130
     except Exception as error:
         line = _line(error)
@@ -184,6 +189,32 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _say(f"error: {line}")
         return 2
+
+
+@contextmanager
+def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """`say`, which ends a command that lost its Ctrl-C: Python drops what is raised amid a garbage collection."""
+    asked = False
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.default_int_handler(number, frame)
+
+    def line(text: str) -> None:
+        say(text)
+        if asked:
+            raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
+    if ours:
+        signal.signal(signal.SIGINT, handle)
+    try:
+        yield line
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _line(error: Exception) -> str | None:

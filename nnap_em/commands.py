@@ -1,6 +1,7 @@
 """What the commands do: read, call the library, write whole files."""
 
 import argparse
+import dataclasses
 import io
 import math
 import os
@@ -29,8 +30,10 @@ from .diagnose import findings
 from .draft import draft
 from .em import EMState, FitError
 from .export import ExportError, export
+from .files import StoreError, replace_bytes, replace_text, sweep
 from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
+from .journal import Journal, keeping
 from .law import PARAMETERS, UNITS, describe, fit_law
 from .loop import close_the_loop
 from .model import StateSpaceModel
@@ -38,17 +41,24 @@ from .parallel import use_every_device
 from .particle import ParticleSmoother
 from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
-from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, replace_text, write_rig
+from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, write_rig
 from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
-from .store import Stored, StoreError, fingerprint, read, replace_bytes, save
+from .store import Stored, fingerprint, notes, read, save
 from .systems import specs
 from .tables import state_unit, visited_nodes, write_friction, write_json
 
-MISTAKES = (RigError, DataError, StoreError, FitError, ExportError)
+
+class Halted(RuntimeError):
+    """A file could not be written: the message names it, and says what is kept and how to go on."""
+
+
+MISTAKES = (RigError, DataError, StoreError, FitError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
 GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
+UNFINISHED = "unfinished"
+"""Folder of the finished steps of a diagnosis that is not."""
 MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 Say = Callable[[str], None]
@@ -150,27 +160,21 @@ def run_identify(args: argparse.Namespace, say: Say) -> None:
     _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
-    if args.resume:
-        start, history = _resume(args, rig, mark, settings)
-        say(f"resumed after epoch {start.state.epoch}")
-    else:
-        start, history = begin(rig, train.data, key=jax.random.key(args.seed)), []
-    with _folder(args.out):
+    start, history = _begin(args, rig, train, mark, settings, say)
+    with _folder(args.out), _telling(lambda: _how_to_go_on(args, history)):
         count, rows = train.data.valid.shape
         say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         watch = _Watch(args, start, train, mark, settings, history, say)
-        try:
-            fitted = identify(
-                rig,
-                train.data,
-                key=jax.random.key(args.seed),
-                smoother=_smoother(args),
-                epochs=args.epochs,
-                start=start,
-                watch=watch,
-            )
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(_how_to_go_on(args, history)) from None
+        fitted = identify(
+            rig,
+            train.data,
+            key=jax.random.key(args.seed),
+            smoother=_smoother(args),
+            epochs=args.epochs,
+            start=start,
+            watch=watch,
+        )
+        (args.out / REPORT).unlink(missing_ok=True)  # an older one is not of the model that is written now
         save(args.out / MODEL, fitted, fingerprint=mark, notes={"settings": settings, "epochs": history})
         _report(args, fitted, train, test, history, began, say)
 
@@ -181,14 +185,28 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
     rig, train, test = _read(args.folder)
     _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
-    with _folder(args.out):
+    journal = Journal(
+        args.out / UNFINISHED, {"rig.toml": dataclasses.asdict(rig), "training data": mark, "--seed": args.seed}
+    )
+    if args.resume:
+        journal.check()
+        say(f"resumed with {len(journal)} finished steps" if len(journal) else _nothing(args))
+    with _folder(args.out), _telling(lambda: _how_to_go_on_finding(args, journal)):
+        if args.resume:
+            sweep(journal.folder)
+        else:
+            journal.clear()
         count, rows = train.data.valid.shape
         say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
-        closed = close_the_loop(rig, train.data, key=jax.random.key(args.seed), say=say)
+        with keeping(journal):
+            closed = close_the_loop(rig, train.data, key=jax.random.key(args.seed), say=say)
         found = findings(closed)
+        for name in (REPORT, "report.html"):  # older ones are not of the models that are written now
+            (args.out / name).unlink(missing_ok=True)
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes={"settings": {"seed": args.seed}})
         write_diagnosis(args.out, closed, found, train, test, seed=args.seed, began=began, say=say)
+        journal.clear()
 
 
 def run_predict(args: argparse.Namespace, say: Say) -> None:
@@ -352,11 +370,24 @@ def _readings(fitted: Identified) -> list[tuple[str, float]]:
     return list(zip(fitted.rig.measured, np.asarray(fitted.model.log_r).tolist(), strict=True))
 
 
+def _begin(args: argparse.Namespace, rig: Rig, train: Logs, mark: str, settings, say: Say) -> tuple[Identified, list]:
+    """The state before the first epoch, or the last one that is kept."""
+    if args.resume and (args.out / CHECKPOINT).exists():
+        start, history = _resume(args, rig, mark, settings)
+        say(f"resumed after epoch {start.state.epoch}")
+        return start, history
+    if args.resume:
+        say(_nothing(args))
+    return begin(rig, train.data, key=jax.random.key(args.seed)), []
+
+
+def _nothing(args: argparse.Namespace) -> str:
+    return f"nothing to go on from in {args.out}: begins at the start"
+
+
 def _resume(args: argparse.Namespace, rig: Rig, mark: str, settings: Mapping[str, Any]) -> tuple[Identified, list]:
     """The state to go on from; refused where it belongs to another rig, other logs or other options."""
     path = args.out / CHECKPOINT
-    if not path.exists():
-        raise StoreError(f"{path}: is not there; leave --resume out to begin")
     stored: Stored = read(path)
     if stored.fitted.rig != rig:
         raise StoreError(f"{path}: made for another rig.toml; leave --resume out to begin anew, or give another --out")
@@ -370,12 +401,34 @@ def _resume(args: argparse.Namespace, rig: Rig, mark: str, settings: Mapping[str
 
 
 def _how_to_go_on(args: argparse.Namespace, history: list) -> str:
-    if not history:
+    kept = 0
+    with suppress(StoreError):  # the last epoch may have been stopped while it was written
+        kept = len(notes(args.out / CHECKPOINT)["epochs"])
+    if kept == 0 or kept not in (len(history) - 1, len(history)):
         return "stopped before the end of the first epoch; nothing was kept"
     command = ["nnap-em", "identify", str(args.folder), "--out", str(args.out), "--smoother", args.smoother]
     command += ["--particles", str(args.particles)] if args.particles else []
     command += ["--epochs", str(args.epochs), "--seed", str(args.seed), "--resume"]
-    return f"stopped after epoch {history[-1]['epoch']}; to go on: {shlex.join(command)}"
+    return f"stopped after epoch {kept}; to go on: {shlex.join(command)}"
+
+
+def _how_to_go_on_finding(args: argparse.Namespace, journal: Journal) -> str:
+    if not len(journal):
+        return "stopped before the end of the first step; nothing was kept"
+    command = ["nnap-em", "diagnose", str(args.folder), "--out", str(args.out), "--seed", str(args.seed), "--resume"]
+    return f"stopped with {len(journal)} finished steps kept; to go on: {shlex.join(command)}"
+
+
+@contextmanager
+def _telling(kept: Callable[[], str]) -> Iterator[None]:
+    """Say what is kept where one is stopped, or where a file cannot be written."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(kept()) from None
+    except OSError as error:
+        file = f"{error.filename}: " if error.filename else ""
+        raise Halted(f"{file}{error.strerror or error}; {kept()}") from error
 
 
 @contextmanager
@@ -385,11 +438,13 @@ def _folder(path: Path) -> Iterator[None]:
     path.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=path):
         pass
+    sweep(path)
     try:
         yield
     finally:
-        if new and not any(path.iterdir()):
-            path.rmdir()
+        for empty in (path / UNFINISHED, path) if new else ():
+            with suppress(OSError):  # it is not
+                empty.rmdir()
 
 
 def _report(

@@ -329,11 +329,14 @@ def error_figure(
             values = np.where(values > 0, values, np.nan)
             ax.plot(horizons, values, color=colour, label=side)
             ax.plot(horizons, values, mark, color=colour, ms=4)
-        ax.set(xscale="log", yscale="log", title=symbol(name), xlabel="time predicted ahead [s]")
+        ax.set(xscale="log", title=symbol(name), xlabel="time predicted ahead [s]")
         ax.set_ylabel(f"rms error [{(units or {}).get(name) or _guess(name)}]")
         ax.xaxis.set_major_locator(FixedLocator(list(horizons)))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
         ax.xaxis.set_minor_locator(NullLocator())
+        if not any(np.isfinite(line.get_ydata()).any() for line in ax.lines):
+            continue  # no test sequence is longer than what is given, and a logarithmic axis needs a number
+        ax.set_yscale("log")
         low, high = ax.get_ylim()
         if high < 30 * low:
             ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, horizon
+from .journal import HERE, step
 from .model import AbstractModel
 from .mstep import AbstractMStep, MStepInfo
 from .parallel import each
@@ -73,6 +74,7 @@ def _smooth(common, one) -> Posterior:
     return smoother(model, seq, key=key)
 
 
+@step(lambda model, *_: (model, MStepInfo(HERE, HERE), HERE, HERE))
 def em_step(
     model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
 ) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 
 from . import __version__, portable
 from .effects import AbstractEffect
+from .files import replace_bytes, replace_text
 from .friction import FrictionNetwork
 from .identify import Identified, friction_table, parameter_table
 from .model import StateSpaceModel
 from .mstep import Weights
-from .rig import parameter_unit, replace_text
-from .store import replace_bytes
+from .rig import parameter_unit
 from .tables import state_unit, write_json
 from .unroll import UnrollError, unroll
 

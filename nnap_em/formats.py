@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Real
 
-from .rig import nearest, replace_text
+from .files import replace_text
+from .rig import nearest
 
 Array = jax.Array | np.ndarray  # host or device
 LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text

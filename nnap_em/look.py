@@ -14,7 +14,7 @@ from .identify import Identified
 from .model import StateSpaceModel
 from .mstep import ScoringMStep
 from .refit import Trial, refit
-from .screen import Verdict, judge, project, sheet, unlike
+from .screen import Verdict, judge, screen, unlike
 
 Say = Callable[[str], None]
 
@@ -246,8 +246,7 @@ def look(
     around = surroundings(before.rig, now.model, data, path)
     candidates = proposals(around)
     weights = now.m_step.weights(now.model)
-    table = sheet(before.model, now.model, weights, candidates, path, data, rows)
-    projected = project(table, np.asarray(used, float))
+    projected = screen(before.model, now.model, weights, candidates, path, data, used, rows)
     verdicts = judge(projected, candidates)
     ranked = _best_of_kind(candidates, verdicts, data)
     present = {key_of(effect) for effect in now.model.effects}

@@ -45,6 +45,13 @@ def all_devices() -> Mesh:
     return jax.make_mesh((jax.device_count(),), (AXIS,), axis_types=(jax.sharding.AxisType.Auto,))
 
 
+def everywhere(flag: bool) -> bool:
+    """Whether `flag` is true in every process."""
+    if jax.process_count() == 1:
+        return flag
+    return bool(np.all(multihost_utils.process_allgather(np.asarray(flag))))
+
+
 def use_every_device() -> None:
     """Spread sequences over all devices from here on; commands and examples do."""
     if jax.device_count() > 1:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
 from .gaussian import Gaussian
+from .journal import HERE, step
 from .kalman import CUBATURE, kalman_filter, rts
 from .model import StateSpaceModel
 from .mstep import Core, ScoringMStep, locals_along
@@ -46,6 +47,7 @@ def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Ga
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
 
+@step(lambda model, m_step, path, *_, **__: Trial(model, m_step, path, HERE, HERE))
 def refit(
     model: StateSpaceModel,
     m_step: ScoringMStep,

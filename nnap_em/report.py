@@ -17,13 +17,14 @@ from . import __version__
 from . import diagnosis_plots as plots
 from .data import Logs
 from .diagnose import Finding, advice, curve, entry, friction_change, verdict
+from .files import replace_text
 from .identify import Identified, friction_table, parameter_table
 from .look import words
 from .loop import Closed
 from .page import Picture, page
 from .predict import HORIZONS, horizon_errors, predict
 from .residual import Residual, names_of, residual, tests
-from .rig import parameter_unit, replace_text
+from .rig import parameter_unit
 from .tables import state_unit, visited_nodes, write_friction, write_json
 
 GIVEN = 1.0

@@ -3,13 +3,14 @@
 import difflib
 import json
 import math
-import os
 import tomllib
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
+
+from .files import replace_text
 
 _FRICTION = {"unknown": True, "none": False}
 _CLOCKS = ("sequence", "session")
@@ -148,17 +149,6 @@ def write_rig(rig: Rig, path: Path) -> None:
     lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
     lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
     replace_text(path, "\n".join(lines) + "\n")
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all (through a temporary file in its folder, which is made if need be)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def toml_text(text: str) -> str:

@@ -13,11 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .data import Dataset, fill_missing
 from .effects import AbstractEffect, Candidate, Scene
 from .gaussian import Gaussian
+from .journal import HERE, step
 from .kalman import CUBATURE, kalman_filter
 from .model import StateSpaceModel
 from .mstep import Weights, friction_columns, locals_along, whitened_sensitivities
@@ -239,6 +240,21 @@ def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
     half = np.linalg.solve(factor, information[:n, n:])
     left = np.linalg.solve(factor, score[:n])
     return Projected(score[n:] - half.T @ left, information[n:, n:] - half.T @ half)
+
+
+@step(lambda *_: Projected(HERE, HERE))
+def screen(
+    base: StateSpaceModel,
+    null: StateSpaceModel,
+    weights: Weights,
+    candidates: Sequence[Candidate],
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    rows: int,
+) -> Projected:
+    """The sheet of all candidates, projected: what the sequences `used` say of them."""
+    return project(sheet(base, null, weights, candidates, path, data, rows), np.asarray(used, float))
 
 
 def unlike(projected: Projected, candidates: Sequence[Candidate], chosen: Candidate) -> list[float]:

@@ -6,12 +6,9 @@ settings and the plain numbers.  No code is stored; loading builds the model ane
 
 import dataclasses
 import hashlib
-import io
-import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,17 +18,22 @@ import numpy as np
 from . import __version__
 from .data import Dataset
 from .effects import catalogue, parts
+from .files import Kind, read_arrays, refuse, write_arrays
 from .identify import Identified, begin
+from .leaves import describe, name_of, plain, restore, tuples
 from .rig import Declared, Rig
 from .systems import systems
 
-KIND = "nnap_em fitted model"
-FORMAT = 1
-_HEADER, _CHECKSUM = "header", "sha256"
-
-
-class StoreError(ValueError):
-    """A file that is no usable model: the message names the file, what is wrong with it and the mend."""
+_GIVE = "give the model.npz that `nnap-em identify` wrote"
+KIND = Kind(
+    "nnap_em fitted model",
+    1,
+    "model",
+    _GIVE,
+    f"{_GIVE}, from a copy that is whole",
+    "identify again, or use the version that wrote it",
+    "use another copy, or identify again",
+)
 
 
 class Stored(NamedTuple):
@@ -64,21 +66,21 @@ def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mappin
     settings: dict[str, Any] = {}
 
     def leaf(place: str, value: Any) -> Any:
-        leaves[place], array = _describe(path, place, value)
+        try:
+            leaves[place], array = describe(value)
+        except TypeError as error:
+            refuse(path, f"{place} is a {error}", "arrays, numbers and named functions can be stored")
         if array is not None:
             arrays[place] = array
         return value
 
     def setting(place: str, value: Any) -> Any:
-        if _plain(value):
+        if plain(value):
             settings[place] = value
         return value
 
     _rebuild(_tree(fitted), "", leaf, setting)
     header = {
-        "kind": KIND,
-        "format": FORMAT,
-        "version": __version__,
         "rig": dataclasses.asdict(fitted.rig),
         "effects": [_sketch(effect) for effect in fitted.model.effects],
         "leaves": leaves,
@@ -86,16 +88,8 @@ def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mappin
         "fingerprint": fingerprint,
         "notes": dict(notes or {}),
     }
-    _assemble(path, header, arrays)
-    text = json.dumps(header).encode()
-    content = io.BytesIO()
-    np.savez(
-        content,
-        allow_pickle=False,
-        **{_HEADER: np.frombuffer(text, np.uint8), _CHECKSUM: _checksum(text, arrays)},
-        **arrays,
-    )
-    replace_bytes(path, content.getvalue())
+    _assemble(path, {"version": __version__, **header}, arrays)
+    write_arrays(path, KIND, header, arrays)
 
 
 def load(path: Path) -> Identified:
@@ -111,25 +105,19 @@ def read(path: Path) -> Stored:
 
     Raises StoreError if the file is damaged, foreign, or of another version.
     """
-    header, arrays = _open(path)
+    header, arrays = read_arrays(path, KIND)
     try:
         return Stored(_assemble(path, header, arrays), header["fingerprint"], header["notes"])
     except (KeyError, TypeError, AttributeError) as error:
-        _refuse(path, f"its header lacks something ({error!r})", "identify again with this version")
+        refuse(path, f"its header lacks something ({error!r})", "identify again with this version")
 
 
-def replace_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all (through a temporary file in its folder, which is made if need be)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+def notes(path: Path) -> dict[str, Any]:
+    """What the writer of `path` wished to keep beside the model.
+
+    Raises StoreError if the file is damaged, foreign, or of another version.
+    """
+    return read_arrays(path, KIND)[0]["notes"]
 
 
 def _tree(fitted: Identified) -> dict[str, Any]:
@@ -158,42 +146,20 @@ def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Ca
     return leaf(place, node)
 
 
-def _describe(path: Path, place: str, value: Any) -> tuple[dict[str, Any], np.ndarray | None]:
-    """How a leaf is told in the header, and its array if it is one."""
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        return {"is": "key", "of": str(jax.random.key_impl(value))}, np.asarray(jax.random.key_data(value))
-    if isinstance(value, jax.Array):
-        return {"is": "weak" if value.weak_type and value.ndim == 0 else "jax"}, np.asarray(value)
-    if isinstance(value, np.ndarray | np.generic):
-        return {"is": "numpy"}, np.asarray(value)
-    if _plain(value):
-        return {"is": "plain", "of": value}, None
-    if callable(value):
-        return {"is": "code", "of": getattr(value, "__name__", type(value).__name__)}, None
-    _refuse(path, f"{place} is a {type(value).__name__}", "arrays, numbers and named functions can be stored")
-
-
-def _plain(value: Any) -> bool:
-    """What JSON gives back unchanged; tuples come back as tuples."""
-    if isinstance(value, tuple):
-        return all(map(_plain, value))
-    return value is None or type(value) in (bool, int, float, str)
-
-
 def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Identified:
     """The model that `header` and `arrays` describe, on the skeleton that its rig gives."""
     rig = _rig(header["rig"])
     if rig.system not in systems:
-        _refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
+        refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
     leaves, settings = header["leaves"], header["settings"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
-        _refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
+        refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
     seen = set()
 
     def differs(place: str, found: str) -> None:
         made = f"it was written by nnap_em {header['version']}, this is {__version__}"
-        _refuse(path, f"another structure at {place.strip('/')}: {found} ({made})", "identify again with this version")
+        refuse(path, f"another structure at {place.strip('/')}: {found} ({made})", "identify again with this version")
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
@@ -201,22 +167,19 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":
-            if getattr(value, "__name__", type(value).__name__) != of:
+            if name_of(value) != of:
                 differs(place, f"{of!r} in the file")
-            return value
-        if kind == "plain":
-            return _tuples(of)
-        if array is None or callable(value) or (value is not None and kind != "key" and np.ndim(value) != array.ndim):
+        elif kind == "plain":
+            pass
+        elif array is None or callable(value) or (value is not None and kind != "key" and np.ndim(value) != array.ndim):
             differs(place, "of another shape" if array is not None else "no array in the file")
-        if kind == "key":
-            return jax.random.wrap_key_data(jnp.asarray(array), impl=of)
-        return {"jax": jnp.asarray, "weak": lambda a: jnp.asarray(a.item()), "numpy": np.asarray}[kind](array)
+        return restore(leaves[place], array, value)
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        if _plain(value) != (place in settings):
+        if plain(value) != (place in settings):
             differs(place, "a setting that only one of the two has")
-        return _tuples(settings[place]) if place in settings else value
+        return tuples(settings[place]) if place in settings else value
 
     effects = tuple(_drawn(path, sketch) for sketch in header.get("effects", []))
     blank = begin(rig, _blank(rig), key=jax.random.key(0), effects=effects)
@@ -233,7 +196,7 @@ def _sketch(node: Any) -> Any:
         kind = type(node)
         parts = {f.name: _sketch(getattr(node, f.name)) for f in dataclasses.fields(node)}
         return {"module": kind.__module__.rpartition(".")[2], "kind": kind.__name__, "parts": parts}
-    if isinstance(node, tuple) and not _plain(node):
+    if isinstance(node, tuple) and not plain(node):
         return {"items": [_sketch(item) for item in node]}
     return {"axes": np.ndim(node)} if eqx.is_array(node) else {"plain": node}
 
@@ -244,22 +207,18 @@ def _drawn(path: Path, sketch: Mapping[str, Any]) -> Any:
         places = {**catalogue, **{kind.__name__: kind for kind in parts}}
         found = [k for k in places.values() if k.__name__ == sketch["kind"] and _module(k) == sketch["module"]]
         if not found:
-            _refuse(path, f"its effect {sketch['kind']!r} is not in the catalogue here", "install what adds it")
+            refuse(path, f"its effect {sketch['kind']!r} is not in the catalogue here", "install what adds it")
         made = object.__new__(found[0])
         for name, part in sketch["parts"].items():
             object.__setattr__(made, name, _drawn(path, part))
         return made
     if "items" in sketch:
         return tuple(_drawn(path, item) for item in sketch["items"])
-    return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else _tuples(sketch["plain"])
+    return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else tuples(sketch["plain"])
 
 
 def _module(kind: type) -> str:
     return kind.__module__.rpartition(".")[2]
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
 
 
 def _rig(told: Mapping[str, Any]) -> Rig:
@@ -277,40 +236,3 @@ def _blank(rig: Rig, rows: int = 32) -> Dataset:
     swing = np.sin(t / t[-1])[None, :, None]
     u, y = (np.repeat(swing, n, axis=2) for n in (len(rig.input_columns), len(rig.measured)))
     return Dataset(t[None], u, y, np.ones((1, rows), bool))
-
-
-def _checksum(header: bytes, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    digest = hashlib.sha256(header)
-    for name in sorted(arrays):
-        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return np.frombuffer(digest.digest(), np.uint8)
-
-
-def _open(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of this format whose checksum holds."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        _refuse(path, f"cannot be read ({error.strerror})", "give the model.npz that `nnap-em identify` wrote")
-    arrays: dict[str, np.ndarray] = {}
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        text = arrays.pop(_HEADER).tobytes()
-        header = json.loads(text)
-    except Exception:  # what the parsers raise on damaged bytes is open-ended
-        mend = "give the model.npz that `nnap-em identify` wrote, from a copy that is whole"
-        _refuse(path, f"no model, or damaged or cut short ({len(content)} bytes)", mend)
-    if not isinstance(header, dict) or header.get("kind") != KIND:
-        _refuse(path, "an npz of another program", "give the model.npz that `nnap-em identify` wrote")
-    if header.get("format") != FORMAT:
-        by = f"format {header.get('format')} (nnap_em {header.get('version')}), this version reads format {FORMAT}"
-        _refuse(path, by, "identify again, or use the version that wrote it")
-    if not np.array_equal(arrays.pop(_CHECKSUM, np.zeros(0)), _checksum(text, arrays)):
-        _refuse(path, "damaged: its checksum does not hold", "use another copy, or identify again")
-    return header, arrays
-
-
-def _refuse(path: Path, found: str, mend: str) -> NoReturn:
-    raise StoreError(f"{path}: {found}; {mend}")

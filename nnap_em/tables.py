@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .files import replace_text
 from .formats import write_csv
-from .rig import replace_text
 from .systems import AbstractSystem
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em import cli, commands, rig, tables
+from nnap_em import cli, commands, files, tables
 from nnap_em.rig import read_rig
 from nnap_em.simulate import examples
 from nnap_em.store import load, read
@@ -384,7 +384,6 @@ def _bench_file(name: str, old: str, new: str):
 IDENTIFY = ("identify", "{bench}", "--out", "{out}")
 PREDICT = ("predict", "{fit}", "{bench}/test", "--given", "1", "--out", "{out}")
 BAD = {
-    "nothing to resume": (lambda b: None, (*IDENTIFY, "--resume"), "checkpoint.npz: is not there; leave --resume out"),
     "out is a file": (
         lambda b: None,
         ("identify", "{bench}", "--out", "{bench}/rig.toml"),
@@ -451,9 +450,9 @@ def test_a_full_disk_leaves_nothing_half_written(bench, fit, tmp_path, monkeypat
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(rig, "os", SimpleNamespace(replace=full, getpid=os.getpid))
+    monkeypatch.setattr(files, "os", SimpleNamespace(fsync=full, getpid=os.getpid))
     assert _run("smooth", fit, bench / "test", "--out", tmp_path / "out") == 2
-    assert capsys.readouterr().err == "nnap-em: error: No space left on device\n"
+    assert capsys.readouterr().err == f"nnap-em: error: {tmp_path}/out/000.csv: No space left on device\n"
     assert _files(tmp_path) == []
     assert _run("simulate", tmp_path / "new", *SIMULATE) == 2
     assert list(tmp_path.iterdir()) == [tmp_path / "out"]

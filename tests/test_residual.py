@@ -289,6 +289,7 @@ def test_figures_of_a_diagnosis_can_be_drawn():
     figures = (
         diagnosis_plots.innovation_figure(found, names, found),
         diagnosis_plots.error_figure(error),
+        diagnosis_plots.error_figure(error | {side: {"theta1": [None, None]} for side in ("before", "after")}),
         diagnosis_plots.friction_pair_figure(table, table, list(found.state[..., 2:].reshape(-1, 2).T)),
         diagnosis_plots.prediction_pair_figure(found.t[0], found.state[0][:, [0, 3]], names, pair, pair, 1.0),
         diagnosis_plots.effect_figure(v, v**2, 0.1 + 0 * v, label_x="θ₁ [rad]", label_y="torque [N m]", visited=v),

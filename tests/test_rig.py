@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, replace_text, write_rig
+from nnap_em.files import replace_text
+from nnap_em.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, write_rig
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em import store
+from nnap_em import files
 from nnap_em.data import Dataset
+from nnap_em.files import StoreError
 from nnap_em.identify import Identified, begin
 from nnap_em.law import StribeckLaw
 from nnap_em.rig import Declared, Rig
-from nnap_em.store import StoreError, fingerprint, load, read, save
+from nnap_em.store import fingerprint, load, read, save
 
 ARM = {
     name: Declared(value, 0.1 * value)
@@ -125,8 +126,8 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(store, "os", SimpleNamespace(fsync=full, getpid=os.getpid, replace=os.replace))
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(files, "os", SimpleNamespace(fsync=full, getpid=os.getpid, replace=os.replace))
+    with pytest.raises(OSError, match=r"No space left.*model\.npz"):
         save(file, _fitted("slide"))
     assert file.read_bytes() == old
     assert [path.name for path in tmp_path.iterdir()] == ["model.npz"]

@@ -1,0 +1,65 @@
+"""A leaf of a tree as an entry of a JSON header and, if it is an array, the array: back to the last bit."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def plain(value: Any) -> bool:
+    """What JSON gives back unchanged; tuples come back as tuples."""
+    if isinstance(value, tuple):
+        return all(map(plain, value))
+    return value is None or type(value) in (bool, int, float, str)
+
+
+def tuples(value: Any) -> Any:
+    """What JSON made of a plain value, as it was."""
+    return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def is_key(value: Any) -> bool:
+    """Whether it is an array of random keys."""
+    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+
+
+def name_of(code: Any) -> str:
+    """A function or callable object by name."""
+    return getattr(code, "__name__", type(code).__name__)
+
+
+def describe(value: Any) -> tuple[dict[str, Any], np.ndarray | None]:
+    """How a leaf is told in the header, and its array if it is one.
+
+    Raises TypeError where it is nothing that can be stored.
+    """
+    if is_key(value):
+        return {"is": "key", "of": str(jax.random.key_impl(value))}, np.asarray(jax.random.key_data(value))
+    if isinstance(value, jax.Array):
+        return {"is": "weak" if value.weak_type and value.ndim == 0 else "jax"}, np.asarray(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return {"is": "numpy"}, np.asarray(value)
+    if plain(value):
+        return {"is": "plain", "of": value}, None
+    if callable(value):
+        return {"is": "code", "of": name_of(value)}, None
+    raise TypeError(type(value).__name__)
+
+
+def restore(entry: dict[str, Any], array: np.ndarray | None, code: Any = None) -> Any:
+    """The leaf of which `describe` told; for a function that is `code`."""
+    match entry["is"]:
+        case "plain":
+            return tuples(entry["of"])
+        case "code":
+            return code
+        case "key":
+            return jax.random.wrap_key_data(jnp.asarray(array), impl=entry["of"])
+        case "weak":
+            assert array is not None
+            return jnp.asarray(array.item())
+        case "jax":
+            return jnp.asarray(array)
+        case _:
+            return np.asarray(array)

@@ -1,6 +1,8 @@
 # make demo | make test | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
 PYTHON ?= python3
 PYTEST_FLAGS ?= -n 2
+# The matrices are small: more threads only wait for each other.
+export OPENBLAS_NUM_THREADS ?= 1
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt

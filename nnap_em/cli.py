@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import signal
 import sys
 import threading
@@ -172,6 +173,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.command == "identify" and args.particles and args.smoother != "particle":
         arguments.error("--particles goes with --smoother particle")
     try:
+        # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from . import commands  # loads JAX
 
         with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:

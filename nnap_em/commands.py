@@ -79,7 +79,7 @@ class Epoch(NamedTuple):
 def set_up() -> None:
     """64-bit numbers, every core, and compiled programs kept for the next call if there is a place for them."""
     jax.config.update("jax_enable_x64", True)
-    if not jax.distributed.is_initialized():  # launch.py has dealt out the cores
+    if not jax.distributed.is_initialized() and "JAX_NUM_CPU_DEVICES" not in os.environ:  # or they are dealt out
         with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
             jax.config.update("jax_num_cpu_devices", min(MOST, len(os.sched_getaffinity(0))))
         use_every_device()

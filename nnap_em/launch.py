@@ -96,6 +96,7 @@ def main() -> None:
     here = args.here or args.processes
     threads = max(1, len(os.sched_getaffinity(0)) // here)
     address = args.coordinator or free_address()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     children = []
     for index in range(args.first, args.first + here):
         order = ["--coordinator", address, "--work", str(index), str(threads), str(args.processes), *args.command]

@@ -1,4 +1,8 @@
+import os
 from pathlib import Path
+
+# numbers are the same to the last bit for the same number of devices only, here and in the processes that tests start
+os.environ["JAX_NUM_CPU_DEVICES"] = "1"
 
 import jax
 import pytest

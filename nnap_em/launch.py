@@ -17,6 +17,10 @@ import time
 from pathlib import Path
 
 
+PATIENCE = 600
+"""How long processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
+
+
 def free_address() -> str:
     """An address on this machine at which nobody listens."""
     with socket.socket() as s:
@@ -31,7 +35,7 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     from . import cli, parallel
 
     jax.config.update("jax_num_cpu_devices", threads)
-    jax.distributed.initialize(coordinator, count, index, initialization_timeout=60)
+    jax.distributed.initialize(coordinator, count, index, initialization_timeout=PATIENCE)
     parallel.use_every_device()
     if index == 0:
         sys.exit(cli.main(command))
@@ -97,6 +101,8 @@ def main() -> None:
     threads = max(1, len(os.sched_getaffinity(0)) // here)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    waits = ("xla_cpu_collective_call_terminate_timeout_seconds", "xla_cpu_collective_timeout_seconds")
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--{name}={PATIENCE}" for name in waits)])
     children = []
     for index in range(args.first, args.first + here):
         order = ["--coordinator", address, "--work", str(index), str(threads), str(args.processes), *args.command]

@@ -95,7 +95,9 @@ def rig(tmp_path_factory) -> Path:
 
 def _nnap(*command, launch=()):
     first = [sys.executable, "-m", "nnap_em.launch", *launch] if launch else [sys.executable, "-m", "nnap_em.cli"]
-    return subprocess.run([*first, *command], env=ENVIRONMENT, check=True, capture_output=True, text=True, timeout=600)
+    done = subprocess.run([*first, *command], env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return done
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ import tempfile
 import time
 from pathlib import Path
 
-
 PATIENCE = 600
 """How long processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
 

@@ -34,12 +34,15 @@ SLIDE = plant.Case(system="slide", sequences=6, tests=1, steps=120, seed=2, nois
 
 
 def numbers(out: Path) -> dict:
-    """Everything in a folder of results but times."""
+    """Everything that a run leaves behind but the seconds that it took."""
     found: dict = {}
     for path in sorted(out.glob("*.npz")):
         if path.name != "checkpoint.npz":
             with np.load(path) as stored:
-                found[path.name] = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
+                arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
+                header = json.loads(stored["header"].tobytes())
+                header.pop("notes")
+                found[path.name] = arrays, header
     for path in sorted(out.glob("*.csv")):
         found[path.name] = path.read_bytes()
     report = json.loads((out / "report.json").read_text())

@@ -196,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """`say`, which ends a command that lost its Ctrl-C: Python drops what is raised amid a garbage collection."""
+    """`say`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped, noisily."""
     asked = False
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -209,15 +209,22 @@ def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
         if asked:
             raise KeyboardInterrupt
 
+    def dropped(lost: sys.UnraisableHookArgs) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            unraisable(lost)
+
+    unraisable = sys.unraisablehook
     ours = threading.current_thread() is threading.main_thread()
     ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
     if ours:
         signal.signal(signal.SIGINT, handle)
+        sys.unraisablehook = dropped
     try:
         yield line
     finally:
         if ours:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            sys.unraisablehook = unraisable
 
 
 def _line(error: Exception) -> str | None:

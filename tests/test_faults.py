@@ -5,7 +5,6 @@ drawn from a seed.
 """
 
 import contextlib
-import json
 import os
 import random
 import re
@@ -21,21 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
+from faults import numbers
+from shell import ENVIRONMENT
 
 from nnap_em import cli, commands, files, journal
 from nnap_em.effects import catalogue
 from nnap_em.files import StoreError, sweep
 from nnap_em.journal import HERE, Journal, digest, keeping, step
 
-ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT = os.environ | {
-    "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
-    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "jax"),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    "TF_CPP_MIN_LOG_LEVEL": "3",
-}
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=6, tests=1, steps=80, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
+FOUND = {"identify": [], "diagnose": ["torsional_spring"]}
 IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
 FAULTY = """
 import errno, os, resource, signal, sys, types
@@ -112,26 +107,6 @@ def _fault_at_some_time(order: list[str], out: Path, kind: signal.Signals, count
     return run.returncode, said
 
 
-def _numbers(out: Path) -> dict:
-    """Everything that a run leaves behind but the seconds that it took."""
-    found: dict = {}
-    for path in sorted(out.glob("*.npz")):
-        if path.name != "checkpoint.npz":
-            with np.load(path) as stored:
-                arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
-                assert len(arrays) > 20
-                header = json.loads(stored["header"].tobytes())
-                header.pop("notes")
-                found[path.name] = arrays, header
-    for path in sorted(out.glob("*.csv")):
-        found[path.name] = path.read_bytes()
-    report = json.loads((out / "report.json").read_text())
-    report.pop("seconds")
-    for epoch in report.get("epochs", []):
-        epoch.pop("seconds")
-    return found | {"report": report}
-
-
 def _told(said: str) -> str:
     """The last line, which is no traceback."""
     assert "Traceback" not in said, said
@@ -183,10 +158,8 @@ def _survives(command, rig: Path, out: Path, faults: list[Fault]) -> None:
     assert not (out / "unfinished").exists()
 
 
-@pytest.mark.slow
-def test_identify_survives(rig, tmp_path):
-    """The numbers are those of an unbroken run, in this process."""
-    faults: list[Fault] = [
+CHAINS: dict[str, list[Fault]] = {
+    "identify": [
         ("kill", 0),
         ("in a write", 2),
         ("before the rename", 2),
@@ -195,16 +168,8 @@ def test_identify_survives(rig, tmp_path):
         ("Ctrl-C", 1),
         ("kill", 1),
         ("in a write", "friction.csv"),
-    ]
-    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole", "--quiet")) == 0
-    _survives(IDENTIFY, rig, tmp_path / "broken", faults)
-    assert _numbers(tmp_path / "broken") == _numbers(tmp_path / "whole")
-
-
-@pytest.mark.slow
-def test_diagnose_survives(rig, tmp_path):
-    """The numbers are those of an unbroken run, in this process, which keeps nothing."""
-    faults: list[Fault] = [
+    ],
+    "diagnose": [
         ("kill", 0),
         ("in a write", 9),
         ("kill", 6),
@@ -214,12 +179,20 @@ def test_diagnose_survives(rig, tmp_path):
         ("Ctrl-C before a write", 3),
         ("unwritable", 3),
         ("after a write", "before.npz"),
-    ]
-    assert cli.main(_order(DIAGNOSE, rig, tmp_path / "whole", "--quiet")) == 0
-    _survives(DIAGNOSE, rig, tmp_path / "broken", faults)
-    numbers = _numbers(tmp_path / "broken")
-    assert [effect["name"] for effect in numbers["report"]["effects"]] == ["torsional_spring"]
-    assert numbers == _numbers(tmp_path / "whole")
+    ],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
+def test_a_chain_of_faults_is_survived(rig, tmp_path, command):
+    """The numbers are those of an unbroken run, in this process, which keeps nothing of a diagnosis."""
+    assert cli.main(_order(command, rig, tmp_path / "whole", "--quiet")) == 0
+    _survives(command, rig, tmp_path / "broken", CHAINS[command[0]])
+    left = numbers(tmp_path / "broken")
+    assert left == numbers(tmp_path / "whole")
+    assert all(len(arrays) > 20 for name, (arrays, _) in left.items() if name.endswith(".npz"))
+    assert [effect["name"] for effect in left["report"].get("effects", [])] == FOUND[command[0]]
 
 
 # --- files that are not what they should be

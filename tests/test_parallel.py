@@ -12,16 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shell import ENVIRONMENT
 
 from nnap_em.parallel import all_devices, each, over
-
-ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT = os.environ | {
-    "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
-    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "jax"),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    "TF_CPP_MIN_LOG_LEVEL": "3",
-}
 
 
 def _weigh(common, one):

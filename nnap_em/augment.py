@@ -16,8 +16,8 @@ from .ode import integrate
 from .rig import Rig
 
 
-def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian) -> Around:
-    """Sizes on the smoothed paths and in the logs."""
+def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int) -> Around:
+    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`."""
     scales = measure_scales(rig, model.system, data)
     dof = len(model.system.coordinates)
     valid = np.asarray(data.valid)
@@ -42,6 +42,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
         rig.dt,
         (float(clock.min()), float(clock.max())),
+        float(clock.max()) + rig.dt * (rows - int(valid.sum(axis=1).max())),
         rig.clock == "session",
         rig.friction,
     )

@@ -243,7 +243,7 @@ def look(
 ) -> tuple[Step, list[Refitted], Trial | None]:
     """One look at one horizon: everything screened, the best few refitted; those that hold, best first."""
     length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    around = surroundings(before.rig, now.model, data, path)
+    around = surroundings(before.rig, now.model, data, path, rows)
     candidates = proposals(around)
     weights = now.m_step.weights(now.model)
     projected = screen(before.model, now.model, weights, candidates, path, data, used, rows)

@@ -211,7 +211,7 @@ def test_absent_strength_is_no_effect():
     model = _model(case)
     around = Around(
         model.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
-        ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), True, True,
+        ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True,
     )  # fmt: skip
     x = jnp.asarray([0.3, -0.5, 2.0, -3.0])
     row = jnp.asarray([0.2, 1.0, 0.1, 1.0])

@@ -66,7 +66,7 @@ def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
 def test_columns_are_difference_quotients(bench, name):
     """A column is minus the change of the whitened innovations; its force is held over a step, so to some per cent."""
     rig, model, rule, data, path = bench
-    candidate = catalogue[name].candidates(surroundings(rig, model, data, path))[-1]
+    candidate = catalogue[name].candidates(surroundings(rig, model, data, path, data.t.shape[1]))[-1]
     table = sheet(model, model, rule.weights(model), [candidate], path, data)
     small = 1.0 if name == "input_delay" else 1e-2  # its probe is of finite size
     weak = jax.tree.map(lambda start, p: start + small * (p - start), candidate.start, candidate.probes[-1])
@@ -101,7 +101,7 @@ def test_projection_is_least_squares():
 def test_what_a_friction_map_holds_gains_nothing(bench):
     """A constant torque, back-EMF and a joint's own drag are static maps of one velocity."""
     rig, model, rule, data, path = bench
-    around = surroundings(rig, model, data, path)
+    around = surroundings(rig, model, data, path, data.t.shape[1])
     maps = ("torque_offset", "motor_back_emf", "air_drag")
     held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
     free = catalogue["torsional_spring"].candidates(around)
@@ -116,7 +116,7 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
 def test_effects_come_and_go(bench):
     """Adding two effects and dropping the first leaves the second with its parameters and its prior."""
     rig, model, rule, data, path = bench
-    candidates = {c.start.name: c for c in proposals(surroundings(rig, model, data, path))}
+    candidates = {c.start.name: c for c in proposals(surroundings(rig, model, data, path, data.t.shape[1]))}
     spring, bristle = candidates["torsional_spring"], candidates["presliding_friction"]
     one, rule_one = augment(model, rule, seeded(spring, np.ones(1)), spring)
     two, rule_two = augment(one, rule_one, seeded(bristle, np.ones(1)), bristle)
@@ -132,7 +132,7 @@ def test_effects_come_and_go(bench):
 def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
     """The interface calls the first two the same model; here it is measured."""
     rig, model, rule, data, path = bench
-    around = surroundings(rig, model, data, path)
+    around = surroundings(rig, model, data, path, data.t.shape[1])
     names = ("base_tilt", "sensor_bias", "torsional_spring")
     candidates = [catalogue[name].candidates(around)[0] for name in names]
     table = sheet(model, model, rule.weights(model), candidates, path, data)
@@ -145,7 +145,7 @@ def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
 def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, monkeypatch):
     """The short way to its sensitivities against differentiation through the whole step."""
     rig, model, rule, data, path = bench
-    around = surroundings(rig, model, data, path)
+    around = surroundings(rig, model, data, path, data.t.shape[1])
     one = next(c for c in catalogue["unknown_function"].candidates(around) if c.start.joint == 2)
     full, wide = augment(model, rule, one.probes[3], one)
     seq, at = jax.tree.map(lambda a: a[0], data), jax.tree.map(lambda a: a[0], path)

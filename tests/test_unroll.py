@@ -18,7 +18,7 @@ from nnap_em.unroll import UnrollError, unroll
 MODEL = _model(plant.Case(steps=20, hidden=False))
 AROUND = Around(
     MODEL.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
-    ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), True, True,
+    ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True,
 )  # fmt: skip
 CANDIDATES = {name: found[0].probes[0] for name, kind in catalogue.items() if (found := kind.candidates(AROUND))}
 

@@ -53,6 +53,8 @@ class Around(NamedTuple):
     dt: float
     duration: tuple[float, float]
     """First and last time on the clock [s]."""
+    ending: float
+    """Last time of the whole recording, of which a part is looked at [s]."""
     session: bool
     """True where the clock runs on over all sequences."""
     learned: bool

@@ -3,6 +3,7 @@
 """A law without a name: an unknown function of some inputs, learned as a network of radial basis functions."""
 
 import itertools
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -59,16 +60,18 @@ class UnknownFunction(AbstractEffect):
             limits[system.coordinates] = (-np.pi, np.pi, True)
         if around.drive.size:
             limits["u",] = (-float(around.drive[0]), float(around.drive[0]), False)
-        limits["time",] = (*around.duration, False)
-        single = [name for name in limits if name[0] not in system.rates]
-        pairs = [(a, b) for a, b in itertools.combinations(limits, 2) if _apart(a, b)]
+        limits["time",] = (around.duration[0], around.ending, False)
+        grids = [(Axis(name, *limits[name], 20),) for name in limits if name[0] not in system.rates]
+        # an angle that goes round, where each turn is another place, as with a cable
+        apart = [(q,) for i, q in enumerate(system.coordinates) if system.angles[i] and limits[q,][2]]
+        grids += [(Axis(name, -2 * np.pi, 2 * np.pi, False, 43),) for name in apart]
+        pairs = ((one, other) for one, other in itertools.combinations(limits, 2) if _apart(one, other))
+        grids += [tuple(Axis(name, *limits[name], 6) for name in pair) for pair in pairs]
         out = []
         for j in joints(around):
             size = float(around.torque[j - 1])
-            for kinds in (*((name,) for name in single), *pairs):
-                count = 20 if len(kinds) == 1 else 6
-                axes = tuple(Axis(name, *limits[name], count) for name in kinds)
-                number = count ** len(kinds)
+            for axes in grids:
+                number = math.prod(axis.count for axis in axes)
                 make = lambda w, axes=axes, j=j: cls(jnp.asarray(w, float), axes, j)  # noqa: E731
                 probes = tuple(make(0.05 * size * row) for row in np.eye(number))
                 out.append(Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size))))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from . import __version__
 
@@ -209,7 +209,7 @@ def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
         if asked:
             raise KeyboardInterrupt
 
-    def dropped(lost: sys.UnraisableHookArgs) -> None:
+    def dropped(lost: Any) -> None:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
             unraisable(lost)
 

@@ -4,7 +4,6 @@ The commands run in processes of their own and are really killed: between writes
 drawn from a seed.
 """
 
-import contextlib
 import os
 import random
 import re
@@ -301,9 +300,13 @@ def test_ctrl_c_leaves_no_half_data_set(tmp_path, monkeypatch, capsys):
 
 
 def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_path, monkeypatch, capsys):
-    def lost(args, say):
-        with contextlib.suppress(KeyboardInterrupt):
+    class Litter:
+        def __del__(self):
             os.kill(os.getpid(), signal.SIGINT)
+
+    def lost(args, say):
+        litter = Litter()
+        del litter
         say("one line")
         raise AssertionError
 

@@ -4,9 +4,10 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
-from .augment import augment, blocks, extended, proposals, seeded, surroundings
+from .augment import augment, blocks, extended, proposals, seeded, surroundings, without
 from .data import Dataset
 from .effects import AbstractEffect, Candidate, fields, flat
 from .gaussian import Gaussian
@@ -154,6 +155,12 @@ def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
 
 
+def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+    """Place of the law whose place `effect` takes: of the same key in another form, as one that repeats each turn."""
+    alike = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
+    return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
+
+
 def _told(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """Whether an unnamed law in the model is a function of the same position at the same joint."""
     if not effect.place or effect.joint is None:
@@ -179,12 +186,13 @@ def _best_of_kind(
 
 def _shortlist(ranked, present: set[Key], model: StateSpaceModel, needed: float, rules: Rules):
     """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
-    fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > needed]
+    other = [entry for entry in ranked if replaced(entry[1].start, model) is not None and entry[0] > needed]
+    fresh = other + [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > needed]
     fresh = [entry for entry in fresh if not _told(entry[1].start, model)]
     named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
     top = named[0][0] if named else 0.0
     unnamed = [entry for entry in fresh if entry[1].start.name == "unknown_function" and entry[0] > top][:2]
-    beside = [entry for entry in fresh if rest_of(entry[1].start, model) is not None]
+    beside = other + [entry for entry in fresh if rest_of(entry[1].start, model) is not None and entry not in other]
     unnamed = (beside + [entry for entry in unnamed if entry not in beside])[:2]
     close = [entry for entry in named if entry[0] > rules.near * top]
     return [(c, v) for _, c, v in unnamed + close[: rules.shortlist - len(unnamed)]]
@@ -208,8 +216,11 @@ def _more_starts(entries, candidates: Sequence[Candidate], verdicts: Sequence[Ve
 def _try(
     now: Search, path: Gaussian, data: Dataset, used, candidate: Candidate, verdict: Verdict, rules: Rules
 ) -> Trial:
-    effect = seeded(candidate, verdict.coefficients)
-    model, rule = augment(now.model, now.m_step.early(), effect, candidate)
+    effect, model, rule = seeded(candidate, verdict.coefficients), now.model, now.m_step.early()
+    place = replaced(effect, model)
+    if place is not None:
+        model, rule = without(model, rule, place)
+    model, rule = augment(model, rule, effect, candidate)
     return refit(model, rule, extended(model, path, data), data, used, passes=rules.passes)
 
 

@@ -34,6 +34,7 @@ from .look import (
     held_out_gain,
     key_of,
     look,
+    replaced,
     rest_of,
     significance,
     trimmed,
@@ -121,7 +122,9 @@ def _further(length: int, longest: int) -> int:
 
 def _taken(now: Search, entry: Refitted) -> Search:
     """The search with a candidate in the model."""
-    return Search(entry.trial.model, now_rule(now.m_step, entry.trial.m_step), now.found)
+    place = replaced(entry.effect, now.model)
+    kept = tuple(f for i, f in enumerate(now.found) if i != place)
+    return Search(entry.trial.model, now_rule(now.m_step, entry.trial.m_step), kept)
 
 
 def now_rule(old: ScoringMStep, new: ScoringMStep) -> ScoringMStep:
@@ -225,7 +228,7 @@ def _plain(
 ) -> tuple[Search, AbstractEffect] | None:
     """The search with an unnamed law in place of a named one and its rest, where the named one says the lesser part."""
     place = rest_of(winner.effect, now.model)
-    if place is None:
+    if place is None or replaced(winner.effect, now.model) is not None:
         return None
     model, rule = without(now.model, now.m_step, place)
     bare = refit(model, rule.early(), path, part, used, passes=rules.passes)

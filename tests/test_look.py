@@ -3,12 +3,14 @@
 import jax
 import numpy as np
 import plant
+import pytest
 from test_effects import _model
 from test_unroll import AROUND
 
 from nnap_em.effects import catalogue
-from nnap_em.look import key_of, replaced
+from nnap_em.look import held_out_gain, key_of, replaced
 from nnap_em.model import with_effects
+from nnap_em.refit import Trial
 
 
 def _functions(joint: int, *names: str):
@@ -37,3 +39,16 @@ def test_one_repeats_each_turn_and_the_other_does_not():
         here, there = basis[:, int(np.argmax(basis[0]))]
         assert here > 0.8
         np.testing.assert_allclose(there, again * here, atol=1e-6)
+
+
+def test_one_sequence_has_nothing_to_be_held_out(bench, monkeypatch):
+    _, model, rule, data, path = bench
+
+    def refit(*_, **__):
+        raise AssertionError("refitted to the very sequence that should judge")
+
+    monkeypatch.setattr("nnap_em.look.refit", refit)
+    null, full = (Trial(model, rule, path, gain * np.ones(4), np.eye(rule.prior.size)) for gain in (0.0, 100.0))
+    assert held_out_gain(null, full, data, np.array([False, True, False, False])) == 0.0
+    with pytest.raises(AssertionError, match="very sequence"):
+        held_out_gain(null, full, data, np.array([False, True, True, False]))

@@ -7,45 +7,16 @@ import numpy as np
 import pytest
 
 from nnap_em.augment import augment, extended, proposals, seeded, surroundings, without
-from nnap_em.build import build
 from nnap_em.data import Dataset, fill_missing
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.gaussian import Gaussian
 from nnap_em.kalman import CUBATURE, kalman_filter
 from nnap_em.model import with_effects
 from nnap_em.mstep import local
-from nnap_em.rig import Declared, Rig
 from nnap_em.screen import Sheet, judge, project, sheet, unlike
-from nnap_em.simulate import paper_experiment, paper_model
-from nnap_em.smoother import CubatureSmoother, active_steps
-from nnap_em.systems.acrobot import table_i
+from nnap_em.smoother import active_steps
 
 ROWS = 60
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """A few short sequences of the paper's acrobot, its model, and the smoothed paths."""
-    truth = paper_model()
-    data = paper_experiment(truth, 4, ROWS - 1, key=jax.random.key(5)).data
-    rig = Rig(
-        "bench",
-        "acrobot",
-        {name: Declared(value, 0.0) for name, value in table_i.items()},
-        True,
-        ("u",),
-        (2,),
-        0.01,
-        "sequence",
-        ("theta1", "dtheta1"),
-        {"theta1": 0.01, "dtheta1": 0.05},
-        {"theta2": Declared(0.0, 0.5), "dtheta1": Declared(0.0, 0.02), "dtheta2": Declared(0.0, 0.02)},
-    )
-    problem = build(rig, data, key=jax.random.key(0))
-    model = eqx.tree_at(lambda m: (m.log_q, m.log_r), problem.model, (truth.log_q + 2.0, truth.log_r))
-    smoother = CubatureSmoother(problem.bank)
-    path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, s))(d))(data).state
-    return rig, model, problem.mstep, data, path
 
 
 def _innovations(model, full, rule, path: Gaussian, seq: Dataset):

@@ -47,12 +47,12 @@ class Logs:
         return f"Logs {self.files[0]} to {self.files[-1]}: {', '.join(self.columns)}; {self.data}"
 
 
-def read_logs(folder: Path, rig: Rig) -> Logs:
+def read_logs(folder: Path | str, rig: Rig) -> Logs:
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Raises DataError at the first mistake; warns DataWarning of what is possible but seldom meant.
     """
-    files = log_files(folder)
+    files = log_files(Path(folder))
     sequences = [_read_sequence(path, rig) for path in files]
     return Logs(tuple(path.name for path in files), pad(sequences), (*rig.input_columns, *rig.measured))
 

@@ -96,11 +96,12 @@ class Rig:
         return "\n  ".join(lines)
 
 
-def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
+def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     """The rig that `rig.toml` declares, in SI units; `systems` are the registered ones.
 
     Raises RigError at the first mistake.
     """
+    path = Path(path)
     root = _Table(path, "", _parse(path))
     root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start"))
     if root.number("format") != 1:

@@ -1,5 +1,6 @@
 """One look: which law may take the place of which, and what is left of the one that goes."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import plant
@@ -52,3 +53,13 @@ def test_one_sequence_has_nothing_to_be_held_out(bench, monkeypatch):
     assert held_out_gain(null, full, data, np.array([False, True, False, False])) == 0.0
     with pytest.raises(AssertionError, match="very sequence"):
         held_out_gain(null, full, data, np.array([False, True, True, False]))
+
+
+def test_a_stop_that_yields_is_none():
+    """One that a typical torque pushes in by half a radian, or whose ends nearly meet, is a spring in disguise."""
+    stop = next(c for c in catalogue["hard_stop"].candidates(AROUND) if c.start.joint == 2).probes[0]
+    assert stop.possible()
+    half = np.log(2.0 * AROUND.torque[1])  # N m/rad
+    assert eqx.tree_at(lambda s: s.stiffness, stop, half + 0.01).possible()
+    assert not eqx.tree_at(lambda s: s.stiffness, stop, half - 0.01).possible()
+    assert not eqx.tree_at(lambda s: s.lower, stop, stop.upper - 0.1).possible()

@@ -107,3 +107,8 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     assert "falls from 0.2 to 0.1" in verdict(found, error)
     assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
     assert verdict(found, None) == "The model lacks payload at joint 2."
+    several = [Finding(catalogue["payload"](jnp.zeros(()), j), {}, {}, (), "") for j in (1, 2, 1)]
+    assert verdict(several, error).startswith(
+        "The model lacks payload at joint 1, payload at joint 2 and payload at joint"
+    )
+    assert "with them" in verdict(several[:2], error)

@@ -19,6 +19,7 @@ from nnap_em.particle import (
     Lookahead,
     MetropolisBackward,
     ParticleSmoother,
+    Potentials,
     _cumsum,
     _exp2,
     _threefry,
@@ -252,6 +253,39 @@ def test_systematic_draws_each_particle_its_share():
         share = 80 * np.asarray(jax.nn.softmax(log_w))
         counts = np.bincount(index, minlength=50)
         assert len(index) == 80 and np.all(np.abs(counts - share) < 1 + 1e-4)  # [Kitagawa 1996]
+
+
+def test_systematic_draws_are_unbiased():
+    """Over all offsets, here 400 in even steps, each particle is drawn as often as it weighs."""
+    log_w = 2 * jax.random.normal(jax.random.key(1), (50,))
+    index = jax.vmap(lambda offset: systematic(log_w, offset, 80))((jnp.arange(400.0) + 0.5) / 400)
+    count = np.bincount(np.asarray(index).ravel(), minlength=50) / 400
+    share = 80 * np.asarray(jax.nn.softmax(log_w))
+    np.testing.assert_allclose(count, share, atol=2.5 / 400)  # either end of a share falls between two offsets
+
+
+def test_weights_of_the_blind_filter_by_hand():
+    """Every weight is the old one, or 1 / N after a resampling, times the density of the reading."""
+    model, n = _oscillator(), 40
+    seq = _linear_data(model)
+    rows = seq.t.shape[0]
+    blind = Potentials(jnp.zeros((rows, 2)), jnp.zeros((rows, 2, 2)), jnp.zeros((rows, 2)))
+    run = eqx.filter_jit(lambda m, s, key: particle_filter(m, blind, s, num_particles=n, key=key, dtype=float))
+    h = run(model, seq, jax.random.key(6))
+    x, f = (np.asarray(h.scale)[:, None] * np.asarray(a) for a in (h.x, h.f))
+    a, b, u = np.asarray(model.matrix), np.asarray(model.drive), np.asarray(seq.u)
+    np.testing.assert_allclose(f[:-1], (a @ x + (b * u)[:, :, None])[:-1], rtol=1e-9, atol=1e-12)
+    w, total, resampled = np.full(n, 1 / n), 0.0, 0
+    for k in range(rows):
+        if np.any(np.asarray(h.ancestors[k]) != np.arange(n)):
+            w, resampled = np.full(n, 1 / n), resampled + 1
+        if not np.isnan(seq.y[k, 0]):
+            w = w * scipy.stats.norm.pdf(seq.y[k, 0], x[k, 0], 0.1)
+        total += np.log(w.sum())
+        w = w / w.sum()
+        np.testing.assert_allclose(np.exp(h.log_w[k]), w, rtol=1e-9)
+    assert 2 < resampled < rows - 2
+    assert float(h.loglik) == pytest.approx(total, rel=1e-9)
 
 
 @functools.cache

@@ -293,7 +293,7 @@ def test_fit_of_parameters_alone_is_ridge_regression():
 
 def test_sequences_that_are_not_used_have_no_weight(slides):
     """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
-    model, data, posterior, _ = slides
+    model, data, posterior, each = slides
     rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), shape=model.log_q, linearise=Tangent())
     read = eqx.filter_jit(jax.vmap(lambda p, s: readings_at(model, p, s)))(posterior, data)
     here = locals_along(model, MASS, posterior.state, data, Tangent())
@@ -312,4 +312,5 @@ def test_sequences_that_are_not_used_have_no_weight(slides):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)  # sums in another order
     (_, once), (_, twice) = step([0, 2, 1, 1], [True, True, False, False]), step([0, 2, 0, 2], [True] * 4)
     prior = np.eye(1)  # of the mass
+    np.testing.assert_allclose(once - prior, each.information[0, -1:, -1:] + each.information[2, -1:, -1:], rtol=1e-9)
     np.testing.assert_allclose(twice - prior, 2 * (once - prior), rtol=1e-9)

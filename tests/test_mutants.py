@@ -13,12 +13,10 @@ OFTEN = (
     "gain of the backward pass transposed",
     "process noise left out",
     "input one row late",
-    "lag-one covariance: gain transposed",
     "a missing reading taken for 0",
     "log weight of the readings missing",
     "backward weights not normalised",
     "M-step without its prior",
-    "nuisance not projected out of the score",
 )
 """The others: `benchmarks/mutation.py`."""
 CHOSEN = [mutant for mutant in MUTANTS if mutant.what in OFTEN]
@@ -36,9 +34,9 @@ def test_every_mutant_is_a_change_of_one_place_and_names_a_test():
 
 
 def test_a_copy_is_green(tmp_path):
-    tests = sorted({mutant.test for mutant in CHOSEN})
-    found = run(copy(tmp_path), *tests)
-    assert (found.passed, found.failed) == (len(tests), 0), found.said
+    """The first two of their tests: the whole suite runs them all on the package itself."""
+    found = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN[:2]))
+    assert (found.passed, found.failed) == (2, 0), found.said
 
 
 @pytest.mark.parametrize("mutant", CHOSEN, ids=lambda mutant: mutant.what.replace(" ", "-"))

@@ -157,9 +157,8 @@ def _unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments
     except UnrollError as error:
         raise ExportError(f"{error}; use {STEP}") from None
     rng, space = np.random.default_rng(0), {"np": np}
-    places = [
-        np.where(a == 0, 3.0, 0.1 * np.asarray(a)) * rng.normal(size=(4, *a.shape)) + a for a in arguments.values()
-    ]
+    centres = [np.asarray(a) for a in arguments.values()]
+    places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
     wanted = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):

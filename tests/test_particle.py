@@ -355,8 +355,11 @@ def test_normals_of_other_rows_times_and_keys_are_independent():
 
 
 def test_normals_keep_double_precision():
-    z = normals(jax.random.key(1), jnp.asarray(3), 3, 50, jnp.float64)
-    assert len(z) == 3 and z[0].dtype == jnp.float64
+    draw = jax.vmap(lambda t: jnp.stack(normals(jax.random.key(1), t, 3, 1001, jnp.float64)))
+    z = np.asarray(jax.jit(draw)(jnp.arange(20)))
+    assert z.dtype == np.float64
+    assert np.mean(z == z.astype(np.float32)) < 1e-3
+    assert scipy.stats.kstest(z.ravel(), "norm").pvalue > 1e-3
 
 
 def test_uniforms_are_uniform():

@@ -74,7 +74,7 @@ def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
-    """Write columns of one length, 12 digits (a late clock: all), NaN as an empty field; the file is whole or not there.
+    """Write columns of one length, 12 digits (a late clock: all), NaN as an empty field; the file is whole or absent.
 
     Raises DataError if the lengths differ or a value is infinite.
     """

@@ -47,7 +47,11 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     jax.distributed.initialize(coordinator, count, index, initialization_timeout=PATIENCE)
     parallel.use_every_device()
     if index == 0:
-        sys.exit(cli.main(command))
+        status = cli.main(command)
+        if status == 130:
+            os._exit(status)  # it has said what is kept; jax.distributed would wait for the others here
+        sys.exit(status)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # or the first one would wait for this one and say nothing
     place = command.index("--out") + 1
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:

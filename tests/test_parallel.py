@@ -93,12 +93,11 @@ def run(count):
     arrays = eqx.filter((state.best, state.hessian, state.loglik), eqx.is_array_like)
     return np.concatenate([np.ravel(a) for a in jax.tree.leaves(arrays)])
 one = run(1)
-# sums in another order, 1e-16 of each, which two Newton steps of condition 1e6 or so pass on
+# sums in another order: 2e-14 after two epochs, and other machines may add in yet another one
 for count in (2, 4):
-    print("DEV", count, np.max(np.abs(run(count) - one) / (1 + np.abs(one))))
-    np.testing.assert_allclose(run(count), one, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run(count), one, rtol=1e-12, atol=1e-12)
 GaussianSmoother.room = 1
-np.testing.assert_allclose(run(2), one, rtol=1e-9, atol=1e-9)
+np.testing.assert_allclose(run(2), one, rtol=1e-12, atol=1e-12)
 """
 
 
@@ -136,7 +135,6 @@ def test_processes_agree(rig, tmp_path):
     assert len(one) > 5
     for count in (2, 4):
         for name, value in _numbers(tmp_path / str(count)).items():
-            print("PROC", name, np.max(np.abs(value - one[name]) / (1 + np.abs(one[name])), initial=0.0))
             # as over devices; the Hessian in the file is a sum over all rows, and as much larger
             np.testing.assert_allclose(value, one[name], rtol=1e-8, atol=1e-8, err_msg=name)
 

@@ -288,6 +288,71 @@ def test_weights_of_the_blind_filter_by_hand():
     assert float(h.loglik) == pytest.approx(total, rel=1e-9)
 
 
+class _Escape(_Oscillator):
+    """A walk whose drift doubles back near 0 and runs away beyond 1: x + x^3 dt."""
+
+    def transition(self, x, u):
+        return x + 2.0 * x**3
+
+
+def _escape(start):
+    """A gap of 10 rows between readings near 0: who leaves [-1, 1] in it is no number at its end."""
+    model = _Escape(
+        jnp.zeros((1, 1)), jnp.zeros(1), Gaussian(jnp.array([start]), jnp.array([[0.01]])),
+        2 * jnp.log(jnp.array([0.08])), 2 * jnp.log(jnp.array([0.1])),
+    )  # fmt: skip
+    t = 0.1 * np.arange(16)
+    y = np.where((t > 0.25) & (t < 1.25), np.nan, 0.0)[:, None]
+    seq = Dataset(*map(jnp.asarray, (t, np.zeros((16, 1)), y, np.ones(16, bool))))
+    path, zero = jnp.zeros((16, 1)), jnp.zeros((16, 1, 1))
+    return model, seq, Potentials(path, zero, path)
+
+
+def _escaped(start, dtype, count=300):
+    model, seq, potentials = _escape(start)
+
+    def run(key):
+        history = particle_filter(model, potentials, seq, num_particles=count, key=key, dtype=dtype)
+        paths = [ffbs(history, rule, num_paths=50, key=key) for rule in BACKWARD.values()]
+        return history, paths
+
+    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(2), 20))
+
+
+def _density_on_a_grid(start):
+    """log p(y) of `_escape`, by sums over 4001 states; beyond 3 nothing comes back."""
+    model, seq, _ = _escape(start)
+    grid = np.linspace(-3, 3, 4001)
+    (q, r), y = (float(jnp.exp(a[0])) for a in (model.log_q, model.log_r)), np.asarray(seq.y)[:, 0]
+    gauss = lambda e, v: np.exp(-0.5 * e**2 / v) / np.sqrt(2 * np.pi * v)  # noqa: E731
+    move = gauss(grid[:, None] - (grid + 2 * grid**3)[None], q) * (grid[1] - grid[0])
+    p, loglik = gauss(grid - start, 0.01), 0.0
+    for k in range(16):
+        p = move @ p if k else p
+        p = p if np.isnan(y[k]) else p * gauss(y[k] - grid, r)
+        mass = p.sum() * (grid[1] - grid[0])
+        loglik, p = loglik + np.log(mass), p / mass
+    return loglik
+
+
+@pytest.mark.parametrize("dtype", (jnp.float32, jnp.float64))
+def test_a_particle_that_runs_away_leaves_the_others_alone(dtype):
+    history, paths = _escaped(0.0, dtype)
+    assert np.any(np.isneginf(history.log_w))  # there are some
+    loglik = np.asarray(history.loglik)
+    error = 4 * np.std(loglik, ddof=1) / np.sqrt(20)
+    # the log of an unbiased estimate is low by half its variance
+    assert abs(np.mean(loglik) + 0.5 * np.var(loglik) - _density_on_a_grid(0.0)) < error
+    for x, kick in paths:
+        assert np.max(np.abs(x)) < 1.5 and np.max(np.abs(kick)) < 1.0
+
+
+def test_where_no_particle_is_left_the_likelihood_is_nothing():
+    history, paths = _escaped(5.0, jnp.float32, 20)
+    assert np.all(np.isneginf(history.loglik))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((paths, history.ess)))
+
+
 @functools.cache
 def _acrobot():
     """The paper's acrobot with gaps: two samplers on one filter."""
@@ -373,8 +438,11 @@ def test_normals_of_other_rows_times_and_keys_are_independent():
 
 
 def test_normals_keep_double_precision():
-    z = normals(jax.random.key(1), jnp.asarray(3), 3, 50, jnp.float64)
-    assert len(z) == 3 and z[0].dtype == jnp.float64
+    draw = jax.vmap(lambda t: jnp.stack(normals(jax.random.key(1), t, 3, 1001, jnp.float64)))
+    z = np.asarray(jax.jit(draw)(jnp.arange(20)))
+    assert z.dtype == np.float64
+    assert np.mean(z == z.astype(np.float32)) < 1e-3
+    assert scipy.stats.kstest(z.ravel(), "norm").pvalue > 1e-3
 
 
 def test_uniforms_are_uniform():

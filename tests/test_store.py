@@ -107,7 +107,7 @@ def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
 
 
 def test_a_path_may_be_a_string(tmp_path):
-    fitted = _fitted(RIGS[0])
+    fitted = _fitted(next(iter(RIGS)))
     save(f"{tmp_path}/model.npz", fitted)
     assert _bits(load(f"{tmp_path}/model.npz")) == _bits(fitted)
 

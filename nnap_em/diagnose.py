@@ -197,9 +197,9 @@ def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: i
             f"The training data ask for {names}, but on test data the 1 s prediction error of {column} does not fall "
             f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
         )
-    return (
-        f"{text}; with {it} the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g} on test data."
-    )
+    rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
+    falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
+    return f"{text}; with {it} {listed([falls, *rising])} on test data."
 
 
 def listed(names: Sequence[str]) -> str:

@@ -109,6 +109,8 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     error = {"horizons_s": [1.0], "before": {"theta1": [0.2]}, "after": {"theta1": [0.1]}}
     assert "falls from 0.2 to 0.1" in verdict(found, error)
     assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
+    mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
+    assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
     assert verdict(found, None) == "The model lacks payload at joint 2."
     several = [Finding(catalogue["payload"](jnp.zeros(()), j), {}, {}, (), "") for j in (1, 2, 1)]
     assert verdict(several, error).startswith(

@@ -76,8 +76,8 @@ def table(told: dict[str, list[dict[str, Any] | None]]) -> str:
 
 
 def figure(told: dict[str, list[dict[str, Any] | None]]) -> Figure:
-    """Prediction error over the horizon, before and after, one panel per rig."""
-    rows = {rig: whole for rig, (whole, *_) in told.items() if whole}
+    """Prediction error over the horizon, before and after, one panel per rig on which something was found."""
+    rows = {rig: whole for rig, (whole, *_) in told.items() if whole and whole["effects"]}
     drawn = Figure(figsize=(2.3 * max(len(rows), 2), 2.8), layout="constrained")
     panels = drawn.subplots(1, len(rows), squeeze=False, sharey=True)[0]
     for ax, (rig, report) in zip(panels, rows.items(), strict=True):

@@ -7,15 +7,11 @@ import pytest
 from mutants import MUTANTS, ROOT, copy, run
 
 OFTEN = (
-    "sign of the Coriolis torque",
     "sign of friction",
-    "weights of the Runge-Kutta stages",
     "gain of the backward pass transposed",
-    "process noise left out",
     "input one row late",
     "a missing reading taken for 0",
     "log weight of the readings missing",
-    "backward weights not normalised",
     "M-step without its prior",
 )
 """The others: `benchmarks/mutation.py`."""

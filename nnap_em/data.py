@@ -86,10 +86,10 @@ def read_logs(folder: Path, rig: Rig, *, trust: bool = False) -> Logs:
     """
     files = log_files(folder)
     tables = [_read_table(path, rig) for path in files]
-    found = [] if trust else [rough(table.readings(rig), rig.dt) for table in tables]
+    found = [[] if trust else rough(table.readings(rig), rig.dt) for table in tables]
     if limits := {limit for table, each in zip(tables, found, strict=True) for limit in table.limits(each, rig)}:
         found = [rough(table.readings(rig), rig.dt, limits) for table in tables]
-    sequences = [_sequence(table, each, rig) for table, each in zip(tables, found or [[]] * len(tables), strict=True)]
+    sequences = [_sequence(table, each, rig) for table, each in zip(tables, found, strict=True)]
     data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
     unmasked = pad([s.as_read for s in sequences]) if masked else None
     return Logs(tuple(path.name for path in files), data, (*rig.input_columns, *rig.measured), masked, unmasked)

@@ -65,7 +65,7 @@ def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = 
     return found
 
 
-def _without(y: Float[np.ndarray, " time"], *rows: Int[np.ndarray, " row"]) -> Float[np.ndarray, " time"]:
+def _without(y: Float[np.ndarray, " time"], *rows: Int[np.ndarray, "_"]) -> Float[np.ndarray, " time"]:
     """The readings, those of some rows as missing."""
     out = np.array(y)
     out[np.concatenate([np.zeros(0, int), *rows])] = np.nan
@@ -168,8 +168,8 @@ def _stands_out(
     rest, freedom = float(left[keep] @ left[keep]), int(keep.sum()) - base.shape[1]
     spread = max(sigma, math.sqrt(rest / max(freedom, 1)))
     strict *= _END if end else 1.0 if run.size == 1 else _SHORT
-    least = strict * max(1.1 * SPIKE * spread, _RESTLESS * _activity(y, run, sigma))
-    if np.any(np.abs(left[~keep]) < least):
+    size = float(np.min(np.abs(left[~keep]))) / strict
+    if size < 1.1 * SPIKE * spread or size < _RESTLESS * _activity(y, run, sigma):
         return False
     return end or _without_a_break(x, base, y[rows]) > 1.5 * rest + _MARGIN * sigma**2
 
@@ -268,10 +268,12 @@ def _jumps(y: Float[np.ndarray, " time"], run: _Run) -> bool:
 
 
 def _alive(y: Float[np.ndarray, " time"], run: _Run) -> bool:
-    """Whether the readings right before and right after the run are as noisy as elsewhere."""
-    sides = (part[np.isfinite(part)] for part in (y[: run.first][::-1], y[run.end :]))
-    scatter = [float(np.median(np.abs(np.diff(side[:8], 2)))) for side in sides if side.size >= 8]
-    return bool(scatter) and min(scatter) > noise(y) / 3
+    """Whether the readings right before and right after the run are noise, as elsewhere: no creep, no steps."""
+    sides = [part[np.isfinite(part)][:10] for part in (y[: run.first][::-1], y[run.end :])]
+    sides = [side for side in sides if side.size >= 8]
+    bend, turn = (np.array([np.std(np.diff(side, n)) for side in sides]) for n in (2, 3))
+    least = max(noise(y) / 3, 3 * _quantum(y))
+    return len(sides) > 0 and bool(np.all((bend > least) & (turn > bend)))
 
 
 def _partner(name: str, readings: Columns) -> str | None:
@@ -311,13 +313,16 @@ def _quantum(y: Float[np.ndarray, " time"]) -> float:
 
 
 def _beyond(name: str, readings: Columns, run: _Run, sign: float, dt: float) -> bool:
-    """Whether it went beyond its limit: by the other column, or else by the trends before and after."""
+    """Whether it went beyond its limit: by the other column, or by the trends before and after.
+
+    A rate denies what the trends of its coordinate say: a machine at a stop comes and goes as fast.
+    """
     y = readings[name]
     before, after = y[max(run.first - 6, 0) : run.first], y[run.end : run.end + 6]
     if np.isfinite(before).sum() < 4 or np.isfinite(after).sum() < 4:
         return False
     away = _travel(name, readings, run, dt)
-    if away is not None:
+    if away is not None and (float(np.max(sign * away)) > 1.0 or _partner(name, readings) == f"d{name}"):
         return float(np.max(sign * away)) > 1.0
     reach = min(run.length / 2, 3.0)
     slopes = np.array([_slope(before), -_slope(after)])

@@ -35,10 +35,10 @@ def _found(readings: Columns) -> dict[tuple[str, str], set[int]]:
     return {(entry.kind, entry.column): set(entry.rows.tolist()) for entry in rough(readings, DT)}
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 10**6), level=st.sampled_from(LEVELS), step=st.sampled_from([0.0, 1e-3, 0.05]))
 def test_smooth_motion_is_left_alone(seed, level, step):
-    """No alarm among 60 x 1002 readings with Gaussian noise, none, or steps; each costs 1e-8 by the threshold."""
+    """No alarm among 40 x 1002 readings with Gaussian noise, none, or steps; each costs 1e-8 by the threshold."""
     readings = _motion(seed, level)
     if step:
         readings["theta1"] = step * np.round(readings["theta1"] / step)
@@ -85,15 +85,15 @@ def test_an_impact_is_no_spike(level):
 
 
 RIGS = {
-    "hard stop": plant.Case(effects=plant.STRONG["hard_stop"], sequences=2, tests=0, hidden=False),
-    "backlash": plant.Case(effects=plant.STRONG["backlash"], sequences=1, tests=0, noise=(1e-4, 1e-3)),
-    "steps": plant.Case(effects=plant.STRONG["sensor_quantization"], sequences=2, tests=0),
+    "hard stop": plant.Case(effects=plant.STRONG["hard_stop"], sequences=1, tests=1, hidden=False),
+    "backlash": plant.Case(effects=plant.STRONG["backlash"], sequences=1, tests=1, noise=(1e-4, 1e-3)),
+    "steps": plant.Case(effects=plant.STRONG["sensor_quantization"], sequences=1, tests=1),
     "pre-sliding": plant.Case(
         system="slide",
         effects=({"name": "presliding_friction", "joint": 1, "sigma0": 300.0},),
-        sequences=2,
-        tests=0,
-        noise=(0.0, 0.0),
+        sequences=1,
+        tests=1,
+        noise=(1e-5, 1e-5),
         hidden=False,
     ),
 }
@@ -101,14 +101,9 @@ RIGS = {
 
 @pytest.mark.parametrize("case", RIGS.values(), ids=RIGS)
 def test_what_machines_do_is_left_alone(case, tmp_path):
-    plant.write(case._replace(steps=300), tmp_path)
+    plant.write(case._replace(steps=200), tmp_path)
     logs = read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs))  # a warning would be an error
     assert (logs.masked, logs.as_read) == ((), logs.data)
-
-
-def test_every_measured_training_log_is_left_alone(shared):
-    for path in sorted((shared / "data/measured").glob("*/rig.toml")):
-        assert read_logs(path.parent / "train", read_rig(path, specs)).masked == ()
 
 
 @pytest.mark.parametrize("name", NOISE)
@@ -209,7 +204,9 @@ def test_what_is_masked_is_said_and_kept_aside(tmp_path):
     trusted, silence = _read(tmp_path, trust=True)
     assert (silence, trusted.masked) == ([], ())
     np.testing.assert_array_equal(trusted.data.y, logs.as_read.y)
-    for one, other in zip((logs.data.t, logs.data.u, logs.data.valid), trusted.data[:2] + trusted.data[3:], strict=True):
+    for one, other in zip(
+        (logs.data.t, logs.data.u, logs.data.valid), trusted.data[:2] + trusted.data[3:], strict=True
+    ):
         np.testing.assert_array_equal(one, other)
 
 

@@ -157,7 +157,7 @@ def detection(logs: Logs, done: dict[str, Spoilt]) -> tuple[int, int, int, int]:
     found = there = false = cut = 0
     for file, y in zip(logs.files, np.asarray(logs.data.y), strict=True):
         log = done[file]
-        cut += sum(entry.count for entry in logs.masked if entry.file == file and entry.kind == "cut")
+        cut += sum(entry.amount for entry in logs.masked if entry.file == file and entry.kind == "cut")
         for column, wrong in zip(np.moveaxis(y, -1, 0), log.wrong.values(), strict=True):
             last = int(np.asarray(logs.data.valid)[logs.files.index(file)].sum())
             masked, kept = np.isnan(column[:last]), log.kept[:last]

@@ -118,13 +118,13 @@ def _rough(train: Logs) -> Iterator[Finding]:
     total = int(np.asarray(train.data.valid).sum())
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
         here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
-        count, what = sum(entry.count for entry in here), f"{column}: " if column else ""
+        count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
         text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
-        yield Finding(_mark(True, count > 0.3 * total), "rough", f"{text}, most in {max(here, key=_count).file}")
+        yield Finding(_mark(True, count > 0.3 * total), "rough", f"{text}, most in {max(here, key=_amount_of).file}")
 
 
-def _count(entry: Masked) -> int:
-    return entry.count
+def _amount_of(entry: Masked) -> int:
+    return entry.amount
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[Finding]:

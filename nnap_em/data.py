@@ -55,7 +55,7 @@ class Masked(NamedTuple):
     """The first one in the file, counted from 1 under the header."""
     time: float
     """Of that row [s]."""
-    count: int
+    amount: int
     """Readings, or rows."""
 
 

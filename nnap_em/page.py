@@ -433,7 +433,7 @@ def _masked(entries: Sequence[Mapping[str, Any]]) -> str:
     head = "".join(f"<th>{h}</th>" for h in ("file", "column", "what", "how many", "first at"))
     rows = []
     for e in entries:
-        told = (f"{e.get('part')}/{e.get('file')}", e.get("column") or "all", e.get("kind"), e.get("count"))
+        told = (f"{e.get('part')}/{e.get('file')}", e.get("column") or "all", e.get("kind"), e.get("amount"))
         cells = "".join(f"<td>{escape(str(cell))}</td>" for cell in told)
         rows.append(f"<tr>{cells}<td>{number(e.get('time'), 4)} s</td></tr>")
     return (

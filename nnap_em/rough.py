@@ -6,6 +6,7 @@ kink in its place, another column or a jump that contradicts a stuck sensor, a t
 
 import math
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -240,7 +241,7 @@ def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, 
     """`rows` with the holes of up to `hole` rows between them: what is let through there was chosen by its noise."""
     k = np.flatnonzero(rows)
     out = rows.copy()
-    for a, b in zip(k[:-1], k[1:], strict=True):
+    for a, b in pairwise(k.tolist()):
         if b - a <= hole + 1:
             out[a:b] = True
     return out

@@ -198,7 +198,7 @@ def test_what_is_masked_is_said_and_kept_aside(tmp_path):
     assert "--trust-readings" in said
     (entry,) = logs.masked
     assert entry[:4] == ("01.csv", "spike", "theta1", 41)
-    assert (entry.time, entry.count) == (0.4, 2)
+    assert (entry.time, entry.amount) == (0.4, 2)
     assert np.argwhere(np.isnan(logs.data.y[0])).tolist() == [[40, 0], [90, 0]]
     np.testing.assert_allclose(logs.as_read.y[0, :, 0], columns["theta1"], rtol=1e-9)
     trusted, silence = _read(tmp_path, trust=True)
@@ -219,7 +219,7 @@ def test_lost_rows_come_back_without_readings(tmp_path):
     np.testing.assert_allclose(logs.data.t[0], columns["time"], atol=1e-9)
     np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], atol=1e-4)
     np.testing.assert_array_equal(np.isnan(logs.data.y[0]).all(axis=1), ~kept)
-    assert [(m.kind, m.row, m.count) for m in logs.masked] == [("gap", 51, 11)]
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("gap", 51, 11)]
 
 
 def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
@@ -230,7 +230,7 @@ def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
     logs, (said,) = _read(tmp_path)
     assert "inputs before these rows were lost and cannot be told" in said
     assert logs.data.valid.sum() == 120
-    assert [(m.kind, m.row, m.count) for m in logs.masked] == [("cut", 121, 76)]
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("cut", 121, 76)]
 
 
 @pytest.mark.parametrize("kept", [np.arange(201) % 3 > 0, (np.arange(201) < 60) | (np.arange(201) > 140)])

@@ -82,7 +82,7 @@ def read_logs(folder: Path, rig: Rig, *, trust: bool = False) -> Logs:
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
-    Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is possible but seldom meant.
+    Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
     files = log_files(folder)
     tables = [_read_table(path, rig) for path in files]

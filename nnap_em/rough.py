@@ -92,7 +92,7 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
 
 
 def noise(y: Float[np.ndarray, " time"]) -> float:
-    """Standard deviation of a reading about the cubic through its neighbours, by the median; at least a step's third."""
+    """Standard deviation of a reading about its neighbours' cubic, by the median; at least a third of a step."""
     left = _left(np.flatnonzero(np.isfinite(y)), y, 1)
     step = np.abs(np.diff(y[np.isfinite(y)]))
     least = float(np.min(step, where=step > 0, initial=math.inf)) / 3
@@ -113,7 +113,7 @@ def _left(k: Int[np.ndarray, " seen"], y: Float[np.ndarray, " time"], length: in
     """Of all runs of `length` among the rows `k` that were read."""
     count = max(k.size - length - 3, 0)
     at = np.arange(count)[:, None]
-    nodes, inner = k[at + [0, 1, length + 2, length + 3]], k[at + 2 + np.arange(length)]
+    nodes, inner = k[at + np.array([0, 1, length + 2, length + 3])], k[at + 2 + np.arange(length)]
     usual = float(np.median(np.diff(k))) if k.size > 1 else 1.0
     near = nodes[:, 3] - nodes[:, 0] <= (length + 3) * usual + 4
     nodes, inner = nodes[near], inner[near]

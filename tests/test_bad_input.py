@@ -174,7 +174,7 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
     "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
     "gap of half a row": (
-        _column("time", lambda t: t + 0.005 * (np.arange(t.size) > 4)),
+        _column("time", lambda t: t + 0.004 * (np.arange(t.size) > 4)),
         "line 7, column 'time'",
         "jitter: 0.04",
         "empty field",
@@ -357,7 +357,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         "--trust-readings",
     ),
     "saturated": (
-        _log_file(_column("dtheta1", lambda x: np.minimum(x, 5.0))),
+        _log_file(_column("dtheta1", lambda x: np.maximum(x, -5.0))),
         "column 'dtheta1'",
         "at the end of the sensor's range while the machine goes beyond (saturated)",
         "--trust-readings",

@@ -59,6 +59,13 @@ PAIRS: dict[str, tuple[dict[str, Any], ...]] = {
 }
 NOISES = {"low": (0.002, 0.02), "middle": (0.005, 0.05), "high": (0.01, 0.1)}
 GROUPS = {"strong": plant.STRONG, "weak": plant.WEAK, "outside": OUTSIDE, "variant": VARIANTS, "pair": PAIRS}
+DATA: dict[str, dict[str, Any]] = {
+    "six": {"sequences": 6},
+    "untold": {"declare_noise": False},
+    "missing": {"missing": 0.1},
+}
+"""Other experiments: six sequences instead of twenty, noise that nobody declared, a tenth of the readings empty."""
+WITH = ("torsional_spring", "payload", "air_drag", "cogging", "dead_zone", "input_delay", "clean")
 SILENT = {"torque_offset", "motor_back_emf"}
 """What a learned friction map holds: naming nothing is right."""
 SAME = {
@@ -76,6 +83,7 @@ def all_cases(clean: int = 60) -> list[str]:
         for i, name in enumerate(effects):
             views = ("hidden", "shown") if group in ("strong", "weak") else ("hidden",)
             out += [f"{group}:{name}:{view}:{11 + i}" for view in views]
+    out += [f"{data}:{name}:hidden:{60 + i}" for data in DATA for i, name in enumerate(WITH)]
     out += [f"clean:{noise}:hidden:{100 + i}" for i in range(clean // 3) for noise in NOISES]
     return out
 
@@ -84,14 +92,15 @@ def case_of(name: str) -> plant.Case:
     """The rig of a case."""
     group, effect, view, seed = name.split(":")
     session = effect in plant.SESSION
-    return plant.Case(
-        effects=() if group == "clean" else GROUPS[group][effect],
+    case = plant.Case(
+        effects=() if "clean" in (group, effect) else GROUPS.get(group, plant.STRONG)[effect],
         hidden=view == "hidden",
         noise=NOISES[effect] if group == "clean" else (0.005, 0.05),
         clock="session" if session else "sequence",
         friction_shape="other" if group == "variant" else "stribeck",
         seed=int(seed),
     )
+    return case._replace(**DATA.get(group, {}))
 
 
 def run(name: str, out: Path) -> None:

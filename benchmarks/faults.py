@@ -96,8 +96,10 @@ def main() -> None:
         plant.write(SLIDE, rig)
         for command in ("identify", "diagnose"):
             began = time.perf_counter()
-            if start(command, rig, Path(spare) / command).wait():
-                raise SystemExit(f"{command} fails without a fault")
+            run = start(command, rig, Path(spare) / command)
+            _, said = run.communicate()
+            if run.returncode:
+                raise SystemExit(f"{command} fails without a fault: {said}")
             length, whole = time.perf_counter() - began, numbers(Path(spare) / command)
             total, survived, runs = {"SIGKILL": 0, "SIGINT": 0}, 0, 0
             while sum(total.values()) < args.faults:

@@ -8,7 +8,6 @@ Gaussian (RTS) and with a particle smoother.  Written into `out/acrobot_em/`: th
 """
 
 import argparse
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +22,7 @@ from nnap_em.blackbox import GradientMStep, build_network, forecast
 from nnap_em.build import build
 from nnap_em.data import Dataset
 from nnap_em.em import EMState, Schedule, e_step, fit, start_state
+from nnap_em.files import cores
 from nnap_em.mstep import AbstractMStep
 from nnap_em.parallel import use_every_device
 from nnap_em.particle import Guided, ParticleSmoother
@@ -343,7 +343,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    jax.config.update("jax_num_cpu_devices", cores())
     use_every_device()
     jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".cache" / "jax"))
     effort = QUICK if options.quick else Effort()

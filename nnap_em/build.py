@@ -14,9 +14,11 @@ from .friction import FrictionNetwork, NoFriction
 from .gaussian import Gaussian
 from .model import StateSpaceModel
 from .mstep import ParameterPrior, ScoringMStep
-from .rig import Rig
+from .rig import Rig, RigError
 from .smoother import StartBank
 from .systems import AbstractSystem, systems
+
+NO_MACHINE = "the declared masses and inertias make no machine"
 
 
 class Scales(NamedTuple):
@@ -39,11 +41,18 @@ class Problem(NamedTuple):
 
 
 def build_system(rig: Rig, dtype=float) -> AbstractSystem:
-    """The declared physics, at the mean of what is uncertain."""
+    """The declared physics, at the mean of what is uncertain.
+
+    Raises RigError where its mass matrix is not positive definite.
+    """
     kind = systems[rig.system]
     names = [f.name for f in dataclasses.fields(kind) if f.name != "joints"]
     values = {n: rig.parameters[n].mean if n in rig.parameters else kind.optional[n] for n in names}
-    return kind(**{n: jnp.asarray(v, dtype) for n, v in values.items()}, joints=rig.input_joints)
+    system = kind(**{n: jnp.asarray(v, dtype) for n, v in values.items()}, joints=rig.input_joints)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(kind.coordinates)))
+    if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, dtype)))).min() <= 0:
+        raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
+    return system
 
 
 def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:

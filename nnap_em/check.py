@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from .build import Scales, build, measure_scales, reading_noise
+from .build import NO_MACHINE, Scales, build, measure_scales, reading_noise
 from .data import Dataset, Logs, Masked, horizon
 from .formats import Array
 from .friction import NoFriction
 from .model import StateSpaceModel
-from .rig import Rig
+from .rig import Rig, RigError
 from .smoother import CubatureSmoother, StartBank
 from .systems import AbstractSystem
 from .tables import state_unit
@@ -52,7 +52,10 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
     if amount[0].mark == BAD:
         return amount
-    problem = build(rig, data, key=key)
+    try:
+        problem = build(rig, data, key=key)
+    except RigError:
+        return [Finding(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))

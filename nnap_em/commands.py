@@ -30,7 +30,7 @@ from .diagnose import findings
 from .draft import draft
 from .em import EMState, FitError
 from .export import ExportError, export
-from .files import StoreError, replace_bytes, replace_text, sweep
+from .files import StoreError, cores, replace_bytes, replace_text, sweep
 from .formats import DataError, DataWarning, has_logs, write_csv
 from .identify import FrictionTable, Identified, begin, friction_table, identify, parameter_table
 from .journal import Journal, keeping
@@ -79,9 +79,10 @@ class Epoch(NamedTuple):
 def set_up() -> None:
     """64-bit numbers, every core, and compiled programs kept for the next call if there is a place for them."""
     jax.config.update("jax_enable_x64", True)
-    if not jax.distributed.is_initialized() and "JAX_NUM_CPU_DEVICES" not in os.environ:  # or they are dealt out
-        with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
-            jax.config.update("jax_num_cpu_devices", min(MOST, len(os.sched_getaffinity(0))))
+    if not jax.distributed.is_initialized():  # or they are dealt out
+        if "JAX_NUM_CPU_DEVICES" not in os.environ:
+            with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
+                jax.config.update("jax_num_cpu_devices", min(MOST, cores()))
         use_every_device()
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return

@@ -78,13 +78,13 @@ class Logs:
         return f"Logs {self.files[0]} to {self.files[-1]}: {', '.join(self.columns)}; {self.data}"
 
 
-def read_logs(folder: Path, rig: Rig, *, trust: bool = False) -> Logs:
+def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False) -> Logs:
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
     Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
-    files = log_files(folder)
+    files = log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]
     found = [[] if trust else rough(table.readings(rig), rig.dt) for table in tables]
     if limits := {limit for table, each in zip(tables, found, strict=True) for limit in table.limits(each, rig)}:

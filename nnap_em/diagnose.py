@@ -178,7 +178,8 @@ def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: i
         )
     if not found:
         return "Nothing is missing that these data could show: the declared model explains them."
-    names = " and ".join(words(key_of(f.effect)) for f in found)
+    names = listed([words(key_of(f.effect)) for f in found])
+    it = "it" if len(found) == 1 else "them"
     text = f"The model lacks {names}"
     if not error:
         return text + "."
@@ -194,9 +195,16 @@ def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: i
     if after >= before:
         return (
             f"The training data ask for {names}, but on test data the 1 s prediction error of {column} does not fall "
-            f"with it ({before:.3g} before, {after:.3g} after): do not trust it."
+            f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
         )
-    return f"{text}; with it the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g} on test data."
+    return (
+        f"{text}; with {it} the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g} on test data."
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a sentence lists them."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:

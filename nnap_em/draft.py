@@ -74,14 +74,14 @@ def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Dr
     Raises DataError where the log cannot be read or the system not be told.
     """
     table = _numbers(path)
-    columns = [_meaning(name) for name in table]
-    system = system or _system(path, columns)
+    columns = _from_one([_meaning(name) for name in table])
+    system = system or _system(path, columns, specs)
     spec = specs[system]
     measured = [name for name in table if name in spec.states]
     name = toml_text(path.resolve().parent.name or "rig")
     lines = [
         *_model(system, spec),
-        *_input(system, spec, columns),
+        *_input(spec, columns),
         *_sampling(table, columns),
         *_measurement(table, measured, spec),
     ]
@@ -112,37 +112,58 @@ def _meaning(name: str) -> _Column:
             number = int(match[1]) if match[1].isdigit() else None
             if "theta" in kind and number is None and word in _EITHER:
                 continue
-            state = f"{kind.strip()}{number or 1}" if "theta" in kind else kind
+            state = f"{kind.strip()}{1 if number is None else number}" if "theta" in kind else kind
             return _Column(name, state, number, unit if _UNITS.get(unit) else "")
     return _Column(name, "", None, "")
 
 
-def _system(path: Path, columns: Sequence[_Column]) -> str:
+def _from_one(columns: Sequence[_Column]) -> list[_Column]:
+    """The joints of states, and those of inputs, counted from 1 where names count them from 0."""
+    shift = {c.kind == "input" for c in columns if c.number == 0}
+
+    def one(c: _Column) -> _Column:
+        if c.number is None or (c.kind == "input") not in shift:
+            return c
+        return c._replace(number=c.number + 1, kind=re.sub(r"\d$", str(c.number + 1), c.kind))
+
+    return [one(column) for column in columns]
+
+
+def _system(path: Path, columns: Sequence[_Column], specs: Mapping[str, SystemSpec]) -> str:
     """The system that the names call for."""
     kinds = {column.kind for column in columns}
-    if kinds & {"x", "dx"}:
+    angles = any("theta" in kind for kind in kinds)
+    if kinds & {"x", "dx"} and not angles:
         return "slide"
-    if kinds & {"theta2", "dtheta2"}:
+    if kinds & {"theta2", "dtheta2"} and not kinds & {"x", "dx"}:
         return "pendubot" if [c.number for c in columns if c.kind == "input"] == [1] else "acrobot"
-    angle = kinds & {"theta1", "dtheta1"}
-    found = "theta1 may be of a pendulum or of an arm with a hidden joint" if angle else "no column is named as a state"
-    raise DataError(f"{path}: line 1: {found}; give --system acrobot, pendubot, pendulum or slide")
+    if kinds & {"x", "dx"}:
+        found = "a coordinate x and an angle are of no machine that is known by its columns"
+    elif angles:
+        found = "theta1 may be of a pendulum or of an arm with a hidden joint"
+    else:
+        found = "no column is named as a state"
+    raise DataError(f"{path}: line 1: {found}; give --system {', '.join(sorted(specs))}")
 
 
 def _model(system: str, spec: SystemSpec) -> Iterator[str]:
     yield from ("[model]", f"type = {toml_text(system)}")
     yield "# A number is trusted; { mean = 0.2, std = 0.02 } is estimated, with that belief."
     for name in spec.parameters:
-        what = f"{parameter_unit(name)}: {_PARAMETERS[name.rstrip('12')]}"
+        what = _what(name)
         yield f"g = 9.81    # {what}" if name == "g" else f"# {name} = ...    # {what}"
     for name, value in spec.optional.items():
-        yield f"# {name} = {value:g}    # {parameter_unit(name)}: {_PARAMETERS[name]}; may be left out"
+        yield f"# {name} = {value:g}    # {_what(name)}; may be left out"
     yield 'friction = "unknown"    # learned in every joint; or "none"'
 
 
-def _input(system: str, spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
-    usual = 2 if system == "acrobot" else 1
-    found = [(c.name, c.number or usual) for c in columns if c.kind == "input"]
+def _what(name: str) -> str:
+    """The unit of a parameter, and what it is where its name is a usual one."""
+    return ": ".join(filter(None, (parameter_unit(name), _PARAMETERS.get(name.rstrip("0123456789")))))
+
+
+def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
+    found = [(c.name, spec.driven if c.number is None else c.number) for c in columns if c.kind == "input"]
     found = [(name, joint) for name, joint in found if joint <= spec.joints]
     names = f"[{', '.join(toml_text(name) for name, _ in found)}]" if found else "..."
     joints = str([joint for _, joint in found]) if found else "..."
@@ -186,6 +207,9 @@ def _measurement(table: Mapping[str, np.ndarray], measured: Sequence[str], spec:
 def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
     """What to rename or convert in the log."""
     names = {column.name for column in columns}
+    for column in columns:
+        if column.number and column.name.strip().endswith(str(column.number - 1)):
+            yield f"column {column.name!r}: counted from 0, so taken for joint {column.number}"
     for column in columns:
         state = column.kind in (*spec.states, "time")
         if not state and column.kind != "input":

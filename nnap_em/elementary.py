@@ -18,22 +18,27 @@ PARTS = {
 }
 """pi / 2 as a sum; the first part has so few digits that a quadrant's number times it is exact [Cody & Waite 1980]."""
 
+FARTHEST = {jnp.dtype(jnp.float32): 1e7, jnp.dtype(jnp.float64): 1e9}
+"""Beyond these [rad] a type has no digits left for the angle, or the sum above not enough."""
+
 
 @jax.custom_jvp
 def sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Sine and cosine together, to 2 units in the last place of 1, for |x| up to 1e4 (float32) or 1e6 (float64) [rad].
 
-    Other types fall back on `jax.numpy`.
+    To 2e-5 up to 1e7 (float32), to 2 units in the last place up to 1e9 (float64); NaN beyond.  Other types fall back
+    on `jax.numpy`.
     """
     return _pair(x) if x.dtype in TERMS else (jnp.sin(x), jnp.cos(x))
 
 
 @jax.jit  # traced once, not for every sine of a model
 def _pair(x):
+    far = jnp.abs(x) > FARTHEST[x.dtype]
     quarter = jnp.round(x * (2 / math.pi))
     for part in PARTS[x.dtype]:
         x = x - quarter * part
-    square = x * x
+    square = jnp.where(far, jnp.nan, x * x)
     sine, cosine = jnp.zeros_like(x), jnp.zeros_like(x)
     for n in reversed(range(TERMS[x.dtype])):
         sine = sine * square + (-1) ** n / math.factorial(2 * n + 1)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from .model import StateSpaceModel
 from .mstep import Weights
 from .rig import parameter_unit
 from .tables import state_unit, write_json
-from .unroll import UnrollError, unroll
+from .unroll import Source, UnrollError, unroll
 
 PARAMETERS, PREDICTOR, STEP = "parameters.json", "predictor.py", "model.stablehlo"
 
@@ -108,14 +109,11 @@ def predictor(fitted: Identified) -> str:
         show = prior.write(model, z).shown
         return show(x, u), jax.jacfwd(show)(x, u)
 
-    try:
-        functions = [
-            unroll("rate", rate, x=x, u=u, force=force, z=z),
-            unroll("reading", reading, x=x, u=u, z=z),
-            unroll("shown", shown, x=x, u=u, z=z),
-        ]
-    except UnrollError as error:
-        raise ExportError(f"{error}; use {STEP}") from None
+    functions = [
+        _unrolled("rate", rate, x=x, u=u, force=force, z=z),
+        _unrolled("reading", reading, x=x, u=u, z=z),
+        _unrolled("shown", shown, x=x, u=u, z=z),
+    ]
     weights = fitted.m_step.weights(model)
     numbers = {
         "states": _states(model),
@@ -147,6 +145,31 @@ def predictor(fitted: Identified) -> str:
     return "\n\n".join(
         [title + usage + units + body.rstrip(), *(f"\n{f}".rstrip() for f in functions), "", model_, tail]
     )
+
+
+def _unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments: Array) -> Source:
+    """`function` in NumPy, compared with JAX at four random places about `arguments`.
+
+    Raises ExportError where there is no such source, or where its numbers are others.
+    """
+    try:
+        source = unroll(name, function, **arguments)
+    except UnrollError as error:
+        raise ExportError(f"{error}; use {STEP}") from None
+    rng, space = np.random.default_rng(0), {"np": np}
+    centres = [np.asarray(a) for a in arguments.values()]
+    places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
+    wanted = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    exec(str(source), space)  # what the exported program does
+    with np.errstate(all="ignore"):
+        found = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
+    for mine, truth in zip((found,) if len(wanted) == 1 else found, wanted, strict=True):
+        flat = np.asarray(truth, np.float64).reshape(4, -1)
+        own = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
+        bound = math.sqrt(jnp.finfo(truth.dtype).eps)
+        if not np.allclose(own, flat, rtol=bound, atol=bound, equal_nan=True):
+            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STEP}")
+    return source
 
 
 def _states(model: StateSpaceModel) -> tuple[str, ...]:

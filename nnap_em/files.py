@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +36,11 @@ class Kind(NamedTuple):
     """The mend for a file of another format."""
     copy: str
     """The mend for a file whose checksum does not hold."""
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def replace_bytes(path: Path, content: bytes) -> None:

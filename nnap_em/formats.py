@@ -40,7 +40,7 @@ def log_files(folder: Path) -> list[Path]:
         found = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
         others = f"; found there: {', '.join(path.name for path in every[:3])}" if every else ""
         raise DataError(f"{folder}: {found}{others}; put one CSV file per sequence there")
-    for one, two in pairwise(files):
+    for one, two in pairwise(sorted(files, key=lambda path: (path.stem, path.name))):
         if one.stem == two.stem:
             raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
     return files
@@ -74,7 +74,7 @@ def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
-    """Write columns of one length, 12 significant digits, NaN as an empty field; the file appears whole or not at all.
+    """Write columns of one length, 12 digits (a late clock: all), NaN as an empty field; the file is whole or absent.
 
     Raises DataError if the lengths differ or a value is infinite.
     """
@@ -82,9 +82,14 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " 
     if len({values.shape for values in table.values()}) != 1 or np.isinf([*table.values()]).any():
         shapes = {name: values.shape for name, values in table.items()}
         raise DataError(f"{path}: columns {shapes}; write finite columns (NaN = missing) of one length")
-    line = ",".join(["%.12g"] * len(table))
+    line = ",".join([_digits(name, values) for name, values in table.items()])
     body = "\n".join([line % row for row in zip(*(values.tolist() for values in table.values()), strict=True)])
     replace_text(path, f"{','.join(table)}\n{body.replace('nan', '')}\n")
+
+
+def _digits(name: str, values: Float[np.ndarray, " time"]) -> str:
+    """12 digits, or all where a clock runs on from so long ago that samples would fall together."""
+    return "%r" if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4 else "%.12g"
 
 
 def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:

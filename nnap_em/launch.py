@@ -1,8 +1,12 @@
 """Several processes for one command: `python -m nnap_em.launch 2 identify FOLDER --out OUT`.
 
-Every process does the same on its share of the sequences; the first one writes and speaks.  For several machines, start
-the same command on each with `--coordinator HOST:PORT --first K`, K being the number of processes before it and the
-first argument the number of all.
+Every process does the same on its share of the sequences; the first one writes and speaks.  For several machines, give
+on each of them
+
+    python -m nnap_em.launch --coordinator HOST:PORT --first K --here N COUNT identify FOLDER --out OUT
+
+HOST is the first machine and PORT free there; K processes run on the machines before this one, N on this one, and COUNT
+in all.  FOLDER is needed on each, and OUT too where the command has --resume.
 """
 
 import argparse
@@ -14,10 +18,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
+
+from .files import cores
 
 PATIENCE = 600
 """How long processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
+
+FAREWELL = 10
+"""How long the first process may take to say what is kept when it is stopped by Ctrl-C [s]."""
 
 
 def free_address() -> str:
@@ -37,7 +47,11 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     jax.distributed.initialize(coordinator, count, index, initialization_timeout=PATIENCE)
     parallel.use_every_device()
     if index == 0:
-        sys.exit(cli.main(command))
+        status = cli.main(command)
+        if status == 130:
+            os._exit(status)  # it has said what is kept; jax.distributed would wait for the others here
+        sys.exit(status)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # or the first one would wait for this one and say nothing
     place = command.index("--out") + 1
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:
@@ -57,6 +71,10 @@ def watch(children: list[subprocess.Popen], first: int) -> int:
                 break
             time.sleep(0.05)
         return _blame(children, first) if any(child.returncode for child in children) else 0
+    except KeyboardInterrupt:  # a terminal sends it to the children, too
+        with suppress(subprocess.TimeoutExpired):
+            children[0].wait(FAREWELL)
+        raise
     finally:
         for child in children:
             if child.poll() is None:
@@ -82,10 +100,12 @@ def _blame(children: list[subprocess.Popen], first: int) -> int:
 
 def main() -> None:
     """Start the processes of this machine."""
-    arguments = argparse.ArgumentParser(prog="python -m nnap_em.launch", description=__doc__)
+    arguments = argparse.ArgumentParser(
+        prog="python -m nnap_em.launch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     arguments.add_argument("processes", type=int, help="how many in all")
     arguments.add_argument("command", nargs=argparse.REMAINDER, help="a command of nnap-em with --out")
-    arguments.add_argument("--coordinator", help="host:port of the first process")
+    arguments.add_argument("--coordinator", help="HOST:PORT of the first process, where there are several machines")
     arguments.add_argument("--first", type=int, default=0, help="processes on machines before this one")
     arguments.add_argument("--here", type=int, help="processes on this machine; all, if not given")
     arguments.add_argument("--work", type=int, nargs=2, help=argparse.SUPPRESS)
@@ -96,8 +116,12 @@ def main() -> None:
         return
     if "--out" not in args.command:
         arguments.error("the command needs --out FOLDER")
+    if args.coordinator and not args.here:
+        arguments.error("--coordinator needs --here N: processes on this machine")
     here = args.here or args.processes
-    threads = max(1, len(os.sched_getaffinity(0)) // here)
+    if not 0 < here <= args.processes - args.first:
+        arguments.error(f"processes {args.first} to {args.first + here - 1} of {args.processes}: check --first, --here")
+    threads = max(1, cores() // here)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     waits = ("xla_cpu_collective_call_terminate_timeout_seconds", "xla_cpu_collective_timeout_seconds")

@@ -4,9 +4,10 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
-from .augment import augment, blocks, extended, proposals, seeded, surroundings
+from .augment import augment, blocks, extended, proposals, seeded, surroundings, without
 from .data import Dataset
 from .effects import AbstractEffect, Candidate, fields, flat
 from .gaussian import Gaussian
@@ -54,8 +55,8 @@ class Rules(NamedTuple):
     """Share of an effect's information, where it was found, that an equivalent one may leave unexplained."""
     loud: float = 5.0
     """Standard deviations of a kick with which a track begins to be lost."""
-    later: int = 8
-    """Rows after that which still count."""
+    later: tuple[int, ...] = (8, 3, 1)
+    """Rows after that which still count; the fewer where the many are too much."""
     even: float = 5.0
     """Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 
@@ -147,19 +148,25 @@ def bar(data: Dataset, rules: Rules) -> float:
 
 def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the named law whose rest an unnamed one is: a function of the same position at the same joint."""
-    if effect.name != "unknown_function" or effect.joint is None:
+    if effect.named or effect.joint is None:
         return None
     if effect.inputs_named() != (model.system.coordinates[effect.joint - 1],):
         return None
     return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
 
 
+def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+    """Place of the law whose place `effect` takes: of the same key in another form, as one that repeats each turn."""
+    alike = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
+    return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
+
+
 def _told(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """Whether an unnamed law in the model is a function of the same position at the same joint."""
     if not effect.place or effect.joint is None:
         return False
-    key = ("unknown_function", effect.joint, None, (model.system.coordinates[effect.joint - 1],))
-    return key in map(key_of, model.effects)
+    own = (model.system.coordinates[effect.joint - 1],)
+    return any(e.joint == effect.joint and e.inputs_named() == own for e in model.effects)
 
 
 def _best_of_kind(
@@ -179,12 +186,13 @@ def _best_of_kind(
 
 def _shortlist(ranked, present: set[Key], model: StateSpaceModel, needed: float, rules: Rules):
     """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
-    fresh = [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > needed]
+    other = [entry for entry in ranked if replaced(entry[1].start, model) is not None and entry[0] > needed]
+    fresh = other + [entry for entry in ranked if key_of(entry[1].start) not in present and entry[0] > needed]
     fresh = [entry for entry in fresh if not _told(entry[1].start, model)]
-    named = [entry for entry in fresh if entry[1].start.name != "unknown_function"]
+    named = [entry for entry in fresh if entry[1].start.named]
     top = named[0][0] if named else 0.0
-    unnamed = [entry for entry in fresh if entry[1].start.name == "unknown_function" and entry[0] > top][:2]
-    beside = [entry for entry in fresh if rest_of(entry[1].start, model) is not None]
+    unnamed = [entry for entry in fresh if not entry[1].start.named and entry[0] > top][:2]
+    beside = other + [entry for entry in fresh if rest_of(entry[1].start, model) is not None and entry not in other]
     unnamed = (beside + [entry for entry in unnamed if entry not in beside])[:2]
     close = [entry for entry in named if entry[0] > rules.near * top]
     return [(c, v) for _, c, v in unnamed + close[: rules.shortlist - len(unnamed)]]
@@ -208,8 +216,11 @@ def _more_starts(entries, candidates: Sequence[Candidate], verdicts: Sequence[Ve
 def _try(
     now: Search, path: Gaussian, data: Dataset, used, candidate: Candidate, verdict: Verdict, rules: Rules
 ) -> Trial:
-    effect = seeded(candidate, verdict.coefficients)
-    model, rule = augment(now.model, now.m_step.early(), effect, candidate)
+    effect, model, rule = seeded(candidate, verdict.coefficients), now.model, now.m_step.early()
+    place = replaced(effect, model)
+    if place is not None:
+        model, rule = without(model, rule, place)
+    model, rule = augment(model, rule, effect, candidate)
     return refit(model, rule, extended(model, path, data), data, used, passes=rules.passes)
 
 
@@ -235,7 +246,7 @@ def _certain(entry: Refitted) -> float:
 
 def _other(candidate: Candidate, chosen: Candidate) -> bool:
     """A named effect of another kind."""
-    return candidate.start.name != "unknown_function" and key_of(candidate.start) != key_of(chosen.start)
+    return candidate.start.named and key_of(candidate.start) != key_of(chosen.start)
 
 
 def look(
@@ -261,7 +272,7 @@ def look(
     for candidate, verdict in entries:
         trial = _try(now, path, data, used, candidate, verdict, rules)
         gain = float(np.sum((np.nan_to_num(trial.loglik, nan=-1e9) - null.loglik)[used]))
-        count = verdict.rank if candidate.start.name == "unknown_function" else len(fields(candidate.start))
+        count = len(fields(candidate.start)) if candidate.start.named else verdict.rank
         shares = zip(candidates, unlike(projected, candidates, candidate), strict=True)
         lost = ((c, share * gain * (share > rules.same)) for c, share in shares)
         alike = tuple((key_of(c.start), nats) for c, nats in lost if _other(c, candidate))
@@ -276,7 +287,7 @@ def look(
     tried.sort(key=lambda e: -e.net)
     step = step._replace(refitted=tuple((key_of(e.effect), e.net) for e in tried))
     sound = [e for e in tried if e.effect.possible() and e.net > bar(data, rules) and _certain(e) > rules.certain]
-    named = [e for e in sound if e.effect.name != "unknown_function"]
+    named = [e for e in sound if e.effect.named]
     if sound and named and sound[0] not in named:
         other = rest_of(sound[0].effect, now.model) is not None and named[0].effect.place
         if named[0].net > (0.9 if other else rules.named) * sound[0].net:
@@ -295,9 +306,12 @@ def held_out_gain(null: Trial, full: Trial, data: Dataset, used, passes: int = 3
     """Gain on sequences after a fit to others, halves or quarters in turn; a sixth at either end is trimmed.
 
     A track that is lost in one of the two fits says nothing of the effect, and would say it loudest.  The noise stays
-    that of the whole fit: a few sequences can be followed more closely than they deserve.
+    that of the whole fit: a few sequences can be followed more closely than they deserve.  From one sequence nothing
+    can be held out, and the gain is 0.
     """
     index = np.flatnonzero(used)
+    if index.size < 2:
+        return 0.0
     gains = []
     folds = 2 if index.size >= 16 else min(4, index.size)
     for fold in range(folds):

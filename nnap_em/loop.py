@@ -34,6 +34,7 @@ from .look import (
     held_out_gain,
     key_of,
     look,
+    replaced,
     rest_of,
     significance,
     trimmed,
@@ -63,7 +64,7 @@ def _followed(
 ) -> tuple[Gaussian, Bool[np.ndarray, " seq"], Bool[np.ndarray, " seq"], Dataset]:
     """Smoothed paths, the sequences that are followed whole and those used, and the data of the latter.
 
-    A sequence that is lost tells most where it is being lost: it is used until a little later.
+    A sequence that is lost tells most where it is being lost: it is used until a little later, as late as it can be.
     """
     smoother = CubatureSmoother(before.bank.padded(now.model.log_q.shape[0]))
     posterior = e_step(now.model, data, smoother, key=before.state.key)
@@ -75,9 +76,15 @@ def _followed(
     loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < rules.loud)
     first = np.where(loud.any(axis=1), loud.argmax(axis=1), data.t.shape[1])
     row = np.arange(data.t.shape[1])
-    cut = data._replace(valid=data.valid & jnp.asarray(whole[:, None] | (row < first[:, None] + rules.later)))
-    posterior = e_step(now.model, cut, smoother, key=before.state.key)
-    return posterior.state, whole, np.asarray(kept(posterior, cut)), cut
+    used, cut = whole, data
+    for later in rules.later:
+        early = data.valid & jnp.asarray(row < first[:, None] + later)
+        cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
+        posterior = e_step(now.model, cut, smoother, key=before.state.key)
+        used = np.asarray(kept(posterior, cut))
+        if used.all():
+            break
+    return posterior.state, whole, used, cut
 
 
 def _chi2_tail(x: float, df: int) -> float:
@@ -121,7 +128,9 @@ def _further(length: int, longest: int) -> int:
 
 def _taken(now: Search, entry: Refitted) -> Search:
     """The search with a candidate in the model."""
-    return Search(entry.trial.model, now_rule(now.m_step, entry.trial.m_step), now.found)
+    place = replaced(entry.effect, now.model)
+    kept = tuple(f for i, f in enumerate(now.found) if i != place)
+    return Search(entry.trial.model, now_rule(now.m_step, entry.trial.m_step), kept)
 
 
 def now_rule(old: ScoringMStep, new: ScoringMStep) -> ScoringMStep:
@@ -168,7 +177,7 @@ def close(
     if state is None:
         return Closed(before, before, (), tuple(steps))
     gain = trimmed(np.nan_to_num(state.top, nan=-1e3) - np.nan_to_num(before.state.top, nan=-1e3))
-    stepped = any(isinstance(e, SensorQuantization) for e in cast(StateSpaceModel, state.best).effects)
+    stepped = any(e.read_off for e in cast(StateSpaceModel, state.best).effects)
     if gain < bar(data, rules) and not stepped:  # steps were read off the numbers themselves
         say(f"  over the whole length that gains {gain:.0f} nat only; nothing is kept of it")
         return Closed(before, before, (), tuple(steps))
@@ -225,7 +234,7 @@ def _plain(
 ) -> tuple[Search, AbstractEffect] | None:
     """The search with an unnamed law in place of a named one and its rest, where the named one says the lesser part."""
     place = rest_of(winner.effect, now.model)
-    if place is None:
+    if place is None or replaced(winner.effect, now.model) is not None:
         return None
     model, rule = without(now.model, now.m_step, place)
     bare = refit(model, rule.early(), path, part, used, passes=rules.passes)
@@ -256,7 +265,7 @@ def _needed(now: Search, state: EMState | None, before: Identified, data: Datase
 def _loss(found: Found, model: StateSpaceModel, m_step: ScoringMStep, hessian, place: int) -> float:
     """Log-likelihood that goes with an effect [nat]; none with one whose value makes no sense, all with steps seen."""
     effect = model.effects[place]
-    if isinstance(effect, SensorQuantization):
+    if effect.read_off:
         return math.inf
     return 0.5 * significance(found.candidate, model, m_step, hessian, place) ** 2 if effect.possible() else 0.0
 
@@ -359,6 +368,8 @@ def close_the_loop(
         stages[seen] = (state, used)
         say(f"epoch {state.epoch}, horizon {seen * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
+    if len(data.t) < 2:
+        say("one sequence: nothing can be held out, so that no effect will be believed; record at least two")
     before = identify(rig, data, key=key, watch=watch)
     try:
         return close(before, stages, data, rules=rules, say=say)

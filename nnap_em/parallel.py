@@ -69,6 +69,8 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         mesh = None  # part of a larger program
     count = next(leaf for leaf in jax.tree.leaves(batch) if eqx.is_array_like(leaf)).shape[0]
     share = -(-count // (1 if mesh is None else mesh.size))
+    if mesh is not None and jax.process_count() == 1:  # no more devices than have work
+        mesh = Mesh(mesh.devices[: -(-count // share)], mesh.axis_names)
     rounds = -(-share // (together or share))
     group = -(-share // rounds)
     whole = group * rounds * (1 if mesh is None else mesh.size)

@@ -163,6 +163,8 @@ def _twist(
     return factor @ jnp.stack(solved).T, logdet
 
 
+_FARTHEST = 1e30
+"""Squared distance from the path [variances of the process noise] from which particles have run away."""
 Rows = list[Float[Array, " particle"]]
 """The entries of a vector per particle: a list, because what is stacked does not fuse with what stands around it."""
 
@@ -315,7 +317,11 @@ def _where(condition: Bool[Array, ""], change: Callable, value):
 def particle_filter(
     model, potentials: Potentials, seq: Dataset, *, num_particles: int, key: PRNGKeyArray, dtype=jnp.float32
 ) -> ParticleHistory:
-    """Filter one sequence; resamples (systematically) where the effective sample size is below half."""
+    """Filter one sequence; resamples (systematically) where the effective sample size is below half.
+
+    A particle that has run away, 1e15 standard deviations off or no number, has weight 0 and stands at the origin.
+    Where none is left, all begin there anew, and the likelihood is 0.
+    """
     key_offset, key_noise = jax.random.split(key)
     exact = model.log_q.dtype
     y, observed = fill_missing(seq.y)
@@ -355,6 +361,11 @@ def particle_filter(
         f = [jnp.where(leave, (f[i] - origin_next[i]) / scale_[i], x[i]) for i in range(states)]
         log_ahead = jnp.where(leave, following.log_ahead(f), 0.0)
         grown = log_w + log_g(state, u, y, observed) - now.log_psi(x) + log_ahead
+        alive = jnp.isfinite(grown) & (_dot(f, f) < _FARTHEST)
+        some = jnp.any(alive)
+        grown = jnp.where(alive, grown, jnp.where(some, -jnp.inf, flat))  # where all are dead, all begin anew
+        x, f = ([jnp.where(alive, row, 0.0) for row in rows] for rows in (x, f))
+        log_ahead = jnp.where(alive, log_ahead, 0.0)
         top = jnp.max(grown)
         w = jnp.exp(grown - top)
         mass = jnp.sum(w)
@@ -362,7 +373,7 @@ def particle_filter(
         log_w = jnp.where(arrive, grown - total, log_w)
         ess = jnp.where(arrive, mass**2 / jnp.sum(w**2), ess)
         out = (jnp.stack(x), jnp.stack(f), log_w - log_ahead, log_ahead, ancestors, ess)
-        return (f, log_w, ess), (*out, jnp.where(arrive, total, 0.0).astype(exact))
+        return (f, log_w, ess), (*out, jnp.where(some, jnp.where(arrive, total, 0.0), -jnp.inf).astype(exact))
 
     mean = [jnp.full(num_particles, m, dtype) for m in start.mean.astype(dtype)]
     log_ahead = jax.tree.map(lambda a: a[0], steps).log_ahead(mean)
@@ -425,7 +436,7 @@ class ExactBackward(AbstractBackward):
 
     def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
         spare = -log_w.shape[0] % self.block
-        centre = jnp.mean(f, axis=1, keepdims=True)  # or the squares below would cancel
+        centre = jnp.mean(x_next, axis=1, keepdims=True)  # or the squares below would cancel
         f = f - centre
         x_next = (x_next - centre) / math.log(2)  # from here on logarithms are to base 2
         level = jnp.maximum((log_w - 0.5 * jnp.sum(f**2, axis=0)) / math.log(2), -1e30)

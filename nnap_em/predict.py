@@ -2,16 +2,19 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .data import Dataset, fill_missing
+from .em import e_step
 from .gaussian import Gaussian, cholesky, lower
 from .identify import Identified, phi_samples
-from .smoother import CubatureSmoother, GaussianSmoother, Posterior
+from .model import StateSpaceModel
+from .mstep import ParameterPrior
+from .parallel import each
+from .smoother import AbstractSmoother, CubatureSmoother, Posterior
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
@@ -41,14 +44,10 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
     return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
 
 
-@eqx.filter_jit
-def _smooth(model, data: Dataset, smoother: GaussianSmoother) -> Posterior:
-    return jax.vmap(lambda seq: smoother(model, seq))(data)
-
-
 def smooth(fitted: Identified, data: Dataset) -> Posterior:
     """p(x_k | all y) of every sequence by the cubature smoother, from the likeliest start."""
-    return _smooth(fitted.model, data, CubatureSmoother(fitted.bank, inflations=(1.0, 10.0, 100.0)))
+    smoother = CubatureSmoother(fitted.bank, inflations=(1.0, 10.0, 100.0))
+    return e_step(fitted.model, data, smoother, key=jax.random.key(0))  # it draws nothing
 
 
 def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
@@ -61,52 +60,57 @@ def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
     return jax.vmap(one)(state.mean, state.cov, model.inputs(seq))
 
 
-@eqx.filter_jit
-def _shown(model, state: Gaussian, data: Dataset) -> Gaussian:
-    return jax.vmap(lambda state, seq: show(model, state, seq))(state, data)
+def _shown(model, one) -> Gaussian:
+    state, seq = one
+    return show(model, state, seq)
 
 
-@eqx.filter_jit
-def _roll(model, m_step, deviations, state: Gaussian, data: Dataset, known, key: PRNGKeyArray):
+class _Paths(NamedTuple):
+    """What the sample paths of all sequences have in common."""
+
+    model: StateSpaceModel
+    prior: ParameterPrior
+    nodes: Float[Array, "dof node"]
+    tables: Float[Array, "path dof node"]
+    """Friction of each path beyond that of the model."""
+    parameters: Float[Array, "path parameter"]
+
+
+def _roll(common: _Paths, one) -> tuple[Float[Array, "time state"], Float[Array, "time state"]]:
     """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
-    prior, nodes = m_step.prior, m_step.weights(model).nodes
-    dof, count = nodes.shape
-    tables = deviations[:, : dof * count].reshape(-1, dof, count)
-    parameters = prior.read(model)[None] + deviations[:, dof * count :]
+    model, prior, nodes, tables, parameters = common
+    (mean, cov), seq, known, key = one
+    dof = nodes.shape[0]
 
     def advance(x, u, table, parameters):
         force = jax.vmap(jnp.interp)(x[dof : 2 * dof], nodes, table)
         now = prior.write(model, parameters)
         return now.transition(x, u, force), now.shown(x, u)
 
-    def one(mean, cov, seq, known, key):
-        u = jax.vmap(lambda p: prior.write(model, p).inputs(seq), out_axes=1)(parameters)
-        last = jnp.sum(known) - 1
-        key_start, key_noise = jax.random.split(key)
-        shape = (tables.shape[0], mean.shape[-1])
-        spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
-        start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
-        kick = jax.random.normal(key_noise, (u.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
+    u = jax.vmap(lambda p: prior.write(model, p).inputs(seq), out_axes=1)(parameters)
+    last = jnp.sum(known) - 1
+    key_start, key_noise = jax.random.split(key)
+    shape = (tables.shape[0], mean.shape[-1])
+    spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
+    start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
+    kick = jax.random.normal(key_noise, (u.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
 
-        def step(x, slices):
-            k, u, kick = slices
-            following, shown = jax.vmap(advance)(x, u, tables, parameters)
-            x = jnp.where(k >= last, following + kick, x)
-            return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
+    def step(x, slices):
+        k, u, kick = slices
+        following, shown = jax.vmap(advance)(x, u, tables, parameters)
+        x = jnp.where(k >= last, following + kick, x)
+        return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
 
-        _, (m, s) = jax.lax.scan(step, start, (jnp.arange(u.shape[0]), u, kick))
-        ahead = (jnp.arange(u.shape[0]) > last)[:, None]
-        past = show(model, Gaussian(mean, cov), seq)
-        std = jnp.sqrt(jnp.diagonal(past.cov, axis1=1, axis2=2))
-        return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
-
-    keys = jax.random.split(key, known.shape[0])
-    return jax.vmap(one)(state.mean, state.cov, data, known, keys)
+    _, (m, s) = jax.lax.scan(step, start, (jnp.arange(u.shape[0]), u, kick))
+    ahead = (jnp.arange(u.shape[0]) > last)[:, None]
+    past = show(model, Gaussian(mean, cov), seq)
+    std = jnp.sqrt(jnp.diagonal(past.cov, axis1=1, axis2=2))
+    return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
 
 
 def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
     """What `smooth` gives, in the coordinates of `Prediction`."""
-    return _shown(fitted.model, smooth(fitted, data).state, data)
+    return each(_shown, fitted.model, (smooth(fitted, data).state, data))
 
 
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:
@@ -118,8 +122,16 @@ def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArra
     known = given_samples(data, given)
     posterior = smooth(fitted, data._replace(valid=known))
     key_draw, key_roll = jax.random.split(key)
+    model, prior = fitted.model, fitted.m_step.prior
+    nodes = fitted.m_step.weights(model).nodes
     deviations = phi_samples(fitted, samples, key=key_draw)
-    mean, std = _roll(fitted.model, fitted.m_step, deviations, posterior.state, data, known, key_roll)
+    tables = deviations[:, : nodes.size].reshape(-1, *nodes.shape)
+    common = _Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
+    sequences, rows = data.t.shape
+    numbers = rows * samples * (posterior.state.mean.shape[-1] + data.u.shape[-1])
+    together = max(1, AbstractSmoother.room // (32 * numbers))  # noise, inputs and what draws them
+    batch = posterior.state, data, known, jax.random.split(key_roll, sequences)
+    mean, std = each(_roll, common, batch, together=together)
     return Prediction(mean, std, jnp.asarray(np.asarray(data.valid) & ~known))
 
 

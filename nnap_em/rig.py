@@ -3,6 +3,7 @@
 import difflib
 import json
 import math
+import re
 import tomllib
 import warnings
 from collections.abc import Collection, Mapping
@@ -13,6 +14,10 @@ from typing import NoReturn
 from .files import replace_text
 
 _FRICTION = {"unknown": True, "none": False}
+_UNITS = {  # of parameters and states, by their names
+    r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
+    r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
+}  # fmt: skip
 _CLOCKS = ("sequence", "session")
 _MEND = {  # how the line of a key or table should look
     "format": "format = 1",
@@ -63,6 +68,8 @@ class SystemSpec:
     parameters: tuple[str, ...]
     optional: Mapping[str, float]
     joints: int
+    driven: int = 1
+    """The joint that an input drives whose name does not tell it."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +103,12 @@ class Rig:
         return "\n  ".join(lines)
 
 
-def read_rig(path: Path, systems: Mapping[str, SystemSpec]) -> Rig:
+def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     """The rig that `rig.toml` declares, in SI units; `systems` are the registered ones.
 
     Raises RigError at the first mistake.
     """
+    path = Path(path)
     root = _Table(path, "", _parse(path))
     root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start"))
     if root.number("format") != 1:
@@ -255,16 +263,14 @@ def _parse(path: Path) -> dict[str, object]:
 def _parameter(model: _Table, key: str) -> Declared:
     """A number (trusted) or { mean, std }. Inertias may be negative: fits about the joint, moved to the centre, are."""
     value = model.declared(key) if isinstance(model.items[key], dict) else Declared(model.number(key), 0.0)
-    if key.startswith("m") and value.mean <= 0:
+    unit = parameter_unit(key)
+    if unit == "kg" and value.mean <= 0:
         model.refuse(key, mend="write a mass above 0 [kg]")
-    if (key.startswith("l") or key == "g") and value.mean < 0:
-        model.refuse(
-            key, mend=f"write 0 or more [{parameter_unit(key)}]: directions are in the equations, not in the signs"
-        )
-    large, unit = (100.0, "mm/s^2") if key == "g" else (50.0, "mm") if key.startswith("l") else (math.inf, "")
-    if value.mean > large:
+    if unit in ("m", "m/s^2") and value.mean < 0:
+        model.refuse(key, mend=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
+    if value.mean > {"m/s^2": 100.0, "m": 50.0}.get(unit, math.inf):
         found = f"{model.path}: [model] {key}: found {value.mean:g}"
-        warnings.warn(f"{found}; is it in {unit}? write it in {parameter_unit(key)}", RigWarning, 2)
+        warnings.warn(f"{found}; is it in m{unit}? write it in {unit}", RigWarning, 2)
     return value
 
 
@@ -303,10 +309,8 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
 
 
 def parameter_unit(name: str) -> str:
-    """The SI unit of a parameter or state, by the first letters of its name."""
-    exact = {"g": "m/s^2", "gr": "-", "x": "m", "dx": "m/s"}
-    first = {"theta": "rad", "dtheta": "rad/s", "m": "kg", "l": "m", "I": "kg m^2"}
-    return exact.get(name) or next((unit for start, unit in first.items() if name.startswith(start)), "SI")
+    """The SI unit of a parameter or state that is called as in the machines here; "SI" where it is not."""
+    return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
 
 
 def quantities(values: Mapping[str, object]) -> str:

@@ -56,11 +56,14 @@ def fingerprint(data: Dataset) -> str:
     return digest.hexdigest()
 
 
-def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mapping[str, Any] | None = None) -> None:
+def save(
+    path: Path | str, fitted: Identified, *, fingerprint: str = "", notes: Mapping[str, Any] | None = None
+) -> None:
     """Write `fitted` to one file, whole or not at all.
 
     Raises StoreError if it could not be loaded again: if it is of another structure than `identify` makes.
     """
+    path = Path(path)
     arrays: dict[str, np.ndarray] = {}
     leaves: dict[str, dict[str, Any]] = {}
     settings: dict[str, Any] = {}
@@ -92,12 +95,12 @@ def save(path: Path, fitted: Identified, *, fingerprint: str = "", notes: Mappin
     write_arrays(path, KIND, header, arrays)
 
 
-def load(path: Path) -> Identified:
+def load(path: Path | str) -> Identified:
     """The fitted model in `path`, with the numbers that were saved.
 
     Raises StoreError if the file is damaged, foreign, or of another version.
     """
-    return read(path).fitted
+    return read(Path(path)).fitted
 
 
 def read(path: Path) -> Stored:

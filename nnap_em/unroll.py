@@ -18,7 +18,7 @@ _ELEMENTWISE = {  # primitive to NumPy
     "max": "np.maximum({}, {})", "min": "np.minimum({}, {})", "pow": "{} ** {}", "atan2": "np.arctan2({}, {})",
     "rem": "np.fmod({}, {})", "square": "{0} * {0}", "rsqrt": "1.0 / np.sqrt({})", "abs": "np.abs({})",
     "logistic": "1.0 / (1.0 + np.exp(-{}))", "clamp": "np.minimum(np.maximum({1}, {0}), {2})", "sign": "np.sign({})",
-    "select_n": "np.where({0}, {2}, {1})", "is_finite": "np.isfinite({})", "not": "~{}",
+    "select_n": "np.where({0}, {2}, {1})", "is_finite": "np.isfinite({})", "not": "np.logical_not({})",
     "and": "{} & {}", "or": "{} | {}", "xor": "{} ^ {}",
     "eq": "{} == {}", "ne": "{} != {}", "lt": "{} < {}", "le": "{} <= {}", "gt": "{} > {}", "ge": "{} >= {}",
     "asinh": "np.arcsinh({})", "acosh": "np.arccosh({})", "atanh": "np.arctanh({})", "asin": "np.arcsin({})",
@@ -77,7 +77,8 @@ class _Writer:
         if not any(isinstance(value, str) for value in values):
             with np.errstate(all="ignore"):
                 # the forms are the constants above
-                return eval(form.format(*map(_text, values)), {"np": np, "inf": np.inf, "nan": np.nan})
+                found = eval(form.format(*map(_text, values)), {"np": np, "inf": np.inf, "nan": np.nan})
+            return found.item() if isinstance(found, np.ndarray) else found
         if (plain := _simpler(form, values)) is not None:
             return plain
         key = (form, *((type(value), value) for value in values))
@@ -184,6 +185,8 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return _run(writer, *_opened(inner), operands)
     if not any(map(_symbolic, operands)):
         return _constant(equation, operands)
+    if refused := _refused(equation):
+        raise UnrollError(f"JAX's {name!r} {refused} has no plain NumPy form here")
     if name in _SAME:
         return operands
     if name == "convert_element_type":
@@ -197,6 +200,18 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
     if name == "dot_general":
         return [_dot(writer, operands[0], operands[1], given["dimension_numbers"])]
     return [_scatter(writer, equation, operands)] if name in _SCATTERED else _move(equation, operands)
+
+
+def _refused(equation: core.JaxprEqn) -> str | None:
+    """What it is about an operation that NumPy does otherwise than the form says."""
+    name, kinds = equation.primitive.name, {_dtype(atom).kind for atom in equation.invars}
+    if name in ("div", "rem", "not") and kinds & {"i", "u"}:
+        return "of whole numbers"
+    if name == "select_n" and len(equation.invars) > 3:
+        return "of more than two cases"
+    if name == "round" and equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        return "away from zero"
+    return None
 
 
 def _converted(old: str, new: str) -> str:

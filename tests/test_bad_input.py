@@ -288,6 +288,12 @@ FOLDERS = {  # name: (the change of the folder, the file, then the words of the 
         "there is a 00.csv beside it",
         "remove or rename one",
     ),
+    "a sequence in two formats, and another between": (
+        lambda f: [(f / "train/00.d.csv").write_bytes(b""), (f / "train/00.mat").write_bytes(b"")],
+        "train/00.mat",
+        "there is a 00.csv beside it",
+        "remove or rename one",
+    ),
     "a folder for a file": (
         lambda f: [(f / "train/01.csv").unlink(), (f / "train/01.csv").mkdir()],
         "train/01.csv",

@@ -1,6 +1,7 @@
 """The check before a fit: closed forms where there are any, and data sets that are bad in one known way."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from nnap_em import cli
+from nnap_em.build import build_system
 from nnap_em.check import check, gramian
 from nnap_em.data import Dataset, Logs
-from nnap_em.rig import Declared, Rig
+from nnap_em.rig import Declared, Rig, RigError
 from nnap_em.simulate import examples, sweep_experiment
+from nnap_em.systems.acrobot import table_i
 
 ROWS, COUNT = 201, 6
 
@@ -54,6 +57,21 @@ def test_a_good_data_set_is_all_ok(slide):
     assert list(found) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
     assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in found["length"][0][1]
     assert "2 of 2 directions" in found["states"][0][1]
+
+
+def test_bodies_that_make_no_machine_are_bad_and_nothing_else_is_tried():
+    """Acrobot with an inertia of link 2 below -m2 lc2^2: its mass matrix has a negative eigenvalue."""
+    model, sweep = examples["acrobot"]()
+    logs = _logs(Dataset(*(np.asarray(a) for a in sweep_experiment(model, sweep, 2, 60, key=jax.random.key(0)).data)))
+    values = {name: Declared(value, 0.0) for name, value in table_i.items()}
+    rig = Rig("a", "acrobot", values, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
+    build_system(rig)
+    rig = replace(rig, parameters={**values, "I2": Declared(-0.006, 0.0)})
+    mark, text = _found(logs, rig)["bodies"][0]
+    assert mark == "bad"
+    assert "the declared masses and inertias make no machine" in text
+    with pytest.raises(RigError, match="rig 'a': the declared masses and inertias make no machine"):
+        build_system(rig)
 
 
 def test_the_gramian_of_a_double_integrator():

@@ -74,6 +74,25 @@ def registries():
         each.update(before)
 
 
+def test_files_import_from_files_above_them():
+    """As README lists them; all are there, and what stands in a line stands in its order."""
+    package = ROOT / "nnap_em"
+    house = (ROOT / "README.md").read_text().partition("## The house")[2].partition("## Documentation")[0]
+    listed = re.findall(r"`(\w+)(?:\.py|/)`", "\n".join(re.findall(r"(?m)^\|[^|]*\|[^|]*\|", house)))
+    order = {name: place for place, name in enumerate(listed)}
+    assert sorted(order) == sorted(p.stem for p in package.iterdir() if p.stem[:2] != "__" and p.suffix in (".py", ""))
+    wrong = []
+    for path in package.rglob("*.py"):
+        own = path.relative_to(package).parts
+        if len(own) > 1 or own[0] != "__init__.py":
+            name = own[0].removesuffix(".py")
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ImportFrom) and node.level == len(own):
+                    others = [node.module.split(".")[0]] if node.module else [alias.name for alias in node.names]
+                    wrong += [f"{name} imports {other}" for other in others if order.get(other, -1) >= order[name]]
+    assert not wrong
+
+
 def test_every_block_is_run_or_says_why_not():
     for page in PAGES:
         blocks = _blocks(page)

@@ -8,7 +8,7 @@ import pytest
 from nnap_em import cli
 from nnap_em.draft import draft
 from nnap_em.formats import DataError, write_csv
-from nnap_em.rig import RigError, read_rig
+from nnap_em.rig import RigError, SystemSpec, read_rig
 from nnap_em.systems import specs
 
 DT, ROWS = 0.02, 400
@@ -70,6 +70,40 @@ def test_a_line_that_is_not_filled_in_is_refused_by_name(tmp_path, key):
         read_rig(tmp_path / "rig.toml", specs)
 
 
+FROM_ZERO = {  # columns, then inputs and joints, and the names that the notes ask for
+    "all": (("u0", "u1", "q0", "q1"), {"u0": 1, "u1": 2}, ["theta1", "theta2"]),
+    "one input": (("u0", "q0", "q1", "dq1"), {"u0": 1}, ["theta1", "theta2", "dtheta2"]),
+    "inputs only": (("u0", "u1", "theta1", "theta2"), {"u0": 1, "u1": 2}, []),
+    "states only": (("u2", "q0", "q1"), {"u2": 2}, ["theta1", "theta2"]),
+}
+
+
+@pytest.mark.parametrize("names, inputs, states", FROM_ZERO.values(), ids=FROM_ZERO)
+def test_joints_that_a_log_counts_from_0(tmp_path, names, inputs, states):
+    zero = [name for name in names if ("u0" in names and name[0] == "u") or name[:2] == "dq"]
+    found = _draft(tmp_path, *names, system="acrobot")
+    assert f"columns = {list(inputs)}".replace("'", '"') in found.text
+    assert f"joints = {list(inputs.values())}" in found.text
+    said = "; ".join(found.notes)
+    assert re.findall(r"name it '(\w+)'", said) == states
+    noted = dict(re.findall(r"column '(\w+)': counted from 0, so taken for joint (\d)", said))
+    assert noted == {name: str(int(name[-1]) + 1) for name in (*inputs, *names) if name[0] == "q" or name in zero}
+
+
+@pytest.mark.parametrize("system", [*specs, "cart"])
+def test_every_machine_can_be_drafted_and_one_of_ones_own(tmp_path, system):
+    """What is drafted and filled in is read."""
+    own = SystemSpec(("x", "theta1", "dx", "dtheta1"), ("mc", "stiffness", "mu"), {"lag": 0.0}, joints=2, driven=2)
+    known = {**specs, "cart": own}
+    path = tmp_path / "01.csv"
+    write_csv(path, _log("u", known[system].states[0]))
+    found = draft(path, system, known)
+    assert found.missing == [name for name in known[system].parameters if name != "g"]
+    (tmp_path / "rig.toml").write_text(_filled(found.text))
+    rig = read_rig(tmp_path / "rig.toml", known)
+    assert rig.input_joints == (2 if system in ("acrobot", "cart") else 1,)
+
+
 NOTES = {  # columns, then the notes
     "degrees": (("u", "theta1_deg"), "column 'theta1_deg': name it 'theta1' and convert it from deg to rad"),
     "brackets": (("u", "theta1 [deg]"), "column 'theta1 [deg]': name it 'theta1' and convert it from deg to rad"),
@@ -121,7 +155,13 @@ def test_noise_without_a_signal_is_not_declared(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "names, reason", [(("u", "theta1"), "hidden joint"), (("a", "b"), "no column is named as a state")]
+    "names, reason",
+    [
+        (("u", "theta1"), "hidden joint"),
+        (("a", "b"), "no column is named as a state"),
+        (("u", "x", "theta1"), "a coordinate x and an angle are of no machine"),
+        (("u", "x", "theta2"), "a coordinate x and an angle are of no machine"),
+    ],
 )
 def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
     with pytest.raises(DataError, match=rf"01.csv: line 1: .*{reason}.*; give --system acrobot"):

@@ -177,6 +177,52 @@ def test_a_spring_that_stiffens_and_detents_with_an_overtone(name, law):
         np.testing.assert_allclose(value, law[key], rtol=1e-6)
 
 
+BRAKES = ("air_drag", "motor_back_emf", "eddy_brake", "position_dependent_friction", "friction_drift")
+"""Effects that take energy from the machine, whatever it does; the bristle may give back what it has stored."""
+
+
+@pytest.mark.parametrize("name", BRAKES)
+def test_brakes_never_add_energy(name):
+    """Power v . tau of friction and effect together at 500 states; without the friction where the effect is a force."""
+    case = plant.Case(effects=plant.STRONG[name], steps=STEPS, hidden=False, seed=3)
+    effect = MAKE[name](case.effects[0])
+    model = with_effects(_model(case), (effect,))
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(rng.normal(size=(500, 4)) * [3.0, 3.0, 10.0, 10.0])
+    rows = jnp.asarray(np.stack([np.zeros(500), rng.uniform(0, 200, 500), np.zeros(500), np.ones(500)], axis=1))
+
+    def power(x, row):
+        scene = model.scene(x, row)
+        force = effect.force(scene, jnp.zeros(0))
+        return scene.v @ force, scene.v @ (force + effect.friction(scene.friction, scene))
+
+    alone, whole = map(np.asarray, jax.jit(jax.vmap(power))(x, rows))
+    assert effect.possible()
+    assert np.all(alone <= 0) and np.all(whole < 0)
+    assert np.all(alone < 0) or np.all(alone == 0)  # a force, or a change of the friction
+
+
+def test_a_bristle_gives_back_less_than_it_was_given():
+    """Work of presliding friction over any path from a slack bristle on: none of it comes from nowhere."""
+    case = plant.Case(effects=plant.STRONG["presliding_friction"], steps=STEPS, hidden=False, seed=3)
+    effect = MAKE["presliding_friction"](case.effects[0])
+    model = with_effects(_model(case), (effect,))
+    rng, count, dt = np.random.default_rng(0), 4000, 1e-4
+    t = dt * np.arange(count)
+    v = sum(a * np.sin(w * t[None] + b) for a, w, b in rng.uniform(0, 1, (6, 3, 50, 1)) * [[[3.0]], [[80.0]], [[6.3]]])
+    row = jnp.asarray([0.0, 1.0, 0.0, 1.0])
+
+    def step(memory, v):
+        scene = model.scene(jnp.zeros(5).at[3].set(v), row)
+        force = effect.force(scene, memory)[1] + scene.friction[1]
+        return memory + dt * effect.drift(scene, memory), force * v
+
+    power = jax.jit(jax.vmap(lambda v: jax.lax.scan(step, jnp.zeros(1), v)[1]))(jnp.asarray(v))
+    power = np.asarray(power)
+    assert np.any(power > 0)  # it does give back now and then
+    assert np.all(dt * np.cumsum(power, axis=1) <= dt * np.abs(power).max(axis=1, keepdims=True))  # Euler: a step late
+
+
 def test_slide_and_pendulum_know_their_effects():
     for system, effects in (("slide", "torsional_spring"), ("pendulum", "base_tilt")):
         effect = {"name": effects, "joint": 1, "k": 2.0, "theta0": 0.1, "angle": 0.2}

@@ -25,6 +25,16 @@ def test_quadrants_and_what_is_no_number():
     assert np.all(np.isnan(np.asarray(sin(jnp.asarray([jnp.nan, jnp.inf])))))
 
 
+@pytest.mark.parametrize(("dtype", "top", "error"), [(jnp.float32, 1e7, 2e-5), (jnp.float64, 1e9, 2.3e-16)])
+def test_large_angles_are_as_good_as_stated_or_no_number(dtype, top, error):
+    x = jnp.asarray(np.random.default_rng(0).uniform(-top, top, 100_000), dtype)
+    wide = np.asarray(x, np.longdouble)
+    for mine, truth in zip(jax.jit(sincos)(x), (np.sin(wide), np.cos(wide)), strict=True):
+        assert np.max(np.abs(np.asarray(mine, np.longdouble) - truth)) < error
+    beyond = jnp.asarray([1.001 * top, -1e3 * top, 1e18, -1e30], dtype)
+    assert all(np.all(np.isnan(a)) for a in (*jax.jit(sincos)(beyond), jax.vmap(jax.grad(sin))(beyond)))
+
+
 def test_asinh():
     x = jnp.asarray(np.random.default_rng(0).standard_cauchy(10_000) * 10)
     truth = np.arcsinh(np.asarray(x, np.longdouble))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_data import _text
 
-from nnap_em import cli
+from nnap_em import cli, unroll
 from nnap_em.data import Dataset
 from nnap_em.effects import AbstractEffect, catalogue
 from nnap_em.export import ExportError, export, parameters, predictor, stablehlo
@@ -174,6 +174,12 @@ def test_a_model_that_numpy_cannot_follow_is_refused_by_the_name_of_its_effect(t
     with pytest.raises(ExportError, match=r"the effect 'motor_gain' changes the inputs over time; use model.stablehlo"):
         export(fitted, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_form_with_other_numbers_is_not_exported(monkeypatch):
+    monkeypatch.setitem(unroll._ELEMENTWISE, "abs", "{}")
+    with pytest.raises(ExportError, match="the NumPy form of 'rate' gives other numbers than JAX"):
+        predictor(_case(()).fitted)
 
 
 def test_a_declared_frictionless_slide_is_exported_too(tmp_path):

@@ -48,6 +48,17 @@ WRITERS = {
 }
 
 
+@pytest.mark.parametrize("t0", (0.0, 12.3, 1.7e9))
+def test_a_clock_keeps_its_samples(tmp_path, t0):
+    """1 ms at the seconds since 1970, which float64 holds to 2.4e-7 s."""
+    t = t0 + 1e-3 * np.arange(1001)
+    write_csv(tmp_path / "01.csv", {"time": t, "u": np.ones_like(t)})
+    back = read_table(tmp_path / "01.csv", ("time", "u"))[:, 0]
+    np.testing.assert_allclose(back, t, rtol=0, atol=1e-9)
+    assert t0 < 1e6 or np.array_equal(back, t)
+    assert len((tmp_path / "01.csv").read_text().splitlines()[4].split(",")[0]) < 18  # no digits of rounding
+
+
 @pytest.mark.parametrize("suffix, write", WRITERS.values(), ids=WRITERS)
 def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
     write(tmp_path / f"01{suffix}", _log())

@@ -11,21 +11,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import minimize
+from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
+from nnap_em.data import Dataset
 from nnap_em.gaussian import Gaussian
 from nnap_em.kalman import Affine, Cubature, Reading, Tangent, ekf, kalman_filter, rts
+from nnap_em.model import AbstractModel
+from nnap_em.simulate import paper_experiment, paper_model
+from nnap_em.smoother import GaussianSmoother, StartBank
 
 LOG_2PI = np.log(2 * np.pi)
 
 
-class _Linear(eqx.Module):
-    """x' = a x + b u + w, y = c x + v, as the filters want a model."""
+class _Linear(AbstractModel):
+    """x' = a x + b u + w, y = c x + v."""
 
     a: jax.Array
     b: jax.Array
     c: jax.Array
     log_q: jax.Array
     log_r: jax.Array
+    start: Gaussian
+    measured: tuple[int, ...] = eqx.field(static=True, default=())
+    dt: float = eqx.field(static=True, default=1.0)
 
     def transition(self, x, u, force=None):
         return self.a @ x + self.b @ u
@@ -45,12 +54,11 @@ class _Problem(NamedTuple):
 def _problem(seed: int, time: int = 6, state: int = 3, obs: int = 2, *, varying: bool = False) -> _Problem:
     rng = np.random.default_rng(seed)
     a = np.linalg.qr(rng.normal(size=(state, state)))[0] * rng.uniform(0.6, 1.1, state)
-    model = _Linear(
-        *map(jnp.asarray, (a, rng.normal(size=(state, 1)), rng.normal(size=(obs, state)))),
-        *map(jnp.asarray, (rng.normal(size=state) - 1, rng.normal(size=obs) - 1)),
-    )
+    parts = a, rng.normal(size=(state, 1)), rng.normal(size=(obs, state)), rng.normal(size=state), rng.normal(size=obs)
     root = rng.normal(size=(state, state))
     start = Gaussian(jnp.asarray(rng.normal(size=state)), jnp.asarray(root @ root.T + 0.1 * np.eye(state)))
+    b, c, log_q, log_r = (jnp.asarray(part - shift) for part, shift in zip(parts[1:], (0, 0, 1, 1), strict=True))
+    model = _Linear(jnp.asarray(a), b, c, log_q, log_r, start)
     u, y = rng.normal(size=(time, 1)), 2 * rng.normal(size=(time, obs))
     matrix = np.tile(a, (time, 1, 1)) + varying * 0.3 * rng.normal(size=(time, state, state))
     offset = u @ np.asarray(model.b).T + varying * rng.normal(size=(time, state))
@@ -143,11 +151,148 @@ def test_passes_equal_the_dense_joint(seed, varying):
     _check(_problem(seed, varying=varying), observed)
 
 
+def _patterns(time: int, obs: int) -> np.ndarray:
+    """All of them, [pattern time obs]."""
+    return np.reshape(list(itertools.product([False, True], repeat=time * obs)), (-1, time, obs))
+
+
 def test_every_pattern_of_missing_readings():
-    """Short enough for all 2^6 of them."""
-    p = _problem(3, time=3, varying=True)
-    for pattern in itertools.product([False, True], repeat=6):
-        _check(p, np.reshape(pattern, (3, 2)))
+    """Short enough for all 2^8 of them."""
+    p = _problem(3, time=4, varying=True)
+    for observed in _patterns(4, 2):
+        _check(p, observed)
+
+
+ROUTES = {
+    "tangent": GaussianSmoother(StartBank((1, 1, 1)), Tangent(), iterations=0),
+    "cubature": GaussianSmoother(StartBank((1, 1, 1)), Cubature(), iterations=0),
+    "tangent, again": GaussianSmoother(StartBank((1, 1, 1)), Tangent(), iterations=2),
+    "cubature, again": GaussianSmoother(StartBank((1, 1, 1)), Cubature(), iterations=2, inflations=(1.0, 9.0)),
+}
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings(route):
+    """All that an M-step is handed on a linear system: likelihood, marginals, and pairs through their nodes."""
+    time, n = 4, 3
+    p = _problem(5, time=time)
+    patterns = _patterns(time, 2)
+    y = jnp.where(jnp.asarray(patterns), p.y[None], jnp.nan)
+    rows = jnp.arange(float(time)), p.u, jnp.ones(time, bool)
+    smooth = jax.jit(jax.vmap(lambda y: ROUTES[route](p.model, Dataset(rows[0], rows[1], y, rows[2]))))
+    found = smooth(y)
+    dense = [_dense(p, observed) for observed in patterns]
+    cov = np.stack([d.cov.reshape(time, n, time, n) for d in dense])
+    mean = np.stack([d.mean.reshape(time, n) for d in dense])
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))  # noqa: E731
+    close(found.loglik, np.asarray([d.loglik for d in dense]))
+    close(found.state.mean, mean)
+    close(found.state.cov, np.einsum("pkikj->pkij", cov))
+    pair = np.asarray(jnp.concatenate([found.prev, found.next], axis=-1))
+    close(pair.mean(axis=2), np.concatenate([mean[:, :-1], mean[:, 1:]], axis=-1))
+    away = pair - pair.mean(axis=2, keepdims=True)
+    second = np.einsum("pkni,pknj->pkij", away, away) / pair.shape[2]
+    blocks = [cov[:, k : k + 2, :, k : k + 2, :].reshape(-1, 2 * n, 2 * n) for k in range(time - 1)]
+    close(second, np.stack(blocks, axis=1))
+    expected = found.next - jnp.einsum("ij,pknj->pkni", p.model.a, found.prev) - (p.u @ p.model.b.T)[:-1][None, :, None]
+    close(found.kick, expected)
+
+
+def test_rows_that_are_not_valid_are_not_read():
+    """A horizon cuts by `valid` alone: the readings behind it stay where they are, and count for nothing."""
+    p = _problem(6, time=7)
+    cut = Dataset(jnp.arange(7.0), p.u, p.y, jnp.arange(7) < 4)
+    for route in ("tangent", "tangent, again"):
+        smooth = eqx.filter_jit(ROUTES[route])
+        long, short = smooth(p.model, cut), smooth(p.model, jax.tree.map(lambda a: a[:4], cut))
+        np.testing.assert_allclose(long.loglik, short.loglik, rtol=1e-12)
+        # the smoother passes the padding by solving with the state's own covariance: rounding, and no more
+        np.testing.assert_allclose(long.state.mean[:4], short.state.mean, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(long.kick[:3], short.kick, rtol=1e-9, atol=1e-9)
+
+
+def test_likeliest_start_weighs_prior_and_readings():
+    """The hypothesis with the largest prior times likelihood, by the dense joint."""
+    bank = StartBank((9, 1, 1))
+    chosen = []
+    for seed in range(6):
+        p = _problem(seed, time=4)
+        p = p._replace(model=eqx.tree_at(lambda m: m.log_r, p.model, p.model.log_r + 1))
+        seen = np.ones((4, 2), bool)
+        starts, _ = bank.hypotheses(p.start)
+        each = [Gaussian(mean, cov) for mean, cov in zip(starts.mean, starts.cov, strict=True)]
+        away = np.linspace(-2.5, 2.5, 9)
+        score = [_dense(p._replace(start=s), seen).loglik - 0.5 * a**2 for s, a in zip(each, away, strict=True)]
+        smoother = GaussianSmoother(bank, Tangent())
+        model = eqx.tree_at(lambda m: m.start, p.model, p.start)
+        found = eqx.filter_jit(smoother.likeliest)(model, p.u, p.y, jnp.asarray(seen), _active(4))
+        np.testing.assert_allclose(found.mean, starts.mean[int(np.argmax(score))], rtol=1e-14)
+        likeliest = int(np.argmax(np.asarray(score) + 0.5 * away**2))
+        chosen.append((int(np.argmax(score)), likeliest))
+    assert any(best != 4 for best, _ in chosen) and any(best != likeliest for best, likeliest in chosen)  # both weigh
+
+
+def _cast(tree, dtype):
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a, tree)
+
+
+@pytest.mark.parametrize("linearise", [Tangent(), Cubature()], ids=["tangent", "cubature"])
+def test_single_precision_gives_what_double_does(linearise):
+    """The paper's acrobot, hidden joint known to 3 degrees at the start: to a hundredth of the standard deviations."""
+    model = paper_model(start_std=0.05)
+    model = eqx.tree_at(lambda m: m.start.cov, model, jnp.diag(jnp.asarray([0.1, 0.05, 0.02, 0.02]) ** 2))
+    data = paper_experiment(model, 4, 80, key=jax.random.key(1)).data
+    run = eqx.filter_jit(lambda smoother, m, d: jax.vmap(lambda seq: smoother(m, seq))(d))
+    smoother = GaussianSmoother(StartBank((1,) * 4), linearise)
+    double, single = (run(*_cast((smoother, model, data), dtype)) for dtype in (jnp.float64, jnp.float32))
+    assert single.state.mean.dtype == jnp.float32 and double.state.mean.dtype == jnp.float64
+    (mean, cov), (other, near) = (tuple(np.asarray(a, float) for a in f.state) for f in (double, single))
+    std, wide = (np.sqrt(np.diagonal(c, axis1=2, axis2=3)) for c in (cov, near))
+    # single rounding, 6e-8, times the condition of the covariances, some 1e4, over 80 steps
+    assert np.max(np.abs(other - mean) / std) < 0.01
+    np.testing.assert_allclose(wide, std, rtol=0.005)
+    np.testing.assert_allclose(single.loglik, double.loglik, atol=0.02)
+
+
+def test_time_varying_system_agrees_with_statsmodels():
+    """Marginals, lag-one covariances and likelihood of 60 rows, a third of the readings missing."""
+    time, n = 60, 3
+    p = _problem(8, time=time, varying=True)
+    observed = np.random.default_rng(8).uniform(size=p.y.shape) < 0.67
+    peer = KalmanSmoother(k_endog=2, k_states=n)
+    peer.bind(np.where(observed, p.y, np.nan))
+    peer["design"], peer["obs_cov"] = np.asarray(p.model.c), np.diag(np.exp(p.model.log_r))
+    peer["transition"] = np.moveaxis(np.asarray(p.affine.matrix), 0, 2)
+    peer["state_intercept"] = np.asarray(p.affine.offset).T
+    peer["selection"] = np.eye(n)
+    peer["state_cov"] = np.moveaxis(np.diag(np.exp(p.model.log_q)) + np.asarray(p.affine.noise), 0, 2)
+    peer.initialize_known(np.asarray(p.start.mean), np.asarray(p.start.cov))
+    expected = peer.smooth()
+    filtered, smoothed = _run(p, jnp.asarray(observed), _active(time))
+    # some hundred products of matrices of condition 1e3 or less, each to 1e-16
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())  # noqa: E731
+    close(filtered.loglik, expected.llf_obs.sum())
+    close(filtered.state.mean, expected.filtered_state.T)
+    close(filtered.state.cov, np.moveaxis(expected.filtered_state_cov, 2, 0))
+    close(smoothed.state.mean, expected.smoothed_state.T)
+    close(smoothed.state.cov, np.moveaxis(expected.smoothed_state_cov, 2, 0))
+    lag_one = np.einsum("kij,kjl->kil", smoothed.gain, smoothed.state.cov[1:])
+    # theirs: cov(x_{k+1}, x_k)
+    close(lag_one, np.moveaxis(expected.smoothed_state_autocov, 2, 0)[: time - 1].swapaxes(1, 2))
+
+
+def test_covariances_stay_symmetric_and_positive():
+    """A start of condition 1e12, a reading of 1e-6 of its size: what is not kept symmetric drifts apart."""
+    p = _problem(2, time=200)
+    wide = p.start._replace(cov=jnp.diag(jnp.asarray([1e6, 1.0, 1e-6])))
+    sharp = eqx.tree_at(lambda m: m.log_r, p.model, jnp.full(2, np.log(1e-6)))
+    filtered, smoothed = _run(p._replace(start=wide, model=sharp), jnp.ones(p.y.shape, bool), _active(200))
+    for cov in (filtered.state.cov, filtered.predicted.cov, smoothed.state.cov):
+        cov = np.asarray(cov)
+        np.testing.assert_array_equal(cov, cov.swapaxes(1, 2))
+        size = np.linalg.eigvalsh(cov)
+        assert np.all(size[1:, 0] > 0)  # the first row's: rounding of 1e6
+        assert size[0, 0] > -1e6 * np.finfo(float).eps
 
 
 def test_what_is_not_measured_may_hold_any_number():
@@ -241,8 +386,8 @@ def _nile() -> tuple[_Problem, np.ndarray]:
     statsmodels = pytest.importorskip("statsmodels.datasets")
     y = statsmodels.nile.load_pandas().data["volume"].to_numpy(float)
     one = jnp.ones((1, 1))
-    model = _Linear(one, 0 * one, one, jnp.log(jnp.asarray([1469.1])), jnp.log(jnp.asarray([15099.0])))
     start = Gaussian(jnp.asarray([y[0]]), jnp.asarray([[15099.0 + 1e-7]]))
+    model = _Linear(one, 0 * one, one, jnp.log(jnp.asarray([1469.1])), jnp.log(jnp.asarray([15099.0])), start)
     n = len(y)
     return _Problem(
         model,
@@ -269,11 +414,32 @@ def test_nile_has_the_published_likelihood():
     assert float(filtered.predicted.cov[60, 0, 0]) == pytest.approx(steady, rel=1e-6)
 
 
-def test_nile_agrees_with_statsmodels():
+def test_nile_likelihood_is_highest_at_the_published_variances():
+    """Maximum likelihood estimates 15099 and 1469.1 [Durbin & Koopman 2012, sec. 2.10.3]."""
+    p, y = _nile()
+    seen = jnp.ones(p.y.shape, bool).at[0].set(False)
+
+    @jax.jit
+    def loss(log):
+        model = eqx.tree_at(lambda m: (m.log_r, m.log_q), p.model, (log[:1], log[1:]))
+        start = Gaussian(p.start.mean, jnp.exp(log[:1])[:, None])  # diffuse, conditioned on y_1
+        rows = _reading(p)
+        return -kalman_filter(model.log_q, model.log_r, start, p.affine, rows, p.y, seen, _active(len(y))).loglik
+
+    found = minimize(loss, np.log([1e4, 1e3]), jac=jax.jit(jax.grad(loss)), method="BFGS", options={"gtol": 1e-8})
+    # with the constants that their table leaves out: -632.54 in all
+    assert -found.fun + 99 / 2 * (LOG_2PI + 1) == pytest.approx(-492.07, abs=0.005)
+    np.testing.assert_array_less(np.abs(np.exp(found.x) - [15099.0, 1469.1]), [1.0, 0.1])  # a unit of the last digit
+
+
+@pytest.mark.parametrize("vague", [False, True], ids=["first reading", "vague"])
+def test_nile_agrees_with_statsmodels(vague):
     structural = pytest.importorskip("statsmodels.tsa.statespace.structural")
     p, y = _nile()
+    if vague:
+        p = p._replace(start=Gaussian(jnp.zeros(1), jnp.full((1, 1), 1e6)))
     reference = structural.UnobservedComponents(y, "local level")
-    reference.ssm.initialize_known(np.asarray([y[0]]), np.asarray(p.start.cov))
+    reference.ssm.initialize_known(np.asarray(p.start.mean), np.asarray(p.start.cov))
     expected = reference.smooth([15099.0, 1469.1])
     filtered, smoothed = _run(p, jnp.ones(p.y.shape, bool), _active(len(y)))
     np.testing.assert_allclose(filtered.loglik, expected.llf_obs.sum(), rtol=1e-9)

@@ -15,7 +15,7 @@ from nnap_em.friction import FrictionNetwork, NoFriction
 from nnap_em.gaussian import Gaussian
 from nnap_em.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.model import StateSpaceModel
-from nnap_em.mstep import ParameterPrior, Quadratic, Weights, expand, spread
+from nnap_em.mstep import ParameterPrior, Quadratic, ScoringMStep, Weights, expand, locals_along, readings_at, spread
 from nnap_em.simulate import simulate
 from nnap_em.smoother import ExtendedKalmanSmoother, Posterior, StartBank, active_steps
 from nnap_em.systems.pendulum import Pendulum
@@ -289,3 +289,28 @@ def test_fit_of_parameters_alone_is_ridge_regression():
     np.testing.assert_allclose(w, (40 + 50 * w0) / 51, atol=np.sqrt(2 * 1e-3 / 51))
     written = weights.write(model, w)
     assert float(written.system.m) == pytest.approx(1.2 + 0.1 * float(w[0]), rel=1e-14)
+
+
+def test_sequences_that_are_not_used_have_no_weight(slides):
+    """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
+    model, data, posterior, each = slides
+    rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), shape=model.log_q, linearise=Tangent())
+    read = eqx.filter_jit(jax.vmap(lambda p, s: readings_at(model, p, s)))(posterior, data)
+    here = locals_along(model, MASS, posterior.state, data, Tangent())
+
+    def step(index, used):
+        parts = jax.tree.map(lambda a: a[np.asarray(index)], (here, posterior, read, data))
+        far = jnp.where(jnp.asarray(used), 1.0, 1e3)
+        spoilt = eqx.tree_at(lambda p: p[1].kick, parts, parts[1].kick * far[:, None, None, None])
+        spoilt = eqx.tree_at(lambda p: p[1].state.mean, spoilt, spoilt[1].state.mean * far[:, None, None])
+        core, hessian, kept = rule.advance(rule.core(model), *spoilt, jnp.asarray(used))
+        np.testing.assert_array_equal(kept, used)
+        return core[1:], hessian
+
+    some, others = step([0, 1, 2, 3], [True, False, True, True]), step([3, 2, 0, 4], [True, True, True, False])
+    for a, b in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)  # sums in another order
+    (_, once), (_, twice) = step([0, 2, 1, 1], [True, True, False, False]), step([0, 2, 0, 2], [True] * 4)
+    prior = np.eye(1)  # of the mass
+    np.testing.assert_allclose(once - prior, each.information[0, -1:, -1:] + each.information[2, -1:, -1:], rtol=1e-9)
+    np.testing.assert_allclose(twice - prior, 2 * (once - prior), rtol=1e-9)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nnap_em import parallel
 from nnap_em.data import Dataset
 from nnap_em.gaussian import Gaussian
 from nnap_em.identify import Identified, begin, friction_table, phi_samples
@@ -15,6 +16,7 @@ from nnap_em.model import StateSpaceModel
 from nnap_em.predict import Prediction, given_samples, horizon_errors, predict
 from nnap_em.rig import Declared, Rig
 from nnap_em.simulate import simulate
+from nnap_em.smoother import AbstractSmoother
 from nnap_em.systems.pendulum import Pendulum
 
 DT, ROWS, SAMPLES = 0.02, 80, 400
@@ -78,6 +80,28 @@ def test_without_noise_the_prediction_is_the_integral():
     assert np.all(np.abs(found.mean[:, last + 1 :] - path) < 4 * std / np.sqrt(SAMPLES) + 1e-5)
     assert np.all(np.abs(found.mean - case.x)[ahead] < 5 * np.asarray(found.std)[ahead])
     assert std.max() < 0.02
+
+
+def test_groups_of_sequences_change_nothing(monkeypatch):
+    """Smoothed and predicted one at a time where there is no room for more."""
+    case, groups = _case(q=1e-2, information=1.0), []
+    run = parallel._run
+    monkeypatch.setattr(
+        parallel, "_run", lambda f, mesh, group, *rest: groups.append(group) or run(f, mesh, group, *rest)
+    )
+
+    def found():
+        groups.clear()
+        return predict(case.fitted, case.data, GIVEN, key=jax.random.key(1), samples=20)
+
+    together = found()
+    assert groups == [3, 3]
+    monkeypatch.setattr(AbstractSmoother, "room", 1)
+    single = found()
+    assert groups == [1, 1]
+    for a, b in zip(together, single, strict=True):
+        # rounding, in other programs, over 80 rows of a smooth motion
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
 def test_std_grows_as_the_kicks_add_up():

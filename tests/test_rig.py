@@ -7,13 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.files import replace_text
-from nnap_em.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, write_rig
+from nnap_em.rig import Declared, Rig, RigError, SystemSpec, nearest, parameter_unit, read_rig, write_rig
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")
 SYSTEMS = {
     "acrobot": SystemSpec(STATES, REQUIRED, {"Ir": 0.0, "gr": 1.0}, joints=2),
     "slide": SystemSpec(("x", "dx"), ("m",), {}, joints=1),
+    "own": SystemSpec(("x", "dx"), ("mc", "mu", "lag", "lc", "Imax"), {}, joints=1),
 }
 
 GOOD = """\
@@ -53,10 +54,40 @@ theta2 = { mean = 0.0, std = 0.5 }
 """
 
 
+OWN = (
+    GOOD[: GOOD.index("m1 =")].replace("acrobot", "own")
+    + """\
+mc = 1.0
+mu = 0.0
+lag = -0.1
+lc = 0.0
+Imax = -3.0
+friction = "none"
+actuated_joint = 1
+"""
+    + GOOD[GOOD.index("\n[sampling]") : GOOD.index("\n[measurement]")]
+    + """
+[measurement]
+columns = ["x"]
+"""
+)
+
+
 def _read(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
     return read_rig(path, SYSTEMS)
+
+
+def test_names_of_ones_own_are_no_masses_and_lengths(tmp_path):
+    rig = _read(tmp_path, OWN)
+    assert (rig.parameters["mu"].mean, rig.parameters["lag"].mean) == (0.0, -0.1)
+    units = {"mc": "kg", "mu": "SI", "lag": "SI", "lc": "m", "Imax": "SI", "m1": "kg", "lc2": "m", "I2": "kg m^2"}
+    assert {name: parameter_unit(name) for name in units} == units
+    with pytest.raises(RigError, match=r"mc: found 0\.0; write a mass above 0"):
+        _read(tmp_path, OWN.replace("mc = 1.0", "mc = 0.0"))
+    with pytest.raises(RigError, match=r"lc: found -0\.1; write 0 or more \[m\]"):
+        _read(tmp_path, OWN.replace("lc = 0.0", "lc = -0.1"))
 
 
 def test_all_that_is_declared_is_read(tmp_path):

@@ -106,6 +106,12 @@ def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     np.testing.assert_array_equal(stored.fitted.model.unknown(v), fitted.model.unknown(v))
 
 
+def test_a_path_may_be_a_string(tmp_path):
+    fitted = _fitted(RIGS[0])
+    save(f"{tmp_path}/model.npz", fitted)
+    assert _bits(load(f"{tmp_path}/model.npz")) == _bits(fitted)
+
+
 def test_settings_of_the_fit_are_kept(tmp_path):
     fitted = _fitted("slide")
     rule = eqx.tree_at(lambda m: m.ridge, fitted.m_step, 0.25)

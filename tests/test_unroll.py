@@ -75,6 +75,13 @@ CASES = {
         jnp.where((x > 0.4) ^ (x > 0.6), x, 1.0) + (x > 0.4).astype(int).astype(float),
     ),
     "all quadrants": lambda x: (sin(20 * x), cos(20 * x), cos(-40 * x)),
+    "partly numbers": lambda x: (
+        jnp.where(~jnp.stack([x[0] > 0.4, jnp.asarray(True), jnp.asarray(False)]), x, 9.0),
+        jnp.where(jnp.stack([x[0] > 0.4, jnp.asarray(True), jnp.asarray(False)]), jnp.asarray([1.0, 2.0, 3.0]), x),
+        jnp.stack([jnp.float64(1.0), jnp.float64(2.5), x[2]]) / jnp.asarray([2.0, 2.0, 0.3]),
+        jnp.round(jnp.stack([jnp.float64(0.5), jnp.float64(-1.5), 5 * x[1]])),
+        jnp.clip(jnp.stack([jnp.float64(0.5), jnp.float64(7.0), x[1]]), 0.6, 2.0),
+    ),
     "constants": lambda x: (jnp.full(3, jnp.inf), jnp.where(x > 9, -jnp.inf, x), -jnp.ones(3)),
 }
 
@@ -89,6 +96,17 @@ REFUSED = {
     "sort": (lambda x: (jnp.sort(x),), "'sort' has no plain NumPy form"),
     "a loop of unknown length": (lambda x: (jax.lax.while_loop(lambda y: y[0] < 9, lambda y: 2 * y, x),), "'while'"),
     "a long loop": (lambda x: (jax.lax.fori_loop(0, 9999, lambda i, y: y * x, x),), "a loop of 9999 passes"),
+    "whole numbers divided": (lambda x: (jax.lax.div((9 * x).astype(int), 2).astype(float),), "of whole numbers"),
+    "what is left of whole numbers": (
+        lambda x: (jax.lax.rem((9 * x).astype(int), 2).astype(float),),
+        "of whole numbers",
+    ),
+    "bits": (lambda x: ((~(9 * x).astype(int)).astype(float),), "'not' of whole numbers"),
+    "three cases": (
+        lambda x: (jax.lax.select_n(jnp.floor(3 * x).astype(jnp.int32), x, 2 * x, 3 * x),),
+        "'select_n' of more than two cases",
+    ),
+    "a half away from zero": (lambda x: (jax.lax.round(x),), "'round' away from zero"),
     "steered": (lambda x: (jax.lax.dynamic_slice(x, (jnp.argmax(x),), (1,)),), "has no plain NumPy form|other numbers"),
 }
 

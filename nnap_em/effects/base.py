@@ -92,9 +92,10 @@ class AbstractEffect(eqx.Module):
     """True for a force that depends on the position of its own joint alone."""
     linear: ClassVar[bool] = True
     """False where a probe itself, not its multiple, is the place to start a fit from."""
-
     held: ClassVar[bool] = False
     """True for a force with many parameters: their sensitivity is that of a force held over the step."""
+    read_off: ClassVar[bool] = False
+    """True for what is seen in the numbers themselves, before any fit."""
 
     joint: eqx.AbstractVar[int | None]
     """The joint that it acts on, counted from 1; None: all, or no joint."""
@@ -117,6 +118,11 @@ class AbstractEffect(eqx.Module):
     def inputs_named(self) -> tuple[str, ...]:
         """Of what it is a function, for laws without a name."""
         return ()
+
+    @property
+    def named(self) -> bool:
+        """False for a law without a name."""
+        return not self.inputs_named()
 
     def memory_scale(self) -> Float[Array, " memory"]:
         """Typical size of its own states."""

@@ -179,6 +179,8 @@ class HardStop(AbstractEffect):
     joint: int | None = eqx.field(static=True)
     reach: Scalar = known()
     """Range of the joint on the paths; stops that nearly touch each other are a spring in disguise."""
+    soft: Scalar = known()
+    """Log of the stiffness [N m/rad] at which a typical torque goes half a radian into a stop, which is none then."""
     channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
@@ -188,17 +190,19 @@ class HardStop(AbstractEffect):
             low, high = float(around.low[j - 1]), float(around.high[j - 1])
             k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
             middle = 0.5 * (low + high)
-            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), j, 2 * size)
-            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), j, 2 * size)
+            fixed = (j, 2 * size, np.log(0.1 * k))
+            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), *fixed)
+            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), *fixed)
             shares = (0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
             for above, below in itertools.product(shares, shares):
                 up, down = middle + above * size, middle - below * size
-                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), j, 2 * size)
+                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), *fixed)
                 out.append(Candidate(start, (probe,), spread))
         return out
 
     def possible(self):
-        return float(self.upper - self.lower) > 0.3 * float(self.reach)
+        apart = float(self.upper - self.lower) > 0.3 * float(self.reach)
+        return apart and float(self.stiffness) > float(self.soft)
 
     def force(self, scene, memory):
         assert self.joint is not None

@@ -88,6 +88,7 @@ class SensorQuantization(AbstractEffect):
     name: ClassVar[str] = "sensor_quantization"
     confirm: ClassVar[str] = "Look up the counts per turn of the encoder."
     units: ClassVar[dict[str, str]] = {"step": "unit of the channel"}
+    read_off: ClassVar[bool] = True
     step: Scalar
     channel: str | None = eqx.field(static=True)
     joint: int | None = eqx.field(static=True, default=None)

@@ -14,18 +14,20 @@ systems: dict[str, type[AbstractSystem]] = {
 }
 
 
-def spec(system: type[AbstractSystem]) -> SystemSpec:
-    """What `rig.toml` may say of a system."""
+def spec(system: type[AbstractSystem], driven: int = 1) -> SystemSpec:
+    """What `rig.toml` may say of a system, whose usual input drives the joint `driven`."""
     names = [f.name for f in dataclasses.fields(system) if f.name != "joints"]
     return SystemSpec(
         states=system.coordinates + system.rates,
         parameters=tuple(n for n in names if n not in system.optional),
         optional=system.optional,
         joints=len(system.coordinates),
+        driven=driven,
     )
 
 
 specs: dict[str, SystemSpec] = {name: spec(system) for name, system in systems.items()}
+specs["acrobot"] = spec(acrobot.Acrobot, *acrobot.drives)
 
 
 def register(name: str, system: type[AbstractSystem]) -> None:

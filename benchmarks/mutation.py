@@ -1,0 +1,51 @@
+"""Every place of `tests/mutants.py` broken in turn: a table of docs/trust.md.
+
+python benchmarks/mutation.py [--share 1/1]
+"""
+
+import argparse
+import os
+import platform
+import sys
+import tempfile
+from datetime import date
+from pathlib import Path
+
+import jax
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from mutants import MUTANTS, copy, run
+
+
+def main() -> None:
+    """Run the unbroken package, then every mutant, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--share", default="1/1", help="i/n: every n-th mutant from the i-th on")
+    first, every = map(int, parser.parse_args().share.split("/"))
+    share = MUTANTS[first - 1 :: every]
+    print(
+        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
+        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
+    )
+    tests = sorted({mutant.test for mutant in share})
+    with tempfile.TemporaryDirectory() as folder:
+        sound = run(copy(Path(folder)), *tests)
+    assert sound.passed == len(tests), sound.said
+    print(f"Unbroken: {sound.passed} of {len(tests)} tests pass.\n")
+    print("| broken | in | test | |\n| --- | --- | --- | --- |", flush=True)
+    killed = 0
+    for mutant in share:
+        with tempfile.TemporaryDirectory() as folder:
+            found = run(copy(Path(folder), mutant), mutant.test)
+        dead = found.failed == 1 and found.asserted
+        killed += dead
+        state = "red" if dead else "green" if found.passed else "does not run"
+        test = mutant.test.removeprefix("test_").replace(".py::test_", ": ").replace("_", " ")
+        print(f"| {mutant.what} | `{mutant.file}` | {test} | {state} |", flush=True)
+        if not dead:
+            print(found.said[-3000:], file=sys.stderr, flush=True)
+    print(f"\n{killed} of {len(share)} turn their test red.")
+
+
+if __name__ == "__main__":
+    main()

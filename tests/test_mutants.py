@@ -1,0 +1,45 @@
+"""The tests turn red where the core is broken: some of the mutants, and all of them still apply."""
+
+import ast
+import re
+
+import pytest
+from mutants import MUTANTS, ROOT, copy, run
+
+OFTEN = (
+    "sign of the Coriolis torque",
+    "sign of friction",
+    "weights of the Runge-Kutta stages",
+    "gain of the backward pass transposed",
+    "process noise left out",
+    "input one row late",
+    "a missing reading taken for 0",
+    "log weight of the readings missing",
+    "backward weights not normalised",
+    "M-step without its prior",
+)
+"""The others: `benchmarks/mutation.py`."""
+CHOSEN = [mutant for mutant in MUTANTS if mutant.what in OFTEN]
+
+
+def test_every_mutant_is_a_change_of_one_place_and_names_a_test():
+    assert len({mutant.what for mutant in MUTANTS}) == len(MUTANTS) and len(CHOSEN) == len(OFTEN)
+    for mutant in MUTANTS:
+        text = (ROOT / "nnap_em" / mutant.file).read_text()
+        assert text.count(mutant.text) == 1, mutant.what
+        broken = text.replace(mutant.text, mutant.instead)
+        assert ast.dump(ast.parse(broken)) != ast.dump(ast.parse(text)), mutant.what
+        file, _, name = mutant.test.partition("::")
+        assert re.search(rf"^def {name.partition('[')[0]}\(", (ROOT / "tests" / file).read_text(), re.MULTILINE), name
+
+
+def test_a_copy_is_green(tmp_path):
+    """The first two of their tests: the whole suite runs them all on the package itself."""
+    found = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN[:2]))
+    assert (found.passed, found.failed) == (2, 0), found.said
+
+
+@pytest.mark.parametrize("mutant", CHOSEN, ids=lambda mutant: mutant.what.replace(" ", "-"))
+def test_a_broken_copy_is_red(mutant, tmp_path):
+    found = run(copy(tmp_path, mutant), mutant.test)
+    assert found.failed == 1 and found.asserted, found.said

@@ -24,6 +24,9 @@ _END = 5.0  # times as large it must be in the first and last two rows, which ha
 _PAIR = 2.5  # times as large it must be where another row near by has to be left out to see it
 _AROUND = 10  # rows before and after a spike that say how restless the signal is
 _RESTLESS = 5.0  # times its own jerks that a spike must be
+_LEAST = 0.015  # of the standard deviation of the column: a smaller spike does no harm, and machines make small wiggles
+_QUICK = 3.0  # times what the curve of `_SIDE` neighbours misses that a spike from that of `_NEAR` must be
+_DOUBT = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them tell little
 _SHORT = 5.0  # times as large a run must be as a single reading: machines make short wiggles too
 _ORDER = 16  # of the linear prediction of an input
 _TRIALS = 40  # gaps that are made on purpose to see how well an input is told
@@ -151,33 +154,68 @@ def _is_spike(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone
     return False
 
 
-def _stands_out(
-    y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float, side: int, strict: float = 1.0
-) -> bool:
-    """Whether the run is far from the curve of `side` neighbours, and a jump or a kink explains the rows worse."""
+class _Fit(NamedTuple):
+    """The curve through the neighbours of a run."""
+
+    x: Float[np.ndarray, " row"]
+    """Rows, the run's among them, about its middle, over their number."""
+    y: Float[np.ndarray, " row"]
+    base: Float[np.ndarray, "row term"]
+    size: float
+    """How far the nearest reading of the run lies from it."""
+    rest: float
+    """The least squares that it leaves."""
+    freedom: int
+    end: bool
+    """Fewer than three neighbours on one side: at the end of the file."""
+
+
+def _fit(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], side: int) -> _Fit:
     seen = np.flatnonzero(np.isfinite(y))
     before, after = seen[seen < run[0]][-side:], seen[seen > run[-1]][:side]
-    end = min(before.size, after.size) < 2
-    if end:  # of the file
+    end = min(before.size, after.size) < 3
+    if end:
         before, after = seen[seen < run[0]][-_SIDE - 2 :], seen[seen > run[-1]][: _SIDE + 2]
     rows = np.concatenate([before, run, after])
     x = (rows - run.mean()) / (rows[-1] - rows[0])
     base = np.vander(x, 3 if end else 4)
     keep = ~np.isin(rows, run)
-    coefficients = np.linalg.lstsq(base[keep], y[rows][keep], rcond=None)[0]
-    left = y[rows] - base @ coefficients
-    rest, freedom = float(left[keep] @ left[keep]), int(keep.sum()) - base.shape[1]
-    spread = max(sigma, math.sqrt(rest / max(freedom, 1)))
-    strict *= _END if end else 1.0 if run.size == 1 else _SHORT
-    size = float(np.min(np.abs(left[~keep]))) / strict
-    if size < 1.1 * SPIKE * spread or size < _RESTLESS * _activity(y, run, sigma):
+    left = y[rows] - base @ np.linalg.lstsq(base[keep], y[rows][keep], rcond=None)[0]
+    rest, freedom = float(left[keep] @ left[keep]), max(int(keep.sum()) - base.shape[1], 1)
+    return _Fit(x, y[rows], base, float(np.min(np.abs(left[~keep]))), rest, freedom, end)
+
+
+def _stands_out(
+    y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float, side: int, strict: float = 1.0
+) -> bool:
+    """Whether the run is far from the curve of `side` neighbours, and a jump, a kink or both explain the rows worse."""
+    fit = _fit(y, run, side)
+    excess = max(fit.rest / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
+    spread = max(sigma, math.sqrt(fit.rest / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
+    size = fit.size / strict / (_END if fit.end else 1.0 if run.size == 1 else _SHORT)
+    if size < 1.1 * SPIKE * spread or size < _LEAST * float(np.std(y[np.isfinite(y)])):
         return False
-    return end or _without_a_break(x, base, y[rows]) > 1.5 * rest + _MARGIN * sigma**2
+    if size < _RESTLESS * _activity(y, run, sigma):
+        return False
+    if fit.end:
+        return True
+    if side < _SIDE and size < _QUICK * math.sqrt((wide := _fit(y, run, _SIDE)).rest / wide.freedom):
+        return False
+    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.rest + _MARGIN * sigma**2
+    return worse and _in_two(fit.x, fit.y) > 1.5 * fit.rest
 
 
-def _without_a_break(
-    x: Float[np.ndarray, " row"], base: Float[np.ndarray, "row term"], y: Float[np.ndarray, " row"]
-) -> float:
+def _in_two(x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]) -> float:
+    """The least squares that two parabolas leave, one up to a row and one from the next: an impact, a reversal."""
+    least = math.inf
+    for k in range(3, x.size - 2):
+        parts = [(np.vander(x[part], 3), y[part]) for part in (slice(k), slice(k, None))]
+        miss = [v - base @ np.linalg.lstsq(base, v, rcond=None)[0] for base, v in parts]
+        least = min(least, sum(float(m @ m) for m in miss))
+    return least
+
+
+def _broken(x: Float[np.ndarray, " row"], base: Float[np.ndarray, "row term"], y: Float[np.ndarray, " row"]) -> float:
     """The least squares that the curve and one jump or one kink, anywhere between the rows, leave."""
     corner = np.concatenate([x[1:-1], 0.5 * (x[1:] + x[:-1])])[:, None]
     breaks = np.concatenate([(x > corner) * 1.0, np.maximum(x - corner, 0.0)])
@@ -211,20 +249,21 @@ def _frozen(
     """Saturated, stuck and late: kinds and rows."""
     y = readings[name]
     runs = _runs(y)
-    if not runs or max(run.length for run in runs) >= np.isfinite(y).sum():
+    first, end = np.array(runs, int).reshape(-1, 2).T
+    lengths = end - first
+    if lengths.max(initial=0) >= np.isfinite(y).sum():
         return
-    lengths = np.array([run.length for run in runs])
     usual = float(np.median(np.repeat(lengths, lengths)))
     full = np.zeros(y.size, bool)
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
-        there = [run for run in runs if y[run.first] == limit and run.length >= max(3, 2 * usual)]
+        there = [runs[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]
         if limit in limits or any(_beyond(name, readings, run, sign, dt) for run in there):
             full |= _closed(y == limit) & np.isfinite(y)
     if full.any():
         yield FULL, np.flatnonzero(full)
-    lively = sum(1 < run.length < STILL and not full[run.first] for run in runs) <= 0.002 * y.size
-    for run in runs:
-        if run.length >= max(STILL, 3 * usual) and not full[run.first] and _stuck(name, readings, run, dt, lively):
+    lively = bool(np.sum((lengths > 1) & (lengths < STILL) & ~full[first]) <= 0.002 * y.size)
+    for run in (runs[i] for i in np.flatnonzero((lengths >= max(STILL, 3 * usual)) & ~full[first])):
+        if _stuck(name, readings, run, dt, lively):
             late = run.first == np.flatnonzero(np.isfinite(y))[0]
             yield "late start" if late else "stuck", np.arange(run.first + (not late), run.end)
 

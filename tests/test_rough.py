@@ -106,6 +106,20 @@ def test_what_machines_do_is_left_alone(case, tmp_path):
     assert (logs.masked, logs.as_read) == ((), logs.data)
 
 
+WIGGLES = {
+    "impacts": plant.Case(effects=plant.STRONG["backlash"], seed=49),
+    "reversals in a dead zone": plant.Case(effects=plant.STRONG["dead_zone"], seed=64),
+    "reversals": plant.Case(seed=44),
+}
+"""At a fiftieth of the usual noise, each had alarms before two parabolas were held against a spike."""
+
+
+@pytest.mark.parametrize("case", WIGGLES.values(), ids=WIGGLES)
+def test_wiggles_without_noise_to_hide_them_are_left_alone(case, tmp_path):
+    plant.write(case._replace(hidden=False, sequences=4, tests=1, noise=(1e-4, 1e-3)), tmp_path)
+    assert read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs)).masked == ()
+
+
 @pytest.mark.parametrize("name", NOISE)
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_stuck_sensor_is_found_by_what_the_other_says(name, level):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from .build import NO_MACHINE, Scales, build, measure_scales, reading_noise
-from .data import Dataset, Logs, horizon
+from .data import Dataset, Logs, Masked, horizon
 from .formats import Array
 from .friction import NoFriction
 from .model import StateSpaceModel
@@ -49,7 +49,7 @@ class Along(NamedTuple):
 def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[Finding]:
     """Every finding on a data set, or what is missing where there is too little of it; nothing is fitted."""
     data = Dataset(*(np.asarray(part) for part in train.data))
-    amount = [*_amount(rig, data, test), *_missing(train, rig)]
+    amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
     if amount[0].mark == BAD:
         return amount
     try:
@@ -114,6 +114,20 @@ def _missing(train: Logs, rig: Rig) -> Iterator[Finding]:
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
         text += f", most in {train.files[worst]}" if share else ""
         yield Finding(_mark(share > 0.2, share > 0.75), "missing", text)
+
+
+def _rough(train: Logs) -> Iterator[Finding]:
+    """What was masked at reading, and how much of each column it is."""
+    total = int(np.asarray(train.data.valid).sum())
+    for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
+        here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
+        count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
+        text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
+        yield Finding(_mark(True, count > 0.3 * total), "rough", f"{text}, most in {max(here, key=_amount_of).file}")
+
+
+def _amount_of(entry: Masked) -> int:
+    return entry.amount
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[Finding]:

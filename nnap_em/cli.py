@@ -160,6 +160,11 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 
+    for reads in (check, identify, diagnose, predict, smooth):
+        reads.add_argument(
+            "--trust-readings", action="store_true", help="use spikes and what a stuck, late or saturated sensor reads"
+        )
+
     export = command("export", "write a fitted model for other programs", _EXPORT)
     export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
     export.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the files")

@@ -46,7 +46,7 @@ from .simulate import Experiment, examples, sweep_experiment
 from .smoother import AbstractSmoother, CubatureSmoother, ExtendedKalmanSmoother, StartBank
 from .store import Stored, fingerprint, notes, read, save
 from .systems import specs
-from .tables import state_unit, visited_nodes, write_friction, write_json
+from .tables import masked, state_unit, visited_nodes, write_friction, write_json
 
 
 class Halted(RuntimeError):
@@ -145,7 +145,7 @@ def run_init(args: argparse.Namespace, say: Say) -> None:
 
 def run_check(args: argparse.Namespace, say: Say) -> int:
     """Say whether the logs can identify what is asked, a line per question; 1 where they cannot."""
-    rig, train, test = _read(args.folder)
+    rig, train, test = _read(args.folder, args.trust_readings)
     found = check(rig, train, test, key=jax.random.key(0))
     for finding in found:
         print(f"{finding.mark:4}  {finding.subject:8}  {finding.text}")
@@ -157,7 +157,7 @@ def run_check(args: argparse.Namespace, say: Say) -> int:
 def run_identify(args: argparse.Namespace, say: Say) -> None:
     """Fit the declared unknowns to the training logs; the test logs serve for the reported error alone."""
     began = time.perf_counter()
-    rig, train, test = _read(args.folder)
+    rig, train, test = _read(args.folder, args.trust_readings)
     _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
@@ -183,7 +183,7 @@ def run_identify(args: argparse.Namespace, say: Say) -> None:
 def run_diagnose(args: argparse.Namespace, say: Say) -> None:
     """Find what the declared model lacks, and report it; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
-    rig, train, test = _read(args.folder)
+    rig, train, test = _read(args.folder, args.trust_readings)
     _warn_of_torques(args.folder, rig, train)
     mark = fingerprint(train.data)
     journal = Journal(
@@ -213,7 +213,7 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
 def run_predict(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after the readings up to the given time."""
     fitted = read(_model_file(args.model)).fitted
-    logs = read_logs(args.folder, fitted.rig)
+    logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
     found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
     _write_states(args.out, logs, fitted, np.asarray(found.mean), np.asarray(found.std))
     say(f"wrote {len(logs.files)} files to {args.out}")
@@ -222,7 +222,7 @@ def run_predict(args: argparse.Namespace, say: Say) -> None:
 def run_smooth(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after all readings of the sequence."""
     fitted = read(_model_file(args.model)).fitted
-    logs = read_logs(args.folder, fitted.rig)
+    logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
     state = smoothed_states(fitted, logs.data)
     std = np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     _write_states(args.out, logs, fitted, np.asarray(state.mean), std)
@@ -247,11 +247,11 @@ commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
 }
 
 
-def _read(folder: Path) -> tuple[Rig, Logs, Logs | None]:
+def _read(folder: Path, trust: bool) -> tuple[Rig, Logs, Logs | None]:
     """A data set; test logs only where there are any."""
     rig = read_rig(folder / "rig.toml", specs)
-    train = read_logs(folder / "train", rig)
-    test = read_logs(folder / "test", rig) if has_logs(folder / "test") else None
+    train = read_logs(folder / "train", rig, trust=trust)
+    test = read_logs(folder / "test", rig, trust=trust) if has_logs(folder / "test") else None
     check_split(train, test)
     return rig, train, test
 
@@ -409,15 +409,20 @@ def _how_to_go_on(args: argparse.Namespace, history: list) -> str:
         return "stopped before the end of the first epoch; nothing was kept"
     command = ["nnap-em", "identify", str(args.folder), "--out", str(args.out), "--smoother", args.smoother]
     command += ["--particles", str(args.particles)] if args.particles else []
-    command += ["--epochs", str(args.epochs), "--seed", str(args.seed), "--resume"]
+    command += ["--epochs", str(args.epochs), "--seed", str(args.seed), *_trusting(args), "--resume"]
     return f"stopped after epoch {kept}; to go on: {shlex.join(command)}"
 
 
 def _how_to_go_on_finding(args: argparse.Namespace, journal: Journal) -> str:
     if not len(journal):
         return "stopped before the end of the first step; nothing was kept"
-    command = ["nnap-em", "diagnose", str(args.folder), "--out", str(args.out), "--seed", str(args.seed), "--resume"]
+    command = ["nnap-em", "diagnose", str(args.folder), "--out", str(args.out), "--seed", str(args.seed)]
+    command += [*_trusting(args), "--resume"]
     return f"stopped with {len(journal)} finished steps kept; to go on: {shlex.join(command)}"
+
+
+def _trusting(args: argparse.Namespace) -> list[str]:
+    return ["--trust-readings"] * args.trust_readings
 
 
 @contextmanager
@@ -468,7 +473,7 @@ def _report(
     error = None
     if test:
         found = predict(fitted, test.data, GIVEN, key=jax.random.key(0))
-        error = horizon_errors(found, fitted, test.data, GIVEN)
+        error = horizon_errors(found, fitted, test.as_read, GIVEN)
         for name, values in error.items():
             pairs = zip(HORIZONS, values, strict=True)
             say(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
@@ -499,6 +504,7 @@ def _report(
         "log_likelihood": fitted.state.loglik.tolist(),
         "epochs": [{**e, "left_out": [train.files[i] for i in e["left_out"]]} for e in history],
         "left_out": [train.files[i] for i in history[-1]["left_out"]],
+        "masked": masked(train, test),
         "smoother": args.smoother,
         "seed": args.seed,
         "seconds": time.perf_counter() - began,

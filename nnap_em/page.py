@@ -106,6 +106,7 @@ def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
         _section("Before and after" if effects else "Prediction error", _before_after(document) + drawn("error")),
         _section("What the declared model leaves unexplained", drawn("residual")),
         _section("What could not be told apart", _alike(effects)),
+        _section("What was not used of the logs", _masked(document.get("masked") or [])),
         _section("What to measure next", _list(document.get("next") or [])),
         _section("Details", _details(document, drawn("details"))),
     ]
@@ -424,6 +425,23 @@ def _alike(effects: Sequence[Mapping[str, Any]]) -> str:
     if not rows:
         return "<p>Nothing: no other effect that was tried explains these data nearly as well.</p>"
     return _list(row[0].upper() + row[1:] for row in rows)
+
+
+def _masked(entries: Sequence[Mapping[str, Any]]) -> str:
+    if not entries:
+        return ""
+    head = "".join(f"<th>{h}</th>" for h in ("file", "column", "what", "how many", "first at"))
+    rows = []
+    for e in entries:
+        told = (f"{e.get('part')}/{e.get('file')}", e.get("column") or "all", e.get("kind"), e.get("amount"))
+        cells = "".join(f"<td>{escape(str(cell))}</td>" for cell in told)
+        rows.append(f"<tr>{cells}<td>{number(e.get('time'), 4)} s</td></tr>")
+    return (
+        "<p>These readings were taken as missing: they are far from what the rows around them say, or their sensor "
+        "stood still while the machine moved. <i>gap</i>: rows that the log lost; <i>cut</i>: rows after a gap that "
+        "nothing could bridge. Errors of prediction are against all readings of the test files. "
+        "<code>--trust-readings</code> uses the readings as they are.</p>"
+    ) + _box(f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>", "left")
 
 
 def _list(sentences: Iterable[Any]) -> str:

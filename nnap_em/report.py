@@ -25,7 +25,7 @@ from .page import Picture, page
 from .predict import HORIZONS, horizon_errors, predict
 from .residual import Residual, names_of, residual, tests
 from .rig import parameter_unit
-from .tables import state_unit, visited_nodes, write_friction, write_json
+from .tables import masked, state_unit, visited_nodes, write_friction, write_json
 
 GIVEN = 1.0
 """Readings before a prediction [s]."""
@@ -51,7 +51,7 @@ def write_diagnosis(
     predictions = {n: predict(f, test.data, GIVEN, key=jax.random.key(0)) for n, f in sides.items()} if test else {}
     error = None
     if test:
-        errors = {n: horizon_errors(p, sides[n], test.data, GIVEN) for n, p in predictions.items()}
+        errors = {n: horizon_errors(p, sides[n], test.as_read, GIVEN) for n, p in predictions.items()}
         error = {"given_s": GIVEN, "horizons_s": list(HORIZONS), "before": errors["before"]}
         error["after"] = errors.get("after", errors["before"])
     residuals = {n: residual(f, train.data) for n, f in sides.items()}
@@ -72,6 +72,7 @@ def write_diagnosis(
         "parameters": {n: _parameters(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "noise": {n: _noise(f) for n, f in (("before", closed.before), ("after", closed.after))},
         "looks": [_look(closed, step) for step in closed.steps],
+        "masked": masked(train, test),
         "next": advice(found),
         "seed": seed,
         "versions": {"nnap_em": __version__, "python": platform.python_version()}

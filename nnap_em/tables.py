@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from .data import Logs
 from .files import replace_text
 from .formats import write_csv
 from .systems import AbstractSystem
@@ -39,6 +40,12 @@ def write_friction(path: Path, velocity, torque, std) -> None:
     joint = np.repeat(1 + np.arange(velocity.shape[0]), velocity.shape[1])
     columns = {"velocity": velocity, "torque": torque, "torque_std": std}
     write_csv(path, {"joint": joint} | {name: np.asarray(values).ravel() for name, values in columns.items()})
+
+
+def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
+    """What no fit and no filter saw of the logs, as reports have it."""
+    parts = (("train", train), ("test", test))
+    return [{"part": part, **entry._asdict()} for part, logs in parts if logs for entry in logs.masked]
 
 
 def state_unit(system: AbstractSystem, name: str) -> str:

@@ -136,6 +136,10 @@ def _wrap(theta):
     return (theta + 1.0) % (2.0 * np.pi)
 
 
+def _random():
+    return np.random.default_rng(0).normal(0.0, 0.1, 201)
+
+
 def _jitter(t):
     return t + 0.0002 * (np.arange(t.size) == 7)
 
@@ -169,7 +173,18 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "row too short": (lambda s: s.replace("\n0.03,", "\n"), "line 5", "3 fields under 4 names", "every column a field"),
     "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
     "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
-    "gap": (lambda s: s.replace(s.splitlines()[6] + "\n", ""), "line 7, column 'time'", "a gap: 0.04", "empty field"),
+    "gap of half a row": (
+        _column("time", lambda t: t + 0.004 * (np.arange(t.size) > 4)),
+        "line 7, column 'time'",
+        "jitter: 0.04",
+        "empty field",
+    ),
+    "gaps everywhere": (
+        lambda s: "".join(line for i, line in enumerate(s.splitlines(True)) if i % 3 or not i),
+        "column 'time'",
+        "a gap: 0.01 s, then 0.03 s (66 places in all)",
+        "resample",
+    ),
     "row twice": (
         lambda s: s.replace("\n0.04,", "\n0.03,"),
         "line 6, column 'time'",
@@ -315,6 +330,44 @@ FOLDERS = {  # name: (the change of the folder, the file, then the words of the 
 }
 ERRORS = FOLDERS | {name: (_log_file(change), "train/01.csv", *words) for name, (change, *words) in LOGS.items()}
 WARNINGS = {  # what may be meant: name: (the change of the folder, then the words of the warning)
+    "gap": (
+        _log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
+        "line 7, column 'time'",
+        "a gap: 0.04 s, then 0.06 s (1 rows are missing in all)",
+        "inputs there are told from the rows around",
+    ),
+    "gap in noisy inputs": (
+        _log_file(
+            lambda _: _text({name: np.delete(x, range(100, 110)) for name, x in (_log(0.0) | {"u": _random()}).items()})
+        ),
+        "line 102, column 'time'",
+        "a gap: 0.99 s, then 1.1 s (91 rows follow in all)",
+        "cannot be told: not used",
+    ),
+    "spike": (
+        _log_file(_field(50, "theta1", "0.5")),
+        "line 50, column 'theta1'",
+        "1 reading far from what the readings before and after say (spike), the first at 0.48 s",
+        "--trust-readings",
+    ),
+    "stuck": (
+        _log_file(_column("theta1", lambda x: np.where(np.arange(x.size) // 40 == 2, x[80], x))),
+        "line 83, column 'theta1'",
+        "39 readings one value over again while the machine moves (stuck)",
+        "--trust-readings",
+    ),
+    "late sensor": (
+        _log_file(_column("dtheta1", lambda x: np.where(np.arange(x.size) < 30, 0.0, x))),
+        "line 2, column 'dtheta1'",
+        "30 readings one value over again until the sensor starts (late start)",
+        "--trust-readings",
+    ),
+    "saturated": (
+        _log_file(_column("dtheta1", lambda x: np.maximum(x, -5.0))),
+        "column 'dtheta1'",
+        "at the end of the sensor's range while the machine goes beyond (saturated)",
+        "--trust-readings",
+    ),
     "constant": (
         _log_file(_column("theta1", lambda x: 0 * x + 0.25)),
         "train/01.csv",

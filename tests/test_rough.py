@@ -1,0 +1,297 @@
+"""Rough logs: what is put in is found, what is right is left alone, and a fit survives it."""
+
+import warnings
+
+import jax
+import numpy as np
+import plant
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_data import _rig, _swing
+
+from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, specs
+from nnap_em.check import check
+from nnap_em.data import Logs
+from nnap_em.formats import DataError, DataWarning, write_csv
+from nnap_em.plausible import Columns
+from nnap_em.rough import retell, rough, spikes
+
+DT, ROWS = 0.01, 501
+NOISE = {"theta1": 0.005, "dtheta1": 0.05}
+LEVELS = (1.0, 1e-2, 0.0)
+"""Of the noise: that of `NOISE`, hardly any, none."""
+
+
+def _motion(seed: int, level: float = 1.0) -> dict[str, np.ndarray]:
+    """An angle of three slow sines, its exact rate, and noise."""
+    rng, t = np.random.default_rng(seed), DT * np.arange(ROWS)
+    size, speed, phase = rng.uniform(0.2, 1.0, (3, 1)), rng.uniform(1.0, 9.0, (3, 1)), rng.uniform(0, 6.3, (3, 1))
+    clean = {"theta1": size * np.sin(speed * t + phase), "dtheta1": size * speed * np.cos(speed * t + phase)}
+    return {n: y.sum(axis=0) + level * NOISE[n] * rng.standard_normal(ROWS) for n, y in clean.items()}
+
+
+def _found(readings: Columns) -> dict[tuple[str, str], set[int]]:
+    return {(entry.kind, entry.column): set(entry.rows.tolist()) for entry in rough(readings, DT)}
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10**6), level=st.sampled_from(LEVELS), step=st.sampled_from([0.0, 1e-3, 0.05]))
+def test_smooth_motion_is_left_alone(seed, level, step):
+    """No alarm among 40 x 1002 readings with Gaussian noise, none, or steps; each costs 1e-8 by the threshold."""
+    readings = _motion(seed, level)
+    if step:
+        readings["theta1"] = step * np.round(readings["theta1"] / step)
+    assert _found(readings) == {}
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", NOISE)
+def test_spikes_are_found_row_by_row(name, level):
+    """Far ones all, none beside them."""
+    for seed in range(5):
+        readings, rng = _motion(seed, level), np.random.default_rng(seed)
+        rows = rng.choice(np.arange(5, ROWS - 5, 7), 5, replace=False)
+        readings[name][rows] += 40 * NOISE[name] * rng.choice([-1, 1], 5)
+        assert _found(readings) == {("spike", name): set(rows.tolist())}
+
+
+def test_two_or_three_rows_are_a_spike_and_ten_are_none():
+    for length in (2, 3, 10):
+        readings = _motion(length)
+        readings["theta1"][200 : 200 + length] += 1.0
+        assert set(spikes(readings["theta1"]).tolist()) == (set(range(200, 200 + length)) if length < 4 else set())
+
+
+def test_a_missing_neighbour_hides_no_spike():
+    readings = _motion(3)
+    readings["theta1"][[148, 153]], readings["theta1"][150] = np.nan, 9.0
+    assert _found(readings) == {("spike", "theta1"): {150}}
+    readings["theta1"][1::2] = np.nan
+    assert _found(readings) == {("spike", "theta1"): {150}}
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_an_impact_is_no_spike(level):
+    """A rate that jumps and its angle that kinks, there and back within some rows; also a ramp that begins and ends."""
+    t, rng = DT * np.arange(ROWS), np.random.default_rng(0)
+    for length in (4, 8, 30):
+        rate = 3.0 * np.sign(((np.arange(ROWS) // length) % 2) - 0.5) + 0.2 * np.sin(5 * t)
+        angle = DT * np.cumsum(rate)
+        noise = {n: level * s * rng.standard_normal(ROWS) for n, s in NOISE.items()}
+        assert _found({"theta1": angle + noise["theta1"], "dtheta1": rate + noise["dtheta1"]}) == {}
+    held = np.clip(np.arange(ROWS) - 200.0, 0.0, 60.0)
+    assert _found({"x": held}) == {}
+
+
+RIGS = {
+    "hard stop": plant.Case(effects=plant.STRONG["hard_stop"], sequences=1, tests=1, hidden=False),
+    "backlash": plant.Case(effects=plant.STRONG["backlash"], sequences=1, tests=1, noise=(1e-4, 1e-3)),
+    "steps": plant.Case(effects=plant.STRONG["sensor_quantization"], sequences=1, tests=1),
+    "pre-sliding": plant.Case(
+        system="slide",
+        effects=({"name": "presliding_friction", "joint": 1, "sigma0": 300.0},),
+        sequences=1,
+        tests=1,
+        noise=(1e-5, 1e-5),
+        hidden=False,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", RIGS.values(), ids=RIGS)
+def test_what_machines_do_is_left_alone(case, tmp_path):
+    plant.write(case._replace(steps=200), tmp_path)
+    logs = read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs))  # a warning would be an error
+    assert (logs.masked, logs.as_read) == ((), logs.data)
+
+
+WIGGLES = {
+    "impacts": plant.Case(effects=plant.STRONG["backlash"], seed=49),
+    "reversals in a dead zone": plant.Case(effects=plant.STRONG["dead_zone"], seed=64),
+    "reversals": plant.Case(seed=44),
+}
+"""At a fiftieth of the usual noise, each had alarms before two parabolas were held against a spike."""
+
+
+@pytest.mark.parametrize("case", WIGGLES.values(), ids=WIGGLES)
+def test_wiggles_without_noise_to_hide_them_are_left_alone(case, tmp_path):
+    plant.write(case._replace(hidden=False, sequences=4, tests=1, noise=(1e-4, 1e-3)), tmp_path)
+    assert read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs)).masked == ()
+
+
+@pytest.mark.parametrize("name", NOISE)
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_stuck_sensor_is_found_by_what_the_other_says(name, level):
+    readings = _motion(4, level)
+    readings[name][151:201] = readings[name][150]
+    ((kind, column), rows), *more = _found(readings).items()
+    assert (column, more) == (name, [])
+    assert kind in ("stuck", "saturated")
+    assert set(range(151, 201)) <= rows <= set(range(150, 201))
+
+
+def test_a_stuck_sensor_is_found_alone():
+    """By the jump where it wakes up; and where it wakes up at the same place, by the noise that it lacks."""
+    theta = _motion(5)["theta1"]
+    theta[151:201] = theta[150]
+    assert _found({"theta1": theta}) == {("stuck", "theta1"): set(range(151, 201))}
+    rest = np.random.default_rng(0).normal(0.0, 0.005, ROWS)
+    rest[151:201] = rest[150]
+    assert _found({"theta1": rest}) == {("stuck", "theta1"): set(range(151, 201))}
+
+
+def test_a_machine_at_rest_is_not_stuck():
+    """An encoder that stands still, moves, and stands still: its rate is 0 meanwhile."""
+    t = DT * np.arange(ROWS)
+    theta = np.where(t < 1, 0.0, np.where(t < 4, 1 - np.cos(np.pi * (t - 1)), 2.0))
+    counts = 1e-3 * np.round(theta / 1e-3)
+    rate = np.where((t > 1) & (t < 4), np.pi * np.sin(np.pi * (t - 1)), 0.0)
+    assert _found({"theta1": counts, "dtheta1": rate}) == {}
+    assert _found({"theta1": counts}) == {}
+    assert _found({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
+
+
+@pytest.mark.parametrize("alone", [False, True], ids=["with its rate", "alone"])
+def test_a_late_sensor_is_found(alone):
+    readings = _motion(6)
+    readings["theta1"][:30] = 0.0
+    assert _found({"theta1": readings["theta1"]} if alone else readings) == {("late start", "theta1"): set(range(30))}
+
+
+@pytest.mark.parametrize("alone", [False, True], ids=["with its angle", "alone"])
+def test_a_saturated_sensor_is_found(alone):
+    readings = _motion(7)
+    limit = float(np.percentile(readings["dtheta1"], 90))
+    beyond = set(np.flatnonzero(readings["dtheta1"] > limit).tolist())
+    readings["dtheta1"] = np.minimum(readings["dtheta1"], limit)
+    ((what, rows),) = _found({"dtheta1": readings["dtheta1"]} if alone else readings).items()
+    assert what == ("saturated", "dtheta1")
+    assert beyond <= rows
+    assert len(rows - beyond) < 0.2 * len(beyond)  # rows between two that are full
+
+
+@pytest.mark.parametrize("length", [1, 8, 25])
+def test_an_input_of_sines_is_told_over_a_gap(length):
+    t = DT * np.arange(ROWS)
+    u = 0.2 * np.sin(7 * t) + 0.1 * np.sin(23 * t + 1)
+    lost = (np.arange(ROWS) >= 200) & (np.arange(ROWS) < 200 + length)
+    told = retell(np.where(lost, np.nan, u), lost)
+    np.testing.assert_allclose(told.u, u, atol=1e-3)
+    assert (told.doubt[lost] < 0.01).all()
+    assert (told.doubt[~lost] == 0).all()
+
+
+def test_an_input_of_noise_is_not_trusted_over_a_gap():
+    u, lost = np.random.default_rng(0).standard_normal(ROWS), np.arange(ROWS) // 8 == 25
+    assert (retell(np.where(lost, np.nan, u), lost).doubt[lost] > 1).all()
+    assert retell(np.where(lost, np.nan, 0.0), lost).u.tolist() == [0.0] * ROWS
+
+
+# --- through the reader
+
+
+def _write(folder, columns, kept=None):
+    kept = np.ones(len(columns["time"]), bool) if kept is None else kept
+    write_csv(folder / "01.csv", {name: values[kept] for name, values in columns.items()})
+
+
+def _read(folder, **options) -> tuple[Logs, list[str]]:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        logs = read_logs(folder, _rig(), **options)
+    return logs, [str(w.message) for w in said]
+
+
+def test_what_is_masked_is_said_and_kept_aside(tmp_path):
+    columns = _swing() | {"theta1": _swing()["theta1"].copy()}
+    columns["theta1"][[40, 90]] += 0.5
+    _write(tmp_path, columns)
+    logs, (said,) = _read(tmp_path)
+    assert "01.csv: line 42, column 'theta1': 2 readings far from" in said
+    assert "--trust-readings" in said
+    (entry,) = logs.masked
+    assert entry[:4] == ("01.csv", "spike", "theta1", 41)
+    assert (entry.time, entry.amount) == (0.4, 2)
+    assert np.argwhere(np.isnan(logs.data.y[0])).tolist() == [[40, 0], [90, 0]]
+    np.testing.assert_allclose(logs.as_read.y[0, :, 0], columns["theta1"], rtol=1e-9)
+    trusted, silence = _read(tmp_path, trust=True)
+    assert (silence, trusted.masked) == ([], ())
+    np.testing.assert_array_equal(trusted.data.y, logs.as_read.y)
+    for one, other in zip(
+        (logs.data.t, logs.data.u, logs.data.valid), trusted.data[:2] + trusted.data[3:], strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_lost_rows_come_back_without_readings(tmp_path):
+    columns, kept = _swing(), np.ones(201, bool)
+    kept[50:60] = kept[100] = False
+    _write(tmp_path, columns, kept)
+    logs, (said,) = _read(tmp_path)
+    assert "line 52, column 'time': a gap: 0.49 s, then 0.6 s (11 rows are missing in all)" in said
+    np.testing.assert_allclose(logs.data.t[0], columns["time"], atol=1e-9)
+    np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], atol=1e-4)
+    np.testing.assert_array_equal(np.isnan(logs.data.y[0]).all(axis=1), ~kept)
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("gap", 51, 11)]
+
+
+def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
+    columns, kept = _swing(), np.ones(201, bool)
+    columns["u"] = np.random.default_rng(0).standard_normal(201)
+    kept[120:125] = False
+    _write(tmp_path, columns, kept)
+    logs, (said,) = _read(tmp_path)
+    assert "inputs before these rows were lost and cannot be told" in said
+    assert logs.data.valid.sum() == 120
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("cut", 121, 76)]
+
+
+@pytest.mark.parametrize("kept", [np.arange(201) % 3 > 0, (np.arange(201) < 60) | (np.arange(201) > 140)])
+def test_a_log_with_too_many_gaps_is_refused(tmp_path, kept):
+    _write(tmp_path, _swing(), kept)
+    with pytest.raises(DataError, match=r"a gap|rows are"):
+        read_logs(tmp_path, _rig(clock="session"))
+
+
+def test_a_limit_seen_in_one_file_holds_for_all(tmp_path):
+    """The second file touches it twice only."""
+    t = DT * np.arange(301)
+    for i, size in enumerate((4.0, 3.006)):
+        rate = np.minimum(size * np.cos(2 * t + 1), 3.0)
+        columns = {"time": t, "u": 0 * t, "theta1": size / 2 * np.sin(2 * t + 1), "dtheta1": rate}
+        write_csv(tmp_path / f"{i}.csv", columns)
+    with pytest.warns(DataWarning):
+        logs = read_logs(tmp_path, _rig())
+    assert {(m.file, m.kind, m.column) for m in logs.masked} == {(f"{i}.csv", "saturated", "dtheta1") for i in range(2)}
+    assert not (np.asarray(logs.data.y)[..., 1] == 3.0).any()
+
+
+# --- through a fit
+
+SLIDE = plant.Case(system="slide", hidden=False, sequences=6, tests=2, steps=200, noise=(5e-4, 5e-3), seed=4)
+
+
+def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
+    plant.write(SLIDE, tmp_path)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    train, test = (read_logs(tmp_path / part, rig) for part in ("train", "test"))
+    rng = np.random.default_rng(0)
+    for path in sorted((tmp_path / "train").glob("*.csv")):
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        columns = {name: table[name] for name in table.dtype.names}
+        for name, std in zip(("x", "dx"), SLIDE.noise, strict=True):
+            columns[name] = columns[name] + 50 * std * (rng.random(len(table)) < 0.01)
+        write_csv(path, columns)
+    with pytest.warns(DataWarning, match="spike"):
+        spoilt = read_logs(tmp_path / "train", rig)
+
+    def error(logs: Logs) -> float:
+        fitted = identify(rig, logs.data, key=jax.random.key(0), epochs=6)
+        found = predict(fitted, test.data, 1.0, key=jax.random.key(0))
+        return horizon_errors(found, fitted, test.as_read, 1.0)["x"][3]
+
+    assert error(spoilt) < 1.3 * error(train)
+    told = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
+    assert [f.mark for f in told] == ["look", "look"]
+    assert "x: spike: " in told[0].text

@@ -1,8 +1,12 @@
 import os
+import signal
 from pathlib import Path
 
 # numbers are the same to the last bit for the same number of devices only, here and in the processes that tests start
 os.environ["JAX_NUM_CPU_DEVICES"] = "1"
+
+# a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
 import pytest

@@ -5,14 +5,13 @@ from pathlib import Path
 # numbers are the same to the last bit for the same number of devices only, here and in the processes that tests start
 os.environ["JAX_NUM_CPU_DEVICES"] = "1"
 
-# a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
-signal.signal(signal.SIGINT, signal.default_int_handler)
-
 import jax
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
+signal.signal(signal.SIGINT, signal.default_int_handler)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -187,7 +187,7 @@ def study(case: plant.Case, kind: str, trust: bool) -> dict[str, float | list[fl
         plant.write(case, folder)
         rig = read_rig(folder / "rig.toml", specs)
         done = spoil(folder, case, kinds(case, read_logs(folder / "train", rig))[kind])
-        train, test = read_logs(folder / "train", rig, trust=trust), read_logs(folder / "test", rig)
+        train, test = read_logs(folder / "train", rig, trust=trust), read_logs(folder / "test", rig, until=1.0)
     began = time.perf_counter()
     out: list[int] = []
     fitted = identify(
@@ -195,7 +195,7 @@ def study(case: plant.Case, kind: str, trust: bool) -> dict[str, float | list[fl
     )
     seconds = time.perf_counter() - began
     found = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-    error = horizon_errors(found, fitted, test.as_read, 1.0)[rig.measured[0]][HORIZONS.index(1.0)]
+    error = horizon_errors(found, fitted, test.data, 1.0)[rig.measured[0]][HORIZONS.index(1.0)]
     return {
         "error": error,
         "friction": friction_error(fitted, case),

@@ -39,7 +39,7 @@ from .loop import close_the_loop
 from .model import StateSpaceModel
 from .parallel import use_every_device
 from .particle import ParticleSmoother
-from .predict import HORIZONS, horizon_errors, predict, smooth, smoothed_states
+from .predict import GIVEN, HORIZONS, horizon_errors, predict, smooth, smoothed_states
 from .report import write_diagnosis
 from .rig import Declared, Rig, RigError, RigWarning, nearest, parameter_unit, read_rig, write_rig
 from .simulate import Experiment, examples, sweep_experiment
@@ -55,7 +55,6 @@ class Halted(RuntimeError):
 
 MISTAKES = (RigError, DataError, StoreError, FitError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
-GIVEN = 1.0  # s, of the reported error
 MODEL, CHECKPOINT, REPORT = "model.npz", "checkpoint.npz", "report.json"
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a diagnosis that is not."""
@@ -213,7 +212,7 @@ def run_diagnose(args: argparse.Namespace, say: Say) -> None:
 def run_predict(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after the readings up to the given time."""
     fitted = read(_model_file(args.model)).fitted
-    logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
+    logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
     found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
     _write_states(args.out, logs, fitted, np.asarray(found.mean), np.asarray(found.std))
     say(f"wrote {len(logs.files)} files to {args.out}")
@@ -248,10 +247,10 @@ commands: dict[str, Callable[[argparse.Namespace, Say], int | None]] = {
 
 
 def _read(folder: Path, trust: bool) -> tuple[Rig, Logs, Logs | None]:
-    """A data set; test logs only where there are any."""
+    """A data set; test logs only where there are any, as predictions of the reported error may see them."""
     rig = read_rig(folder / "rig.toml", specs)
     train = read_logs(folder / "train", rig, trust=trust)
-    test = read_logs(folder / "test", rig, trust=trust) if has_logs(folder / "test") else None
+    test = read_logs(folder / "test", rig, trust=trust, until=GIVEN) if has_logs(folder / "test") else None
     check_split(train, test)
     return rig, train, test
 
@@ -473,7 +472,7 @@ def _report(
     error = None
     if test:
         found = predict(fitted, test.data, GIVEN, key=jax.random.key(0))
-        error = horizon_errors(found, fitted, test.as_read, GIVEN)
+        error = horizon_errors(found, fitted, test.data, GIVEN)
         for name, values in error.items():
             pairs = zip(HORIZONS, values, strict=True)
             say(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))

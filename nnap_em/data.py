@@ -1,5 +1,6 @@
 """Sequences: logs read and checked once, padded to one length."""
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .formats import Array, DataError, DataWarning, log_files, place, read_table, refuse
-from .plausible import doubts, repeats
+from .plausible import Columns, doubts, repeats
 from .rig import Rig
 from .rough import FULL, Rough, retell, rough
 
@@ -71,24 +72,26 @@ class Logs:
 
     @property
     def as_read(self) -> Dataset:
-        """The readings of the files, those that are masked too: what errors are reported against."""
+        """The readings of the files, those that are masked too."""
         return self.data if self.unmasked is None else self.unmasked
 
     def __str__(self) -> str:
         return f"Logs {self.files[0]} to {self.files[-1]}: {', '.join(self.columns)}; {self.data}"
 
 
-def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False) -> Logs:
+def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
+    Those later than `until` [s after the first row] are neither masked nor asked: a prediction may not know of them.
     Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
     files = log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]
-    found = [[] if trust else rough(table.readings(rig), rig.dt) for table in tables]
-    if limits := {limit for table, each in zip(tables, found, strict=True) for limit in table.limits(each, rig)}:
-        found = [rough(table.readings(rig), rig.dt, limits) for table in tables]
+    early = [table.readings(rig, until) for table in tables]
+    found = [[] if trust else rough(readings, rig.dt) for readings in early]
+    if limits := {limit for readings, each in zip(early, found, strict=True) for limit in _limits(readings, each)}:
+        found = [rough(readings, rig.dt, limits) for readings in early]
     sequences = [_sequence(table, each, rig) for table, each in zip(tables, found, strict=True)]
     data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
     unmasked = pad([s.as_read for s in sequences]) if masked else None
@@ -156,13 +159,16 @@ class _Table(NamedTuple):
     """Where those of the file stand."""
     masked: list[Masked]
 
-    def readings(self, rig: Rig) -> dict[str, Float[np.ndarray, " time"]]:
-        return dict(zip(rig.measured, self.table[:, 1 + len(rig.input_columns) :].T, strict=True))
+    def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
+        """The columns of readings up to some seconds after the first row."""
+        early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
+        return dict(zip(rig.measured, self.table[early, 1 + len(rig.input_columns) :].T, strict=True))
 
-    def limits(self, found: Sequence[Rough], rig: Rig) -> set[tuple[str, float]]:
-        """Columns and the values at which they saturate."""
-        flat = [(entry.column, self.readings(rig)[entry.column][entry.rows]) for entry in found if entry.kind == FULL]
-        return {(column, float(limit)) for column, y in flat for limit in (y.min(), y.max()) if np.sum(y == limit) > 2}
+
+def _limits(readings: Columns, found: Sequence[Rough]) -> set[tuple[str, float]]:
+    """Columns and the values at which they saturate."""
+    flat = [(entry.column, readings[entry.column][entry.rows]) for entry in found if entry.kind == FULL]
+    return {(column, float(limit)) for column, y in flat for limit in (y.min(), y.max()) if np.sum(y == limit) > 2}
 
 
 class _Sequence(NamedTuple):

@@ -16,6 +16,7 @@ from .mstep import ParameterPrior
 from .parallel import each
 from .smoother import AbstractSmoother, CubatureSmoother, Posterior
 
+GIVEN = 1.0  # s of readings before a reported error
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
 

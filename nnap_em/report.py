@@ -22,13 +22,11 @@ from .identify import Identified, friction_table, parameter_table
 from .look import words
 from .loop import Closed
 from .page import Picture, page
-from .predict import HORIZONS, horizon_errors, predict
+from .predict import GIVEN, HORIZONS, horizon_errors, predict
 from .residual import Residual, names_of, residual, tests
 from .rig import parameter_unit
 from .tables import masked, state_unit, visited_nodes, write_friction, write_json
 
-GIVEN = 1.0
-"""Readings before a prediction [s]."""
 Say = Callable[[str], None]
 
 
@@ -51,7 +49,7 @@ def write_diagnosis(
     predictions = {n: predict(f, test.data, GIVEN, key=jax.random.key(0)) for n, f in sides.items()} if test else {}
     error = None
     if test:
-        errors = {n: horizon_errors(p, sides[n], test.as_read, GIVEN) for n, p in predictions.items()}
+        errors = {n: horizon_errors(p, sides[n], test.data, GIVEN) for n, p in predictions.items()}
         error = {"given_s": GIVEN, "horizons_s": list(HORIZONS), "before": errors["before"]}
         error["after"] = errors.get("after", errors["before"])
     residuals = {n: residual(f, train.data) for n, f in sides.items()}

@@ -224,6 +224,23 @@ def test_what_is_masked_is_said_and_kept_aside(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_prediction_knows_nothing_of_later_readings(tmp_path):
+    """Not even through a mask: whatever comes after the given time, what a filter sees is the same."""
+    seen = []
+    for later in ("as it is", "restless"):
+        columns = {name: values.copy() for name, values in _swing().items()}
+        columns["theta1"][[40, 100, 150]] += 0.5  # at .4 s, 1 s and 1.5 s
+        if later == "restless":  # beside this the first spike is none
+            columns["theta1"][101:] += np.random.default_rng(0).normal(0.0, 0.5, len(columns["time"]) - 101)
+        _write(tmp_path, columns)
+        logs, _ = _read(tmp_path, until=1.0)
+        seen.append((logs.masked, logs.data.y[:, :101]))
+        np.testing.assert_allclose(logs.data.y[0, 101:, 0], columns["theta1"][101:], rtol=1e-9)
+    assert [entry.row for entry in seen[0][0]] == [41]
+    assert seen[0][0] == seen[1][0]
+    np.testing.assert_array_equal(seen[0][1], seen[1][1])
+
+
 def test_lost_rows_come_back_without_readings(tmp_path):
     columns, kept = _swing(), np.ones(201, bool)
     kept[50:60] = kept[100] = False
@@ -289,7 +306,7 @@ def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
     def error(logs: Logs) -> float:
         fitted = identify(rig, logs.data, key=jax.random.key(0), epochs=6)
         found = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-        return horizon_errors(found, fitted, test.as_read, 1.0)["x"][3]
+        return horizon_errors(found, fitted, test.data, 1.0)["x"][3]
 
     assert error(spoilt) < 1.3 * error(train)
     told = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from .build import NO_MACHINE, Scales, build, measure_scales, reading_noise
-from .data import Dataset, Logs, Masked, horizon
+from .data import Dataset, Logs, horizon
 from .formats import Array
 from .friction import NoFriction
 from .model import StateSpaceModel
@@ -123,11 +123,11 @@ def _rough(train: Logs) -> Iterator[Finding]:
         here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
         count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
         text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
-        yield Finding(_mark(True, count > 0.3 * total), "rough", f"{text}, most in {max(here, key=_amount_of).file}")
-
-
-def _amount_of(entry: Masked) -> int:
-    return entry.amount
+        yield Finding(
+            _mark(True, count > 0.3 * total),
+            "rough",
+            f"{text}, most in {max(here, key=lambda entry: entry.amount).file}",
+        )
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[Finding]:

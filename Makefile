@@ -1,13 +1,16 @@
 # make demo | make test | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
 PYTHON ?= python3
 PYTEST_FLAGS ?= -n 2
+# What `make matrix` runs, and with which interpreters; one that is not there is left out.
+MATRIX_PYTHONS ?= python3.11 python3.12 python3.13
+MATRIX_FLAGS ?= -n 2 -m "not slow"
 # The matrices are small: more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint docs matrix clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
@@ -23,8 +26,22 @@ lint: .venv/.test
 docs: .venv/.test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
+# The oldest accepted versions are those of constraints.txt, the newest what pyproject.toml lets through.
+matrix:
+	@failed=; for python in $(MATRIX_PYTHONS); do \
+		$$python -c "" 2>/dev/null || { echo "== $$python: not on this machine"; continue; }; \
+		for age in oldest newest; do \
+			bin=.venv-matrix/$${python##*/}-$$age/bin; \
+			test $$age = oldest && bounds="--constraint constraints.txt" || bounds="--upgrade --upgrade-strategy eager"; \
+			{ test -x $$bin/python || $$python -m venv $${bin%/bin}; } && \
+			$$bin/python -m pip --disable-pip-version-check install --quiet $$bounds --editable '.[test]' && \
+			echo "== $$python, $$age:" $$($$bin/python -m pip freeze | grep -E "^(jax|equinox|diffrax|optax|optimistix|numpy)==") && \
+			$$bin/pytest $(MATRIX_FLAGS) || failed="$$failed $$python-$$age"; \
+		done; \
+	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
+
 clean:
-	rm -rf .venv .cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .venv .venv-matrix .cache .pytest_cache .ruff_cache .hypothesis build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:

@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from nnap_em.identify import Identified, begin, friction_table, identify
-from nnap_em.law import StribeckLaw
-from nnap_em.model import StateSpaceModel
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import Experiment, Sweep, examples, sweep_experiment
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import Identified, begin, friction_table, identify
+from nnap_em.model.law import StribeckLaw
+from nnap_em.model.simulate import Experiment, Sweep, examples, sweep_experiment
+from nnap_em.model.state_space import StateSpaceModel
 
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Of the visited velocities, where the truth is looked up."""

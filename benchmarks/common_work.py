@@ -15,18 +15,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data import Dataset
-from nnap_em.em import e_step
-from nnap_em.friction import AbstractJointMap
-from nnap_em.gaussian import Gaussian
-from nnap_em.model import StateSpaceModel
-from nnap_em.particle import (
+from nnap_em.data.dataset import Dataset
+from nnap_em.em.loop import e_step
+from nnap_em.model.base import prepare
+from nnap_em.model.friction import AbstractJointMap
+from nnap_em.model.simulate import Experiment, paper_friction, paper_model, paper_sweep, sweep_experiment
+from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.particle import (
     ParticleSmoother,
     ffbs,
     particle_filter,
 )
-from nnap_em.simulate import Experiment, paper_friction, paper_model, paper_sweep, sweep_experiment
-from nnap_em.smoother import CubatureSmoother, ExtendedKalmanSmoother, StartBank
+from nnap_em.smoother.start import StartBank
 
 START, START_STD = (math.pi / 2, 0.0, 0.0, 0.0), (0.05, 0.05, 0.05, 0.05)
 """Prior of the first row: the arm held out level, at rest [rad, rad/s]."""
@@ -154,8 +156,9 @@ def _each(one: Callable, size: Size) -> Callable[[], Any]:
 
 def particle_history(model, seq: Dataset, proposal, particles: int, key):
     """The particle filter about the path of the extended smoother, as `ParticleSmoother` runs it."""
-    potentials = proposal(model, seq, *ExtendedKalmanSmoother(one_start, iterations=0).path(model, seq))
-    return particle_filter(model, potentials, seq, num_particles=particles, key=key)
+    prepared = prepare(model, seq)
+    potentials = proposal(model, prepared, *ExtendedKalmanSmoother(one_start, iterations=0).path(model, prepared))
+    return particle_filter(model, potentials, prepared, num_particles=particles, key=key)
 
 
 def filter_case(name: str, proposal, size: Size) -> Case:

@@ -28,13 +28,13 @@ import jax
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
-from nnap_em.commands import set_up
-from nnap_em.data import read_logs
-from nnap_em.diagnose import entry, findings
-from nnap_em.files import replace_text
-from nnap_em.loop import close_the_loop
-from nnap_em.predict import horizon_errors, predict
-from nnap_em.rig import read_rig
+from nnap_em.commands.common import set_up
+from nnap_em.data.dataset import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.diagnose.findings import entry, findings
+from nnap_em.diagnose.loop import close_the_loop
+from nnap_em.em.predict import horizon_errors, predict
+from nnap_em.storage.files import replace_text
 from nnap_em.systems import specs
 
 OUTSIDE: dict[str, tuple[dict[str, Any], ...]] = {

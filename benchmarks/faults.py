@@ -27,7 +27,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
-from nnap_em.files import replace_text
+from nnap_em.storage.files import replace_text
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=6, tests=1, steps=120, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
@@ -37,12 +37,11 @@ def numbers(out: Path) -> dict:
     """Everything that a run leaves behind but the seconds that it took."""
     found: dict = {}
     for path in sorted(out.glob("*.npz")):
-        if path.name != "checkpoint.npz":
-            with np.load(path) as stored:
-                arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
-                header = json.loads(stored["header"].tobytes())
-                header.pop("notes")
-                found[path.name] = arrays, header
+        with np.load(path) as stored:
+            arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
+            header = json.loads(stored["header"].tobytes())
+            header.pop("notes")
+            found[path.name] = arrays, header
     for path in sorted(out.glob("*.csv")):
         found[path.name] = path.read_bytes()
     report = json.loads((out / "report.json").read_text())
@@ -54,7 +53,7 @@ def numbers(out: Path) -> dict:
 
 def start(command: str, rig: Path, out: Path, *more: str) -> subprocess.Popen:
     """The command in a process of its own."""
-    order = [sys.executable, "-m", "nnap_em.cli", command, str(rig), "--out", str(out), *more]
+    order = [sys.executable, "-m", "nnap_em.commands.cli", command, str(rig), "--out", str(out), *more]
     return subprocess.Popen(order, stderr=subprocess.PIPE, text=True)
 
 

@@ -21,15 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from nnap_em.em import Schedule, e_step, em_step
-from nnap_em.friction import FixedFriction
-from nnap_em.identify import Identified, begin, friction_table, identify
-from nnap_em.mstep import expand
-from nnap_em.particle import ParticleSmoother
-from nnap_em.predict import predict
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import paper_experiment, paper_model
-from nnap_em.smoother import CubatureSmoother, ExtendedKalmanSmoother, StartBank
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import Identified, begin, friction_table, identify
+from nnap_em.em.local import local, readings_at
+from nnap_em.em.loop import Schedule, e_step, em_step
+from nnap_em.em.predict import predict
+from nnap_em.em.quadratic import quadratic
+from nnap_em.model.friction import FixedFriction
+from nnap_em.model.simulate import paper_experiment, paper_model
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.particle.smoother import banked
+from nnap_em.smoother.start import StartBank
 from nnap_em.systems.acrobot import table_i
 
 whole = Schedule(first=501)
@@ -38,7 +40,7 @@ recipes = {
     "naive": (lambda bank: ExtendedKalmanSmoother(one_start, iterations=0), whole),
     "extended": (ExtendedKalmanSmoother, Schedule()),
     "cubature": (CubatureSmoother, Schedule()),
-    "particle": (lambda bank: ParticleSmoother(CubatureSmoother(bank)), Schedule()),
+    "particle": (banked, Schedule()),
 }
 """Smoother and schedule; `naive`: one start, no relinearisation, whole sequences from the first epoch on."""
 
@@ -87,8 +89,16 @@ def cramer_rao(truth_fit: Identified, fitted: Identified, truth, smoother, data,
     weights = fitted.m_step.weights(fitted.model)
     nodes = weights.nodes
     posterior = eqx.filter_jit(e_step)(truth_fit.model, data, smoother(fitted.bank), key=jax.random.key(0))
-    each = jax.vmap(lambda p, s: expand(truth_fit.model, fitted.m_step.prior, nodes, p, s).information)
-    information = jnp.sum(jax.jit(each)(posterior, data), axis=0)
+    model = truth_fit.model
+
+    @jax.jit
+    @jax.vmap
+    def information_of(posterior, seq):
+        here = local(model, fitted.m_step.prior, posterior.state, seq)
+        read = readings_at(model, posterior, here.seq)
+        return quadratic(model.log_q, model.log_r, model.start, here, nodes, posterior, read).information
+
+    information = jnp.sum(information_of(posterior, data), axis=0)
     flat, law = ravel_pytree(truth.unknown)
 
     def limit(at_nodes, at_velocity, precision):

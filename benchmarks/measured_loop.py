@@ -19,7 +19,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from nnap_em import cli
+from nnap_em.commands import cli
 
 RIGS = ("cloudpendulum", "dfki_c1", "dfki_c0", "dfki_a0", "dfki_c1_pert")
 PARTS = ("", "_half0", "_half1")

@@ -30,8 +30,8 @@ def main() -> None:
     tests = sorted({mutant.test for mutant in share})
     with tempfile.TemporaryDirectory() as folder:
         sound = run(copy(Path(folder)), *tests)
-    assert sound.passed == len(tests), sound.said
-    print(f"Unbroken: {sound.passed} of {len(tests)} tests pass.\n")
+    assert sound.passed >= len(tests) and not sound.failed, sound.said  # one of many cases counts as many
+    print(f"Unbroken: {len(tests)} tests pass, {sound.passed} cases.\n")
     print("| broken | in | test | |\n| --- | --- | --- | --- |", flush=True)
     killed = 0
     for mutant in share:

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.identify import friction_table, identify
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import examples, sweep_experiment
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import friction_table, identify
+from nnap_em.model.simulate import examples, sweep_experiment
 
 
 def study(name: str, seed: int, sequences: int = 20, steps: int = 500) -> tuple[float, float, int]:

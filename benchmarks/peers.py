@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from common_work import Case, Network, Size, common_logs, common_model, compiled
 
-from nnap_em.model import StateSpaceModel
+from nnap_em.model.state_space import Inputs, StateSpaceModel
 
 
 def natural_transition(model: StateSpaceModel):
@@ -47,7 +47,8 @@ def natural_transition(model: StateSpaceModel):
 def pick_transition(own: bool):
     """The transition that a peer is given, and the words that say so."""
     model = common_model()
-    return (model.transition, ", our transition") if own else (natural_transition(model), "")
+    held = lambda x, u: model.transition(x, Inputs.held(u))  # noqa: E731
+    return (held, ", our transition") if own else (natural_transition(model), "")
 
 
 def dynamax_case(rule: str, own: bool, size: Size) -> Case:

@@ -26,12 +26,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
-from nnap_em.commands import set_up
-from nnap_em.data import Logs, read_logs
-from nnap_em.formats import write_csv
-from nnap_em.identify import friction_table, identify
-from nnap_em.predict import HORIZONS, horizon_errors, predict
-from nnap_em.rig import read_rig
+from nnap_em.commands.common import set_up
+from nnap_em.data.dataset import Logs, read_logs
+from nnap_em.data.formats import write_csv
+from nnap_em.data.rig import read_rig
+from nnap_em.em.identify import friction_table, identify
+from nnap_em.em.predict import HORIZONS, horizon_errors, predict
 from nnap_em.systems import specs
 
 CASES = {
@@ -234,7 +234,7 @@ def main() -> None:
 
 
 def _nothing():
-    from nnap_em.data import pad
+    from nnap_em.data.dataset import pad
 
     return pad([(np.zeros(2), np.zeros((2, 1)), np.zeros((2, 1)))])
 

@@ -128,7 +128,7 @@ def limit_lines(rows: list[dict]) -> list[str]:
 def start_up(repeats: int) -> list[str]:
     """What a user waits for before anything is computed."""
     names = "import nnap_em; [getattr(nnap_em, name) for name in nnap_em.__all__]"
-    cli = "from nnap_em.cli import parser; parser().format_help()"
+    cli = "from nnap_em.commands.cli import parser; parser().format_help()"
     programs = {
         "python alone": "",
         "import jax": "import jax",
@@ -158,7 +158,7 @@ def growth_figure(curves: dict[str, dict[str, list[dict]]], base: Sequence[int])
     from matplotlib.figure import Figure
 
     sys.path.insert(0, str(root))
-    from nnap_em.plots import BLUE, STYLE, VERMILION
+    from nnap_em.report.style import BLUE, STYLE, VERMILION
 
     colours = {"extended": BLUE, "particle": VERMILION}
     with rc_context(STYLE):

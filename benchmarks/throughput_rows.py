@@ -27,12 +27,13 @@ from common_work import (
 from limits import c_case, transition_case
 from peers import cuthbert_case, cuthbert_exact, cuthbert_mcmc, dynamax_case, natural_transition, particles_case
 
-from nnap_em.em import e_step, em_step
-from nnap_em.identify import begin
-from nnap_em.parallel import use_every_device
-from nnap_em.particle import Bootstrap, ExactBackward, Guided, MetropolisBackward, ParticleSmoother
-from nnap_em.simulate import paper_experiment, paper_model
-from nnap_em.smoother import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.em.identify import begin
+from nnap_em.em.loop import e_step, em_step
+from nnap_em.model.simulate import paper_experiment, paper_model
+from nnap_em.model.state_space import Inputs
+from nnap_em.numerics.parallel import use_every_device
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.particle import Bootstrap, ExactBackward, Guided, MetropolisBackward, ParticleSmoother
 
 LOST = 0.3
 """A sequence is lost where the estimate of theta2 is off by more, root mean square [rad]."""
@@ -45,7 +46,7 @@ def groups(whole: Size, quick: bool) -> dict[str, list[Case]]:
     pair = half._replace(sequences=2)
     sizes = (whole,) if quick else (whole._replace(particles=most // 10), half, whole)
     limit = whole._replace(steps=whole.steps // 5, particles=64 * -(-most // 64))
-    own = common_model().transition
+    own = lambda x, u: common_model().transition(x, Inputs.held(u))  # noqa: E731
     return {
         "extended": [
             smoother_case("one start, one pass", ExtendedKalmanSmoother(one_start, iterations=0), plain),

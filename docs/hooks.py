@@ -1,4 +1,4 @@
-"""What the site adds to the Markdown: formulas as MathML (no script), the commands' help, the table of effects."""
+"""What the site adds to the Markdown: formulas as MathML (no script), the commands' help, effects, modules."""
 
 import argparse
 import ast
@@ -6,15 +6,15 @@ import os
 import re
 from html import unescape
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 from xml.etree.ElementTree import tostring
 
 from latex2mathml.converter import convert_to_element
 
-from nnap_em.cli import parser
+from nnap_em.commands.cli import parser
+from nnap_em.effects import catalogue
 
-EFFECTS = Path(__file__).resolve().parents[1] / "nnap_em" / "effects"
+ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
 """In a table."""
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\s*\\([(\[])(.*?)\\[)\]]\s*</\1>', re.DOTALL)
@@ -26,7 +26,7 @@ _ACCENTS = set("¨˙¯~^")
 
 def on_page_markdown(markdown: str, **_) -> str:
     """Put what is made from the code in the place of its marker."""
-    for marker, made in (("<!-- commands -->", commands), ("<!-- effects -->", effects)):
+    for marker, made in (("<!-- commands -->", commands), ("<!-- effects -->", effects), ("<!-- folders -->", folders)):
         if marker in markdown:
             markdown = markdown.replace(marker, made())
     return markdown
@@ -65,21 +65,29 @@ def commands() -> str:
 def effects() -> str:
     """A row for each class of the catalogue: the law, its parameters, and how to confirm it on the machine."""
     rows = ["| name | law | parameters | to be sure |", "| --- | --- | --- | --- |"]
-    for path in sorted(EFFECTS.glob("*.py")):
-        for kind in ast.parse(path.read_text()).body:
-            if isinstance(kind, ast.ClassDef) and "name" in (said := _class_variables(kind)):
-                law = " ".join((ast.get_docstring(kind) or "").split("\n\n")[0].split()).rstrip(".").replace("|", BAR)
-                units = ", ".join(f"`{name}` [{unit}]" for name, unit in said.get("units", {}).items())
-                rows.append(f"| `{said['name']}` | {law} | {units} | {said.get('confirm', '')} |")
+    for name, kind in catalogue.items():
+        law = kind.meaning().rstrip(".").replace("|", BAR)
+        units = ", ".join(f"`{parameter}` [{unit}]" for parameter, unit in kind.units.items())
+        rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} |")
     return "\n".join(rows)
 
 
-def _class_variables(kind: ast.ClassDef) -> dict[str, Any]:
-    said = {}
-    for line in kind.body:
-        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and line.value is not None:
-            try:
-                said[line.target.id] = ast.literal_eval(line.value)
-            except ValueError:
-                continue  # a field, not a text
-    return said
+def folders() -> str:
+    """A section for each folder of the package, in the order of README.md: its README and a row for each module."""
+    return "\n\n".join(map(_folder, re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "README.md").read_text())))
+
+
+def _folder(name: str) -> str:
+    folder = ROOT / "nnap_em" / name
+    told = (folder / "README.md").read_text().replace("](../../docs/how/", "](").replace("](../../docs/", "](../")
+    rows = [
+        f"| `{path.relative_to(folder)}` | {_first_line(path)} |"
+        for path in sorted(folder.rglob("*.py"))
+        if path.name != "__init__.py"
+    ]
+    return "\n".join([f"#{told}", "| module | |", "| --- | --- |", *rows])
+
+
+def _first_line(path: Path) -> str:
+    said = ast.get_docstring(ast.parse(path.read_text())) or ""
+    return " ".join(said.split("\n\n")[0].split()).replace("|", BAR)

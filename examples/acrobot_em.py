@@ -17,26 +17,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from blackbox import GradientMStep, build_network, forecast
+from paper_figures import Band, Curve, Record, friction_epochs_figure, prediction_figure, states_figure
 
-from nnap_em.blackbox import GradientMStep, build_network, forecast
-from nnap_em.build import build
-from nnap_em.data import Dataset
-from nnap_em.em import EMState, Schedule, e_step, fit, start_state
-from nnap_em.files import cores
-from nnap_em.mstep import AbstractMStep
-from nnap_em.parallel import use_every_device
-from nnap_em.particle import Guided, ParticleSmoother
-from nnap_em.plots import Band, Curve, Record, friction_epochs_figure, prediction_figure, states_figure
-from nnap_em.predict import given_samples
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import Experiment, paper_experiment, paper_model
-from nnap_em.smoother import (
-    AbstractSmoother,
-    CubatureSmoother,
-    ExtendedKalmanSmoother,
-    GaussianSmoother,
-    StartBank,
-)
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.build import build
+from nnap_em.em.loop import EMState, Schedule, e_step, fit, start_state
+from nnap_em.em.mstep import AbstractMStep
+from nnap_em.em.predict import given_samples
+from nnap_em.model.base import prepare
+from nnap_em.model.simulate import Experiment, paper_experiment, paper_model
+from nnap_em.numerics.parallel import use_every_device
+from nnap_em.smoother import AbstractSmoother
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother, GaussianSmoother
+from nnap_em.smoother.particle import Guided, ParticleSmoother
+from nnap_em.smoother.start import StartBank
+from nnap_em.storage.files import cores
 from nnap_em.systems.acrobot import table_i
 
 EPOCHS = (1, 5, 10, 20)
@@ -109,7 +106,7 @@ def gaussian_filter(smoother: GaussianSmoother):
     """Mean and standard deviation of the Gaussian filter."""
 
     def run(model, seq: Dataset, key):
-        state = smoother.path(model, seq)[0].state
+        state = smoother.path(model, prepare(model, seq))[0].state
         return state.mean, jnp.sqrt(jnp.diagonal(state.cov, axis1=1, axis2=2))
 
     return run
@@ -119,7 +116,7 @@ def particle_cloud(smoother: ParticleSmoother):
     """Weighted mean and standard deviation of the particles."""
 
     def run(model, seq: Dataset, key):
-        history = smoother.history(model, seq, key=key)
+        history = smoother.history(model, prepare(model, seq), key=key)
         x = history.origin[:, None] + history.scale[None, None] * jnp.swapaxes(history.x, 1, 2)
         weight = jnp.exp(history.log_w)[..., None]
         mean = jnp.sum(weight * x, axis=1)
@@ -214,7 +211,8 @@ def predict(model, smoother, data: Dataset, *, key):
     last = int(known[0].sum()) - 1
     state = _smooth(model, data._replace(valid=jnp.asarray(known)), smoother, key=key_smooth).state
     keys = jax.random.split(key_path, data.u.shape[0])
-    return state, last, _forecast(model, jax.tree.map(lambda a: a[:, last], state), data.u[:, last:-1], keys)
+    u = jax.tree.map(lambda a: a[:, last:-1], jax.vmap(model.inputs)(data))
+    return state, last, _forecast(model, jax.tree.map(lambda a: a[:, last], state), u, keys)
 
 
 @eqx.filter_jit

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import plant
 
-from nnap_em.cli import main as nnap_em
+from nnap_em.commands.cli import main as nnap_em
 
 SLIDE = (
     {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05},

@@ -183,6 +183,7 @@ INPUT: dict[str, Callable[[Effect, Array], Array]] = {
     "motor_gain": lambda p, u: p["gain"] * u,
     "dead_zone": lambda p, u: np.sign(u) * np.maximum(np.abs(u) - p["width"], 0),
     "saturation": lambda p, u: np.clip(u, -p["limit"], p["limit"]),
+    "one_sided_loss": lambda p, u: np.where(np.sign(u) == p["side"], (1 - p["loss"]) * u, u),
 }
 
 # Factors on the friction of a joint.
@@ -211,7 +212,7 @@ SUBSTEPS = {"backlash": 20, "joint_flexibility": 20, "presliding_friction": 20, 
 OTHERS = {
     *("base_tilt", "base_vibration", "payload", "payload_step", "link_inertia", "link_length", "center_of_mass"),
     *("input_delay", "actuator_lag", "presliding_friction", "coupling"),
-    *("sensor_bias", "sensor_scale", "sensor_delay", "sensor_quantization"),
+    *("load_friction", "sensor_bias", "sensor_scale", "sensor_delay", "sensor_quantization"),
 }
 KNOWN = {*JOINT, *INPUT, *LEVEL, *TRANSMISSION, *OTHERS}
 
@@ -461,6 +462,9 @@ def _drive(plant: Plant, x: Array, u: Array, dx: Array) -> Array:
         dx[:, i] = x[:, i + 1]
         dx[:, i + 1] = (u - 3e-4 * x[:, i + 1] - through) / MOTOR_INERTIA
         u = through
+    for e in plant.named("load_friction"):
+        rate = x[:, plant.dof + plant.driven - 1]
+        u = u - e["mu"] * np.abs(u) * np.tanh(rate / e["knee"])
     return u
 
 
@@ -844,5 +848,10 @@ _THIRDS: dict[str, dict[str, float]] = {
 }
 WEAK: dict[str, tuple[Effect, ...]] = {name: ({**STRONG[name][0], **less},) for name, less in _THIRDS.items()}
 """About a third as strong."""
+UNNAMED: dict[str, tuple[Effect, ...]] = {
+    "one_sided_loss": ({"name": "unknown_function", "form": "one_sided_loss", "joint": 2, "side": -1, "loss": 0.5},),
+    "load_friction": ({"name": "unknown_function", "form": "load_friction", "joint": 2, "mu": 0.3, "knee": 0.2},),
+}
+"""Laws that the vocabulary has no name for: unknown functions of u, and of u and dtheta2."""
 SESSION = frozenset({"friction_drift", "payload_step"})
 """Names whose cases in STRONG and WEAK are meant for clock="session"."""

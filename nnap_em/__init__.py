@@ -4,31 +4,30 @@ The names below are loaded at their first use, so that `import nnap_em` costs no
 """
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .check import Finding, check
-    from .data import Dataset, Logs, pad, read_logs
-    from .diagnose import findings
-    from .em import EMState, FitError, Schedule
-    from .export import ExportError, export
-    from .files import StoreError
-    from .formats import DataError, DataWarning
-    from .friction import FrictionNetwork
-    from .identify import Identified, friction_table, identify, parameter_table
-    from .loop import Closed, close_the_loop
-    from .model import StateSpaceModel
-    from .parallel import all_devices, over
-    from .particle import ParticleSmoother
-    from .predict import Prediction, horizon_errors, predict, smooth
-    from .rig import Rig, RigError, RigWarning, read_rig, write_rig
-    from .simulate import Experiment, examples, paper_experiment, paper_model, simulate
-    from .smoother import ExtendedKalmanSmoother, Posterior
-    from .store import load, save
+    from .data.dataset import Dataset, Logs, pad, read_logs
+    from .data.formats import DataError, DataWarning
+    from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
+    from .diagnose.findings import findings
+    from .diagnose.loop import Closed, close_the_loop
+    from .em.check import Finding, check
+    from .em.identify import Identified, friction_table, identify, parameter_table
+    from .em.loop import EMState, FitError, Schedule
+    from .em.predict import Prediction, horizon_errors, predict, smooth
+    from .em.store import load, save
+    from .model.friction import FrictionNetwork
+    from .model.simulate import Experiment, examples, paper_experiment, paper_model, simulate
+    from .model.state_space import StateSpaceModel
+    from .numerics.parallel import all_devices, over
+    from .portable.export import ExportError, export
+    from .smoother.gaussian import ExtendedKalmanSmoother
+    from .smoother.particle import ParticleSmoother
+    from .smoother.posterior import Posterior
+    from .storage.files import StoreError
     from .systems import AbstractSystem, register, specs
 
 __all__ = [
@@ -82,38 +81,28 @@ __all__ = [
     "write_rig",
 ]
 _homes = {
-    "check": ("Finding", "check"),
-    "data": ("Dataset", "Logs", "pad", "read_logs"),
-    "diagnose": ("findings",),
-    "em": ("EMState", "FitError", "Schedule"),
-    "export": ("ExportError", "export"),
-    "files": ("StoreError",),
-    "formats": ("DataError", "DataWarning"),
-    "friction": ("FrictionNetwork",),
-    "identify": ("Identified", "friction_table", "identify", "parameter_table"),
-    "loop": ("Closed", "close_the_loop"),
-    "model": ("StateSpaceModel",),
-    "parallel": ("all_devices", "over"),
-    "particle": ("ParticleSmoother",),
-    "predict": ("Prediction", "horizon_errors", "predict", "smooth"),
-    "rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
-    "simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
-    "smoother": ("ExtendedKalmanSmoother", "Posterior"),
-    "store": ("load", "save"),
+    "em.check": ("Finding", "check"),
+    "data.dataset": ("Dataset", "Logs", "pad", "read_logs"),
+    "diagnose.findings": ("findings",),
+    "em.loop": ("EMState", "FitError", "Schedule"),
+    "portable.export": ("ExportError", "export"),
+    "storage.files": ("StoreError",),
+    "data.formats": ("DataError", "DataWarning"),
+    "model.friction": ("FrictionNetwork",),
+    "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "diagnose.loop": ("Closed", "close_the_loop"),
+    "model.state_space": ("StateSpaceModel",),
+    "numerics.parallel": ("all_devices", "over"),
+    "smoother.particle": ("ParticleSmoother",),
+    "em.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
+    "data.rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
+    "model.simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
+    "smoother.gaussian": ("ExtendedKalmanSmoother",),
+    "smoother.posterior": ("Posterior",),
+    "em.store": ("load", "save"),
     "systems": ("AbstractSystem", "register", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}
-
-
-class _Package(ModuleType):
-    """A package in which names such as `identify` and `predict` mean the functions, not the modules that they are in.
-
-    Importing a submodule binds it in its package; which would hide the function.
-    """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name not in _home or not isinstance(value, ModuleType):
-            ModuleType.__setattr__(self, name, value)
 
 
 def __getattr__(name: str) -> Any:
@@ -126,6 +115,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-sys.modules[__name__].__class__ = _Package

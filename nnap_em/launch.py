@@ -21,7 +21,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from .files import cores
+from .storage.files import cores
 
 PATIENCE = 600
 """How long processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
@@ -41,7 +41,8 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     """One process: join the others, then run the command; all but the first into a folder that is thrown away."""
     import jax
 
-    from . import cli, parallel
+    from .commands import cli
+    from .numerics import parallel
 
     jax.config.update("jax_num_cpu_devices", threads)
     jax.distributed.initialize(coordinator, count, index, initialization_timeout=PATIENCE)
@@ -91,7 +92,7 @@ def _blame(children: list[subprocess.Popen], first: int) -> int:
     assert code is not None
     cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
     print(
-        f"error: process {first + index} {cause}; the others were ended. The last checkpoint is whole: "
+        f"error: process {first + index} {cause}; the others were ended. What was finished is kept: "
         "give the same command with --resume",
         file=sys.stderr,
     )

@@ -34,10 +34,11 @@ def bench():
     # not at the top: the types of what is imported before pytest is configured are not checked
     import equinox as eqx
 
-    from nnap_em.build import build
-    from nnap_em.rig import Declared, Rig
-    from nnap_em.simulate import paper_experiment, paper_model
-    from nnap_em.smoother import CubatureSmoother
+    from nnap_em.data.rig import Declared, Rig
+    from nnap_em.em.build import build
+    from nnap_em.model.base import prepare
+    from nnap_em.model.simulate import paper_experiment, paper_model
+    from nnap_em.smoother.gaussian import CubatureSmoother
     from nnap_em.systems.acrobot import table_i
 
     truth = paper_model()
@@ -58,5 +59,5 @@ def bench():
     problem = build(rig, data, key=jax.random.key(0))
     model = eqx.tree_at(lambda m: (m.log_q, m.log_r), problem.model, (truth.log_q + 2.0, truth.log_r))
     smoother = CubatureSmoother(problem.bank)
-    path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, s))(d))(data).state
+    path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, prepare(model, s)))(d))(data).state
     return rig, model, problem.mstep, data, path

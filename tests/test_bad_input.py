@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import csv_text, swing, with_field
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_data import _field, _swing, _text
 
-from nnap_em import cli, commands
-from nnap_em.em import FitError
-from nnap_em.formats import LARGEST, DataError, read_csv
+from nnap_em.commands import cli
+from nnap_em.commands import identify as identify_command
+from nnap_em.data.formats import LARGEST, DataError, read_csv
+from nnap_em.em.loop import FitError
 
 RIG = """\
 format = 1
@@ -42,13 +43,6 @@ dtheta1 = 0.05
 """
 
 
-def _log(phase: float, rows: int = 201) -> dict[str, np.ndarray]:
-    """Two rad to and fro, with its exact rate; at phase 0 that of test_data."""
-    t = 0.01 * np.arange(rows)
-    theta, rate = 2.0 * np.sin(3.0 * t + phase), 6.0 * np.cos(3.0 * t + phase)
-    return {"time": t, "u": 0.1 * np.sin(t + phase), "theta1": theta, "dtheta1": rate}
-
-
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("good")
@@ -56,7 +50,7 @@ def good(tmp_path_factory) -> Path:
     for name, phase in (("train/00", 0.5), ("train/01", 0.0), ("test/00", 1.0)):
         path = folder / f"{name}.csv"
         path.parent.mkdir(exist_ok=True)
-        path.write_text(_text(_log(phase)))
+        path.write_text(csv_text(swing(phase=phase)))
     return folder
 
 
@@ -73,7 +67,7 @@ def _log_file(change: Callable[[str], str | bytes]) -> Callable[[Path], object]:
 
 def _columns(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Callable[[str], str]:
     """A change of the columns of train/01.csv before they are written."""
-    return lambda _: _text(_log(0.0) | change(_log(0.0)))
+    return lambda _: csv_text(swing() | change(swing()))
 
 
 def _column(name: str, change) -> Callable[[str], str]:
@@ -117,7 +111,7 @@ def _everywhere(name: str, change) -> Callable[[Path], object]:
         for path in folder.glob("t*/*.csv"):
             log = np.genfromtxt(path, delimiter=",", names=True)
             columns = {other: log[other] for other in log.dtype.names}
-            path.write_text(_text(columns | {name: change(columns[name])}))
+            path.write_text(csv_text(columns | {name: change(columns[name])}))
 
     return apply
 
@@ -126,8 +120,8 @@ def _cut(first: int, last: int) -> Callable[[Path], object]:
     """test/01.csv: some rows of train/01.csv, their clock set back."""
 
     def apply(folder: Path) -> None:
-        rows = {name: values[first:last] for name, values in _log(0.0).items()}
-        (folder / "test/01.csv").write_text(_text(rows | {"time": rows["time"] - rows["time"][0]}))
+        rows = {name: values[first:last] for name, values in swing().items()}
+        (folder / "test/01.csv").write_text(csv_text(rows | {"time": rows["time"] - rows["time"][0]}))
 
     return apply
 
@@ -157,19 +151,19 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "semicolons": (lambda s: s.replace(",", ";").replace(".", ","), "line 1", "missing", "not ';'"),
     "tabs": (lambda s: s.replace(",", "\t"), "line 1", "missing", "by ',' (not '\\t')"),
     "decimal commas": (lambda s: s.replace(".", ","), "line 3", "found 8 fields under 4 names", "decimals with '.'"),
-    "text": (_field(12, "u", "n/a"), "line 12, column 'u'", "'n/a'", "write a number"),
+    "text": (with_field(12, "u", "n/a"), "line 12, column 'u'", "'n/a'", "write a number"),
     "text in a reading": (
-        _field(9, "theta1", "0.1 rad"),
+        with_field(9, "theta1", "0.1 rad"),
         "line 9, column 'theta1'",
         "'0.1 rad'",
         "leave the field empty",
     ),
-    "inf": (_field(9, "theta1", "inf"), "line 9, column 'theta1'", "'inf'", "leave the field empty"),
-    "minus infinity": (_field(9, "u", "-Infinity"), "line 9, column 'u'", "'-Infinity'", "write a number"),
-    "nan in an input": (_field(9, "u", "nan"), "line 9, column 'u'", "'nan'", "never empty"),
-    "minus nan in an input": (_field(9, "u", "-NaN"), "line 9, column 'u'", "'-NaN'", "never empty"),
-    "empty input": (_field(9, "u", ""), "line 9, column 'u'", "found ''", "never empty"),
-    "blank time": (_field(202, "time", " "), "line 202, column 'time'", "found ''", "never empty"),
+    "inf": (with_field(9, "theta1", "inf"), "line 9, column 'theta1'", "'inf'", "leave the field empty"),
+    "minus infinity": (with_field(9, "u", "-Infinity"), "line 9, column 'u'", "'-Infinity'", "write a number"),
+    "nan in an input": (with_field(9, "u", "nan"), "line 9, column 'u'", "'nan'", "never empty"),
+    "minus nan in an input": (with_field(9, "u", "-NaN"), "line 9, column 'u'", "'-NaN'", "never empty"),
+    "empty input": (with_field(9, "u", ""), "line 9, column 'u'", "found ''", "never empty"),
+    "blank time": (with_field(202, "time", " "), "line 202, column 'time'", "found ''", "never empty"),
     "row too short": (lambda s: s.replace("\n0.03,", "\n"), "line 5", "3 fields under 4 names", "every column a field"),
     "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
     "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
@@ -215,12 +209,12 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
         "plain UTF-8",
     ),
     "a picture": (lambda _: bytes(range(256)) * 9, "line", "not UTF-8", "plain UTF-8"),
-    "zero bytes": (_field(9, "u", "\0\0"), "line 9, column 'u'", "\\x00", "write a number"),
-    "thousands": (_field(9, "u", '"1,000.5"'), "line 9", "5 fields under 4 names", "decimals with '.'"),
-    "underscore": (_field(9, "u", "1_0"), "line 9, column 'u'", "'1_0'", "write a number"),
-    "hexadecimal": (_field(9, "u", "0x1p-3"), "line 9, column 'u'", "'0x1p-3'", "write a number"),
-    "formula": (_field(9, "theta1", "#REF!"), "line 9, column 'theta1'", "'#REF!'", "leave the field empty"),
-    "date": (_field(2, "time", "2026-01-01"), "line 2, column 'time'", "'2026-01-01'", "write a number"),
+    "zero bytes": (with_field(9, "u", "\0\0"), "line 9, column 'u'", "\\x00", "write a number"),
+    "thousands": (with_field(9, "u", '"1,000.5"'), "line 9", "5 fields under 4 names", "decimals with '.'"),
+    "underscore": (with_field(9, "u", "1_0"), "line 9, column 'u'", "'1_0'", "write a number"),
+    "hexadecimal": (with_field(9, "u", "0x1p-3"), "line 9, column 'u'", "'0x1p-3'", "write a number"),
+    "formula": (with_field(9, "theta1", "#REF!"), "line 9, column 'theta1'", "'#REF!'", "leave the field empty"),
+    "date": (with_field(2, "time", "2026-01-01"), "line 2, column 'time'", "'2026-01-01'", "write a number"),
     "angle in turns": (
         _column("theta1", lambda x: x / (2 * np.pi)),
         "column 'theta1'",
@@ -302,7 +296,7 @@ FOLDERS = {  # name: (the change of the folder, the file, then the words of the 
     ),
     "huge": (_huge, "train/01.csv", "257 MB", "cut it into sequences"),
     "bad test file": (
-        lambda f: (f / "test/00.csv").write_text(_text(_log(1.0)).replace("time", "tme")),
+        lambda f: (f / "test/00.csv").write_text(csv_text(swing(phase=1.0)).replace("time", "tme")),
         "test/00.csv",
         "line 1, column 'time'",
         "did you mean 'tme'?",
@@ -338,14 +332,16 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
     ),
     "gap in noisy inputs": (
         _log_file(
-            lambda _: _text({name: np.delete(x, range(100, 110)) for name, x in (_log(0.0) | {"u": _random()}).items()})
+            lambda _: csv_text(
+                {name: np.delete(x, range(100, 110)) for name, x in (swing() | {"u": _random()}).items()}
+            )
         ),
         "line 102, column 'time'",
         "a gap: 0.99 s, then 1.1 s (91 rows follow in all)",
         "cannot be told: not used",
     ),
     "spike": (
-        _log_file(_field(50, "theta1", "0.5")),
+        _log_file(with_field(50, "theta1", "0.5")),
         "line 50, column 'theta1'",
         "1 reading far from what the readings before and after say (spike), the first at 0.48 s",
         "--trust-readings",
@@ -404,7 +400,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         "check units",
     ),
     "overlapping sequences": (
-        lambda f: (f / "train/02.csv").write_text(_text(_log(0.0, 150))),
+        lambda f: (f / "train/02.csv").write_text(csv_text(swing(150))),
         "train file 02.csv",
         "row 1 and those after it are also in train file 01.csv",
         "cut sequences without overlap",
@@ -448,7 +444,7 @@ def test_what_is_doubtful_is_said_before_the_fit(good, tmp_path, capsys, monkeyp
     def stop(*_, **__):
         raise FitError("the fit would begin here")
 
-    monkeypatch.setattr(commands, "begin", stop)
+    monkeypatch.setattr(identify_command, "resumable", stop)
     _identify(good, change, tmp_path)
     *warnings, last = capsys.readouterr().err.splitlines()
     assert last == "nnap-em: error: the fit would begin here"
@@ -459,7 +455,7 @@ def test_good_input_is_read_without_a_word(good, tmp_path, capsys, monkeypatch):
     def stop(*_, **__):
         raise FitError("the fit would begin here")
 
-    monkeypatch.setattr(commands, "begin", stop)
+    monkeypatch.setattr(identify_command, "resumable", stop)
     _identify(good, lambda _: None, tmp_path)
     assert capsys.readouterr().err == "nnap-em: error: the fit would begin here\n"
 
@@ -480,8 +476,8 @@ _corrupt = st.sampled_from(["x", "-inf", "1e999", "--1", "0x10", "1_0", "1;5", "
 @example(row=19, column=1, bad="")
 def test_any_corrupted_field_is_named_with_its_line_and_column(tmp_path_factory, row, column, bad):
     path = tmp_path_factory.getbasetemp() / "corrupted.csv"
-    name = list(_swing())[column]
-    path.write_text(_field(row + 2, name, bad)(_text(_swing(20))))
+    name = list(swing())[column]
+    path.write_text(with_field(row + 2, name, bad)(csv_text(swing(20))))
     with pytest.raises(DataError) as refused:
         read_csv(path, ("time", "u"), ("theta1", "dtheta1"))
     assert f"line {row + 2}, column {name!r}: found {bad.strip()!r}" in str(refused.value)

@@ -5,13 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from blackbox import GradientMStep, NetworkModel, build_network, forecast, gather_pairs, squared_error
 
-from nnap_em.blackbox import GradientMStep, NetworkModel, build_network, forecast, gather_pairs, squared_error
-from nnap_em.data import Dataset
-from nnap_em.em import Schedule, e_step, fit, start_state
-from nnap_em.gaussian import Gaussian
-from nnap_em.particle import ParticleSmoother
-from nnap_em.smoother import ExtendedKalmanSmoother, StartBank
+from nnap_em.data.dataset import Dataset
+from nnap_em.em.loop import Schedule, e_step, fit, start_state
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.particle import ParticleSmoother
+from nnap_em.smoother.start import StartBank
 
 
 class _Oscillator(eqx.Module):

@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from nnap_em.data import Dataset, fill_missing
-from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Cubature, Filtered, Smoothed, Tangent
-from nnap_em.model import StateSpaceModel
-from nnap_em.particle import ParticleSmoother
-from nnap_em.simulate import examples, paper_model, simulate
-from nnap_em.smoother import GaussianSmoother, StartBank
+from nnap_em.data.dataset import Dataset, fill_missing
+from nnap_em.model.base import prepare
+from nnap_em.model.simulate import examples, paper_model, simulate
+from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import GaussianSmoother
+from nnap_em.smoother.kalman import Cubature, Filtered, Smoothed, Tangent
+from nnap_em.smoother.particle import ParticleSmoother
+from nnap_em.smoother.start import StartBank
 
 RUNS, ROWS = 200, 60
 LEVEL = 1e-3
@@ -83,7 +85,7 @@ class _Run(NamedTuple):
 def _run(name: str, rule: str) -> _Run:
     model, data, x = _logs(name)
     smoother = GaussianSmoother(StartBank((1,) * x.shape[-1]), RULES[rule], iterations=1)
-    filtered, smoothed = eqx.filter_jit(jax.vmap(lambda seq: smoother.path(model, seq)))(data)
+    filtered, smoothed = eqx.filter_jit(jax.vmap(lambda seq: smoother.path(model, prepare(model, seq))))(data)
     return _Run(filtered, smoothed, np.asarray(fill_missing(data.y)[1]), x)
 
 
@@ -124,7 +126,7 @@ def test_truth_has_any_rank_among_the_trajectories():
         GaussianSmoother(StartBank((1,) * x.shape[-1]), Tangent()), num_particles=200, num_paths=99
     )
     keys = jax.random.split(jax.random.key(4), RUNS)
-    found = eqx.filter_jit(jax.vmap(lambda seq, key: smoother(model, seq, key=key)))(data, keys)
+    found = eqx.filter_jit(jax.vmap(lambda seq, key: smoother(model, prepare(model, seq), key=key)))(data, keys)
     rows = [0, ROWS // 2, ROWS - 2]
     rank = np.sum(np.asarray(found.prev)[:, rows] < x[:, rows, None], axis=2)  # of 100 places
     count = np.stack([np.sum(rank // 10 == i, axis=0) for i in range(10)])

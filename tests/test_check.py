@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em import cli
-from nnap_em.build import build_system
-from nnap_em.check import check, gramian
-from nnap_em.data import Dataset, Logs
-from nnap_em.rig import Declared, Rig, RigError
-from nnap_em.simulate import examples, sweep_experiment
+from nnap_em.commands import cli
+from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.rig import Declared, Rig, RigError
+from nnap_em.em.build import build_system
+from nnap_em.em.check import check, gramian
+from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems.acrobot import table_i
 
 ROWS, COUNT = 201, 6

@@ -17,10 +17,18 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em import cli, commands, files, tables
-from nnap_em.rig import read_rig
-from nnap_em.simulate import examples
-from nnap_em.store import load, read
+from nnap_em.commands import cli
+from nnap_em.commands import identify as identify_command
+from nnap_em.commands import smooth as smooth_command
+from nnap_em.data.dataset import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.em.store import load, read
+from nnap_em.model.simulate import examples
+from nnap_em.report import tables
+from nnap_em.smoother import AbstractSmoother
+from nnap_em.smoother.start import StartBank
+from nnap_em.storage import files
+from nnap_em.storage.journal import Journal
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,7 +86,7 @@ def fit(bench) -> Path:
 def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys, time
-from nnap_em import cli
+from nnap_em.commands import cli
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])
@@ -108,7 +116,7 @@ def test_public_names_are_what_they_say():
         assert not isinstance(value, type(sys)), f"{name} is a module"
         assert name in dir(nnap_em)
     from nnap_em import identify
-    from nnap_em.identify import identify as same
+    from nnap_em.em.identify import identify as same
 
     assert identify is same
     with pytest.raises(AttributeError, match="no attribute 'identity'"):
@@ -117,11 +125,11 @@ def test_public_names_are_what_they_say():
 
 def test_command_line_offers_what_the_library_has():
     assert sorted(cli.SYSTEMS) == sorted(examples) == sorted(specs)
-    bank = commands.StartBank((1, 1))
+    bank = StartBank((1, 1))
     for name in cli.SMOOTHERS:
         args = argparse.Namespace(smoother=name, particles=7 if name == "particle" else None)
-        smoother = commands._smoother(args)(bank)
-        assert isinstance(smoother, commands.AbstractSmoother)
+        smoother = identify_command.smoother(args)(bank)
+        assert isinstance(smoother, AbstractSmoother)
     assert smoother.num_particles == 7
 
 
@@ -157,7 +165,7 @@ def test_every_system_is_simulated(tmp_path, system):
     for name in "ab":
         assert _run("simulate", tmp_path / name, "--system", system, *size, "--seed", 1) == 0
     declared = read_rig(tmp_path / "a/rig.toml", specs)
-    table = commands.read_logs(tmp_path / "a/train", declared).data
+    table = read_logs(tmp_path / "a/train", declared).data
     assert table.y.shape == (1, 31, len(declared.measured))
     assert np.isfinite(table.y).all()
     assert not (tmp_path / "a/test").exists()
@@ -172,7 +180,7 @@ def test_a_folder_with_something_in_it_is_left_alone(bench, capsys):
 
 
 def test_identify_writes_whole_results(bench, fit):
-    wanted = ["checkpoint.npz", "friction.csv", "friction.png", "model.npz", "report.json"]
+    wanted = ["friction.csv", "friction.png", "model.npz", "report.html", "report.json"]
     assert _files(fit) == wanted
     assert (fit / "friction.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((fit / "report.json").read_text(), parse_constant=pytest.fail)
@@ -187,6 +195,11 @@ def test_identify_writes_whole_results(bench, fit):
     assert set(report["noise"]["process_per_step"]) == {"x", "dx"}
     assert report["friction_law"][0]["joint"] == 1
     assert report["versions"]["jax"] == jax.__version__
+    assert report["verdict"] == f"Fitted the friction of 1 joint to 4 sequences in {EPOCHS} epochs."
+    html = (fit / "report.html").read_text()
+    assert "Identification of simulated slide" in html
+    assert report["friction_law"][0]["text"] in html
+    assert "Nothing is missing" not in html
 
 
 def test_particles_identify_as_well(bench, fit, tmp_path):
@@ -273,31 +286,32 @@ def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_
     assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 2.0
 
 
-def _stop_after(epochs: int, monkeypatch):
-    """Ctrl-C right after a checkpoint."""
-    whole = commands.save
+def _stop_after(steps: int, monkeypatch):
+    """Ctrl-C right after so many finished steps."""
+    whole = Journal.keep
 
-    def save(path, fitted, **options):
-        whole(path, fitted, **options)
-        if fitted.state.epoch == epochs:
+    def keep(self, name, outcome):
+        whole(self, name, outcome)
+        if len(self) == steps:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "save", save)
+    monkeypatch.setattr(Journal, "keep", keep)
 
 
 def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path, monkeypatch, capsys):
     out = tmp_path / "stopped"
     argv = ("identify", bench, "--out", out, "--epochs", EPOCHS)
     with monkeypatch.context() as patch:
-        _stop_after(4, patch)
+        _stop_after(9, patch)  # five of them tell how large the process noise is
         assert _run(*argv) == 130
     said = capsys.readouterr().err
     assert said.startswith("nnap-em: compiling for 4 sequences of 151 rows")
     assert re.search(r"epoch   2 of 9  horizon 0\.60 s  log-likelihood [\d.]+ per sequence  noise std x 0\.00", said)
-    assert f"stopped after epoch 4; to go on: nnap-em identify {bench} --out {out}" in said
-    assert _files(out) == ["checkpoint.npz"]
+    assert f"stopped with 9 finished steps kept; to go on: nnap-em identify {bench} --out {out}" in said
+    assert all(name.startswith("unfinished/em_step-") for name in _files(out))
     assert _run(*argv, "--resume") == 0
-    assert "resumed after epoch 4" in capsys.readouterr().err
+    assert "resumed with 9 finished steps" in capsys.readouterr().err
+    assert _files(out) == _files(fit)
     assert (out / "friction.csv").read_bytes() == (fit / "friction.csv").read_bytes()
     whole, stopped = (json.loads((folder / "report.json").read_text()) for folder in (fit, out))
     for name in ("fit", "noise", "parameters", "friction_law", "log_likelihood", "left_out"):
@@ -312,7 +326,7 @@ def test_a_stop_before_the_first_epoch_keeps_nothing(bench, tmp_path, monkeypatc
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "identify", stop)
+    monkeypatch.setattr(identify_command, "identify", stop)
     assert _run("identify", bench, "--out", tmp_path / "new") == 130
     assert "nothing was kept" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -329,22 +343,38 @@ def _other_rig(bench: Path) -> None:
     path.write_text(path.read_text().replace("m = 1.0", "m = 1.1"))
 
 
+@pytest.fixture(scope="module")
+def stopped(bench) -> Path:
+    """What a run leaves that was stopped after its second step."""
+    out = bench.parent / "stopped"
+    with pytest.MonkeyPatch.context() as patch:
+        _stop_after(2, patch)
+        assert _run("identify", bench, "--out", out, "--quiet") == 130
+    return out
+
+
 RESUMES = {
-    "data": (_other_data, (), "made from other training data"),
-    "rig": (_other_rig, (), "made for another rig.toml"),
+    "data": (_other_data, (), "made from another training data"),
+    "rig": (_other_rig, (), "made from another rig.toml"),
     "seed": (lambda bench: None, ("--seed", "8"), "made with --seed 0, not 8; resume with --seed 0"),
     "smoother": (lambda bench: None, ("--smoother", "ekf"), "resume with --smoother cubature"),
+    "particles": (
+        lambda bench: None,
+        ("--smoother", "particle", "--particles", "9"),
+        "resume with --smoother cubature",
+    ),
 }
 
 
 @pytest.mark.parametrize("change, options, reason", RESUMES.values(), ids=RESUMES)
-def test_resume_refuses_what_the_checkpoint_is_not_of(bench, fit, tmp_path, capsys, change, options, reason):
+def test_resume_refuses_what_the_kept_steps_are_not_of(bench, stopped, tmp_path, capsys, change, options, reason):
     shutil.copytree(bench, tmp_path / "bench")
     change(tmp_path / "bench")
-    before = {name: (fit / name).stat().st_mtime_ns for name in _files(fit)}
-    assert _run("identify", tmp_path / "bench", "--out", fit, "--resume", *options) == 2
+    before = {name: (stopped / name).stat().st_mtime_ns for name in _files(stopped)}
+    assert before
+    assert _run("identify", tmp_path / "bench", "--out", stopped, "--resume", *options) == 2
     assert reason in capsys.readouterr().err
-    assert {name: (fit / name).stat().st_mtime_ns for name in _files(fit)} == before
+    assert {name: (stopped / name).stat().st_mtime_ns for name in _files(stopped)} == before
 
 
 def test_without_test_sequences_there_is_no_error_to_report(bench, tmp_path, capsys):
@@ -462,19 +492,19 @@ def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
     def bug(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(commands, "smoothed_states", bug)
+    monkeypatch.setattr(smooth_command, "smoothed_states", bug)
     with pytest.raises(ZeroDivisionError):
         _run("smooth", fit, bench / "test", "--out", tmp_path / "out")
 
 
 def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypatch, capsys):
-    whole = commands.smoothed_states
+    whole = smooth_command.smoothed_states
 
     def lost(fitted, data):
         state = whole(fitted, data)
         return state._replace(mean=state.mean.at[2, 10:, 1].set(np.inf))
 
-    monkeypatch.setattr(commands, "smoothed_states", lost)
+    monkeypatch.setattr(smooth_command, "smoothed_states", lost)
     assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
     assert f"nnap-em: warning: 002.csv: {STEPS + 1 - 10} values run away" in capsys.readouterr().err
     assert np.isnan(_read(tmp_path / "002.csv")["dx"]).sum() == STEPS + 1 - 10

@@ -6,51 +6,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import csv_text, swing, swing_rig, with_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_rig import SYSTEMS
 
-from nnap_em.data import Dataset, check_split, fill_missing, horizon, pad, read_logs
-from nnap_em.formats import DataError, DataWarning, read_csv, write_csv
-from nnap_em.rig import Rig, read_rig
+from nnap_em.data.dataset import Dataset, check_split, fill_missing, horizon, pad, read_logs
+from nnap_em.data.formats import DataError, DataWarning, read_csv, write_csv
+from nnap_em.data.rig import Rig, read_rig
+from nnap_em.systems import specs
 
 ROWS = 201
 
 
-def _rig(**changes) -> Rig:
-    given = {"dt": 0.01, "clock": "sequence", "measured": ("theta1", "dtheta1")} | changes
-    return Rig("bench", "acrobot", {}, True, ("u",), (2,), noise_std={}, start={}, **given)
-
-
-def _swing(rows: int = ROWS, dt: float = 0.01) -> dict[str, np.ndarray]:
-    """Two rad to and fro, with its exact rate."""
-    t = dt * np.arange(rows)
-    return {"time": t, "u": 0.1 * np.sin(t), "theta1": 2.0 * np.sin(3.0 * t), "dtheta1": 6.0 * np.cos(3.0 * t)}
-
-
-def _text(columns) -> str:
-    rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
-    return "\n".join([",".join(columns), *rows]) + "\n"
-
-
-def _field(line: int, column: str, text: str):
-    """A change of one field of the file; `line` as an editor counts."""
-
-    def change(content: str) -> str:
-        lines = [row.split(",") for row in content.splitlines()]
-        lines[line - 1][lines[0].index(column)] = text
-        return "\n".join(map(",".join, lines)) + "\n"
-
-    return change
-
-
 def test_a_folder_without_logs_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"nowhere: is no folder; put one CSV file per sequence there"):
-        read_logs(tmp_path / "nowhere", _rig())
+        read_logs(tmp_path / "nowhere", swing_rig())
     (tmp_path / ".01.csv.7.part").touch()
     (tmp_path / "._01.csv").touch()  # what a Mac leaves on a memory stick
     with pytest.raises(DataError, match=r"holds no \*.csv"):
-        read_logs(tmp_path, _rig())
+        read_logs(tmp_path, swing_rig())
 
 
 READABLE = {
@@ -68,9 +42,9 @@ READABLE = {
 
 @pytest.mark.parametrize("change", READABLE.values(), ids=READABLE.keys())
 def test_harmless_differences_are_read_alike(tmp_path, change):
-    (tmp_path / "01.csv").write_bytes(change(_text(_swing())).encode("utf-8"))
-    logs = read_logs(tmp_path, _rig())
-    columns = _swing()
+    (tmp_path / "01.csv").write_bytes(change(csv_text(swing())).encode("utf-8"))
+    logs = read_logs(tmp_path, swing_rig())
+    columns = swing()
     assert (logs.files, logs.columns) == (("01.csv",), ("u", "theta1", "dtheta1"))
     np.testing.assert_allclose(logs.data.t[0], columns["time"], rtol=1e-8)
     np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], rtol=1e-8)
@@ -79,29 +53,29 @@ def test_harmless_differences_are_read_alike(tmp_path, change):
 
 @pytest.mark.parametrize("text", ["", "nan", "NaN", " "])
 def test_an_empty_field_is_a_missing_sample(tmp_path, text):
-    (tmp_path / "01.csv").write_text(_field(4, "theta1", text)(_text(_swing())))
-    y = read_logs(tmp_path, _rig()).data.y[0]
+    (tmp_path / "01.csv").write_text(with_field(4, "theta1", text)(csv_text(swing())))
+    y = read_logs(tmp_path, swing_rig()).data.y[0]
     assert np.argwhere(np.isnan(y)).tolist() == [[2, 0]]
 
 
 def test_angles_read_every_other_row_pass_the_checks(tmp_path):
-    columns = _swing()
+    columns = swing()
     columns["theta1"][1::2] = np.nan
     write_csv(tmp_path / "01.csv", columns)
-    assert np.isnan(read_logs(tmp_path, _rig()).data.y[0, 1::2, 0]).all()
+    assert np.isnan(read_logs(tmp_path, swing_rig()).data.y[0, 1::2, 0]).all()
 
 
 def test_a_session_clock_runs_on_over_files(tmp_path):
     for i, start in enumerate((0.0, 3.21, 86400.0)):
-        columns = _swing()
+        columns = swing()
         write_csv(tmp_path / f"{i}.csv", columns | {"time": columns["time"] + start})
-    t = read_logs(tmp_path, _rig(clock="session")).data.t
+    t = read_logs(tmp_path, swing_rig(clock="session")).data.t
     np.testing.assert_allclose(t[:, 0], [0.0, 3.21, 86400.0])
     np.testing.assert_allclose(np.diff(t), 0.01, atol=1e-9)
 
 
 def test_a_rig_without_input_has_inputs_of_width_zero(tmp_path):
-    write_csv(tmp_path / "01.csv", _swing())
+    write_csv(tmp_path / "01.csv", swing())
     rig = Rig("free", "acrobot", {}, True, (), (), 0.01, "sequence", ("theta1",), {}, {})
     assert read_logs(tmp_path, rig).data.u.shape == (1, ROWS, 0)
 
@@ -112,14 +86,14 @@ def test_noise_is_not_taken_for_degrees(tmp_path):
     rest = {"time": 0.001 * np.arange(500), "u": np.zeros(500)}
     rest |= {"theta1": rng.normal(0.0, 5e-3, 500), "dtheta1": rng.normal(0.0, 1e-4, 500)}
     write_csv(tmp_path / "01.csv", rest)
-    assert read_logs(tmp_path, _rig(dt=0.001)).files == ("01.csv",)
+    assert read_logs(tmp_path, swing_rig(dt=0.001)).files == ("01.csv",)
 
 
 def test_a_fast_joint_is_not_taken_for_a_wrapped_one(tmp_path):
     t = 0.1 * np.arange(50)
     write_csv(tmp_path / "01.csv", {"time": t, "u": t, "theta1": 60.0 * t, "dtheta1": 60.0 + 0.0 * t * t})
     with pytest.warns(DataWarning):
-        read_logs(tmp_path, _rig(dt=0.1))
+        read_logs(tmp_path, swing_rig(dt=0.1))
 
 
 def test_padding_is_marked_and_neutral():
@@ -198,7 +172,7 @@ def test_every_shared_log_is_read_without_a_word(shared):
     paths = sorted((shared / "data").glob("*/*/rig.toml"))
     assert paths
     for path in paths:
-        rig = read_rig(path, SYSTEMS)
+        rig = read_rig(path, specs)
         train, test = (read_logs(path.parent / name, rig) for name in ("train", "test"))
         check_split(train, test)
         assert train.data.y.shape == (len(train.files), 501, len(rig.measured))
@@ -209,7 +183,7 @@ def test_every_shared_log_is_read_without_a_word(shared):
 def test_reading_is_fast(tmp_path):
     """A file of 500 rows takes 2 ms on one core; the bound leaves room for a busy machine."""
     for i in range(20):
-        write_csv(tmp_path / f"{i:02d}.csv", _swing(500))
+        write_csv(tmp_path / f"{i:02d}.csv", swing(500))
     start = time.process_time()
-    read_logs(tmp_path, _rig())
+    read_logs(tmp_path, swing_rig())
     assert time.process_time() - start < 20 * 0.02

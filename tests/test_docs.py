@@ -15,13 +15,17 @@ from typing import NamedTuple
 import pytest
 
 import nnap_em
-from nnap_em import cli
+from nnap_em.commands import cli
+from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
-from nnap_em.rig import read_rig
+from nnap_em.smoother import Posterior
 from nnap_em.systems import register, specs, systems
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FOLDERS = sorted(path.parent for path in (ROOT / "nnap_em").glob("*/__init__.py"))
+GENERATED = {"predictor.py"}
+"""Programs that the package writes."""
 _BLOCK = re.compile(r"(?:^<!-- not run:(?P<reason>.*?)-->\n)?^```(?P<kind>.*)\n(?P<text>(?:.*\n)*?)```$", re.MULTILINE)
 
 
@@ -74,25 +78,6 @@ def registries():
         each.update(before)
 
 
-def test_files_import_from_files_above_them():
-    """As README lists them; all are there, and what stands in a line stands in its order."""
-    package = ROOT / "nnap_em"
-    house = (ROOT / "README.md").read_text().partition("## The house")[2].partition("## Documentation")[0]
-    listed = re.findall(r"`(\w+)(?:\.py|/)`", "\n".join(re.findall(r"(?m)^\|[^|]*\|[^|]*\|", house)))
-    order = {name: place for place, name in enumerate(listed)}
-    assert sorted(order) == sorted(p.stem for p in package.iterdir() if p.stem[:2] != "__" and p.suffix in (".py", ""))
-    wrong = []
-    for path in package.rglob("*.py"):
-        own = path.relative_to(package).parts
-        if len(own) > 1 or own[0] != "__init__.py":
-            name = own[0].removesuffix(".py")
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.ImportFrom) and node.level == len(own):
-                    others = [node.module.split(".")[0]] if node.module else [alias.name for alias in node.names]
-                    wrong += [f"{name} imports {other}" for other in others if order.get(other, -1) >= order[name]]
-    assert not wrong
-
-
 def test_every_block_is_run_or_says_why_not():
     for page in PAGES:
         blocks = _blocks(page)
@@ -127,8 +112,38 @@ def test_a_name_that_is_taken_is_refused(registries):
 
 
 def test_reference_has_every_public_name():
-    listed = re.findall(r"^::: nnap_em\.(\w+)\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    listed = re.findall(r"^::: nnap_em\.([\w.]+)\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
     assert sorted(listed) == sorted((nnap_em._home[name], name) for name in nnap_em.__all__ if name in nnap_em._home)
+
+
+def test_every_folder_says_what_goes_in_and_out():
+    for folder in FOLDERS:
+        told = (folder / "README.md").read_text()
+        assert told.startswith(f"# {folder.name}\n") and "\nIn: " in told and " Out: " in told, folder
+        for link in re.findall(r"\]\(([^)#]+)", told):
+            assert (folder / link).exists(), f"{folder}: {link}"
+
+
+def test_every_file_that_is_named_is_there():
+    """By its name, or by the end of its path."""
+    there = [f"/{p.relative_to(ROOT)}" for part in ("nnap_em", "tests", "examples", "benchmarks", "docs")
+             for p in (ROOT / part).rglob("*.py")]  # fmt: skip
+    for page in [*PAGES, ROOT / "benchmarks/README.md", *ROOT.glob("nnap_em/*/README.md")]:
+        for named in re.findall(r"(?<![\w/])(\w[\w/]*\.py)\b", page.read_text()):
+            assert named in GENERATED or any(path.endswith(f"/{named}") for path in there), f"{page}: {named}"
+
+
+def test_every_benchmark_has_its_row():
+    told = (ROOT / "benchmarks/README.md").read_text()
+    scripts = [path.name for path in (ROOT / "benchmarks").glob("*.py") if not path.name.startswith("planted_")]
+    assert [name for name in scripts if f"`{name}" not in told] == []
+    for page in re.findall(r"\]\(([^)#]+)", told):
+        assert (ROOT / "benchmarks" / page).exists(), page
+
+
+def test_a_new_smoother_is_told_every_field_of_its_result():
+    section = (ROOT / "docs/adding.md").read_text().partition("\n## A smoother\n")[2].partition("\n## ")[0]
+    assert [name for name in Posterior._fields if not re.search(rf"`{name}\b", section)] == []
 
 
 def test_pages_made_from_the_code_are_whole():
@@ -137,3 +152,6 @@ def test_pages_made_from_the_code_are_whole():
     under = next(a for a in cli.parser()._actions if isinstance(a, argparse._SubParsersAction))
     assert all(f"## {name}\n" in commands for name in under.choices)
     assert all(f"| `{name}` |" in effects for name in catalogue)
+    rows = re.findall(r"(?m)^\| `([\w/]+\.py)` \| \S.* \|$", hooks.folders())
+    modules = [p.relative_to(folder) for folder in FOLDERS for p in folder.rglob("*.py") if p.name != "__init__.py"]
+    assert sorted(rows) == sorted(map(str, modules))

@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from nnap_em import cli
-from nnap_em.draft import draft
-from nnap_em.formats import DataError, write_csv
-from nnap_em.rig import RigError, SystemSpec, read_rig
+from nnap_em.commands import cli
+from nnap_em.commands.draft import draft
+from nnap_em.data.formats import DataError, write_csv
+from nnap_em.data.rig import RigError, SystemSpec, read_rig
 from nnap_em.systems import specs
 
 DT, ROWS = 0.02, 400

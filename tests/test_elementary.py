@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.elementary import asinh, cos, reciprocal, sin, sincos
+from nnap_em.numerics.elementary import asinh, cos, reciprocal, sin, sincos
 
 
 @pytest.mark.parametrize("turns", [1.0, 1e3])

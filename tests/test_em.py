@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from nnap_em.data import Dataset
-from nnap_em.em import FitError, Schedule
-from nnap_em.gaussian import Gaussian
-from nnap_em.identify import Identified, begin, friction_table, identify
-from nnap_em.kalman import ekf
-from nnap_em.model import StateSpaceModel
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import Experiment, examples, simulate, sweep_experiment
-from nnap_em.smoother import active_steps
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import Identified, begin, friction_table, identify
+from nnap_em.em.loop import FitError, Schedule
+from nnap_em.model.base import prepare
+from nnap_em.model.simulate import Experiment, examples, simulate, sweep_experiment
+from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.kalman import ekf
 from nnap_em.systems import specs, systems
 from nnap_em.systems.slide import Slide
 
@@ -94,7 +94,7 @@ def _error(model: StateSpaceModel, truth: StateSpaceModel, x) -> float:
 @eqx.filter_jit
 def _loglik(model: StateSpaceModel, data: Dataset):
     def one(seq):
-        return ekf(model, model.start, seq.u, seq.y, ~jnp.isnan(seq.y), active_steps(seq.valid)).loglik
+        return ekf(model, model.start, prepare(model, seq)).loglik
 
     return jnp.sum(jax.vmap(one)(data))
 

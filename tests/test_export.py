@@ -12,16 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_data import _text
+from helpers import csv_text
 
-from nnap_em import cli, unroll
-from nnap_em.data import Dataset
+from nnap_em.commands import cli
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import AbstractEffect, catalogue
-from nnap_em.export import ExportError, export, parameters, predictor, stablehlo
-from nnap_em.identify import Identified, begin, friction_table, parameter_table, phi_samples
-from nnap_em.predict import predict, smoothed_states
-from nnap_em.rig import Declared, Rig
-from nnap_em.store import save
+from nnap_em.em.identify import Identified, begin, friction_table, parameter_table, phi_samples
+from nnap_em.em.predict import predict, smoothed_states
+from nnap_em.em.store import save
+from nnap_em.portable import unroll
+from nnap_em.portable.export import ExportError, export, parameters, predictor, stablehlo
 
 DT, ROWS, GIVEN, SAMPLES = 0.02, 90, 0.6, 20
 RIG = Rig(
@@ -32,8 +33,8 @@ RIG = Rig(
 EFFECTS: dict[str, tuple[AbstractEffect, ...]] = {
     "plain": (),
     "spring and bias": (
-        catalogue["torsional_spring"](*map(jnp.asarray, (0.3, 0.02, 0.0, 0.0)), 1),
-        catalogue["sensor_bias"](jnp.asarray(0.05), "theta1"),
+        catalogue["torsional_spring"](*map(jnp.asarray, (0.3, 0.02, 0.0, 0.0)), joint=1),
+        catalogue["sensor_bias"](jnp.asarray(0.05), channel="theta1"),
     ),
 }
 
@@ -123,7 +124,7 @@ def test_the_predictor_is_a_program(case, tmp_path):
     fitted, data = case
     export(fitted, tmp_path)
     columns = {"time": data.t[0], "u": data.u[0, :, 0], "theta1": data.y[0, :, 0]}
-    (tmp_path / "log.csv").write_text(_text(columns).replace("nan", ""))
+    (tmp_path / "log.csv").write_text(csv_text(columns).replace("nan", ""))
     _alone(tmp_path, "predictor.py", "log.csv", "--given", str(GIVEN), "--out", "prediction.csv")
     found = np.genfromtxt(tmp_path / "prediction.csv", delimiter=",", names=True)
     assert found.dtype.names == ("time", "theta1", "dtheta1", "theta1_std", "dtheta1_std")
@@ -139,8 +140,9 @@ def test_one_step_through_stablehlo(case):
     fitted, data = case
     step = jax.export.deserialize(bytearray(stablehlo(fitted.model)))
     x = jnp.asarray(np.random.default_rng(1).normal(size=(7, fitted.model.log_q.shape[0])))
-    u = fitted.model.inputs(jax.tree.map(lambda a: jnp.asarray(a[0]), data))[:7]
-    following, reading = step.call(x, u)
+    u = jax.tree.map(lambda a: a[:7], fitted.model.inputs(jax.tree.map(lambda a: jnp.asarray(a[0]), data)))
+    clock = (u.time[:, None], u.before, u.age[:, None]) if fitted.model.effects else ()
+    following, reading = step.call(x, jnp.concatenate([u.u, *clock], axis=1))
     np.testing.assert_allclose(following, jax.vmap(fitted.model.transition)(x, u), rtol=1e-12)
     np.testing.assert_allclose(reading, jax.vmap(fitted.model.emission)(x, u), rtol=1e-12)
 
@@ -168,8 +170,24 @@ def test_the_json_has_the_numbers_of_the_model(case, tmp_path):
     assert torque == pytest.approx(float(fitted.model.unknown(jnp.asarray([v]))[0]), rel=1e-12)
 
 
+def test_a_slide_is_exported_in_newtons_and_metres():
+    rig = Rig("s", "slide", {"m": Declared(1.0, 0.0)}, True, ("f",), (1,), DT, "sequence", ("x",), {"x": 1e-3}, {})
+    t = DT * np.arange(ROWS)
+    swing = np.sin(5 * t)[None, :, None]
+    data = Dataset(t[None], swing, swing, np.ones((1, ROWS), bool))
+    spring = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
+    fitted = begin(rig, data, key=jax.random.key(0), effects=(spring,))
+    fitted = fitted._replace(state=fitted.state._replace(hessian=jnp.eye(fitted.state.hessian.shape[0])))
+    found = parameters(fitted)
+    (effect,), (joint,) = found["effects"], found["friction"]["joints"]
+    assert {n: p["unit"] for n, p in effect["parameters"].items()} == {"k": "N/m", "theta0": "m"}
+    assert (joint["velocity_unit"], joint["torque_unit"]) == ("m/s", "N")
+    assert found["inputs"] == [{"name": "f", "joint": 1, "unit": "N"}]
+    assert "Inputs: f [N]." in predictor(fitted)
+
+
 def test_a_model_that_numpy_cannot_follow_is_refused_by_the_name_of_its_effect(tmp_path):
-    gain = catalogue["motor_gain"](jnp.asarray(0.1), 1)
+    gain = catalogue["motor_gain"](jnp.asarray(0.1), joint=1)
     fitted, _ = _case((gain,))
     with pytest.raises(ExportError, match=r"the effect 'motor_gain' changes the inputs over time; use model.stablehlo"):
         export(fitted, tmp_path / "out")

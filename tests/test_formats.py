@@ -12,11 +12,11 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em import commands
-from nnap_em.data import read_logs
-from nnap_em.formats import DataError, read_table, write_csv
-from nnap_em.identify import Identified
-from nnap_em.rig import Rig
+from nnap_em.commands.common import write_states
+from nnap_em.data.dataset import read_logs
+from nnap_em.data.formats import DataError, read_table, write_csv
+from nnap_em.data.rig import Rig
+from nnap_em.em.identify import Identified
 
 RIG = Rig("bench", "acrobot", {}, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
 
@@ -160,5 +160,5 @@ def test_predictions_of_such_logs_are_csv_files(tmp_path):
     _parquet(tmp_path / "logs/01.parquet", _log())
     logs = read_logs(tmp_path / "logs", RIG)
     values = np.zeros((1, 50, 4))
-    commands._write_states(tmp_path / "out", logs, Identified(RIG, *[None] * 3), values, values)
+    write_states(tmp_path / "out", logs, Identified(RIG, *[None] * 4), values, values)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["01.csv"]

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.friction import FrictionNetwork
+from nnap_em.model.friction import FrictionNetwork
 
 SPEED, SCALE = jnp.asarray([8.0, 15.0]), jnp.asarray([0.3, 0.1])
 FRICTION = FrictionNetwork(SPEED, SCALE, key=jax.random.key(0))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.gaussian import cholesky, cubature, lower, spd_solve, symmetric
+from nnap_em.numerics.gaussian import cholesky, cubature, lower, spd_solve, symmetric
 
 EPS = np.finfo(float).eps
 

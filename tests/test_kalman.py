@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
-from nnap_em.data import Dataset
-from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Affine, Cubature, Reading, Tangent, ekf, kalman_filter, rts
-from nnap_em.model import AbstractModel
-from nnap_em.simulate import paper_experiment, paper_model
-from nnap_em.smoother import GaussianSmoother, StartBank
+from nnap_em.data.dataset import Dataset
+from nnap_em.model.base import AbstractModel, Prepared, prepare
+from nnap_em.model.simulate import paper_experiment, paper_model
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import GaussianSmoother
+from nnap_em.smoother.kalman import Affine, Cubature, Reading, Tangent, ekf, kalman_filter, rts
+from nnap_em.smoother.start import StartBank
 
 LOG_2PI = np.log(2 * np.pi)
 
@@ -119,7 +120,8 @@ def _reading(p: _Problem) -> Reading:
 
 @jax.jit
 def _run(p: _Problem, observed, active):
-    filtered = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), p.y, observed, active)
+    seq = Prepared(p.u, p.y, observed, active)
+    filtered = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), seq)
     return filtered, rts(filtered)
 
 
@@ -179,7 +181,8 @@ def test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings(r
     patterns = _patterns(time, 2)
     y = jnp.where(jnp.asarray(patterns), p.y[None], jnp.nan)
     rows = jnp.arange(float(time)), p.u, jnp.ones(time, bool)
-    smooth = jax.jit(jax.vmap(lambda y: ROUTES[route](p.model, Dataset(rows[0], rows[1], y, rows[2]))))
+    one = lambda y: ROUTES[route](p.model, prepare(p.model, Dataset(rows[0], rows[1], y, rows[2])))  # noqa: E731
+    smooth = jax.jit(jax.vmap(one))
     found = smooth(y)
     dense = [_dense(p, observed) for observed in patterns]
     cov = np.stack([d.cov.reshape(time, n, time, n) for d in dense])
@@ -203,7 +206,7 @@ def test_rows_that_are_not_valid_are_not_read():
     p = _problem(6, time=7)
     cut = Dataset(jnp.arange(7.0), p.u, p.y, jnp.arange(7) < 4)
     for route in ("tangent", "tangent, again"):
-        smooth = eqx.filter_jit(ROUTES[route])
+        smooth = eqx.filter_jit(lambda model, seq, route=route: ROUTES[route](model, prepare(model, seq)))
         long, short = smooth(p.model, cut), smooth(p.model, jax.tree.map(lambda a: a[:4], cut))
         np.testing.assert_allclose(long.loglik, short.loglik, rtol=1e-12)
         # the smoother passes the padding by solving with the state's own covariance: rounding, and no more
@@ -225,7 +228,7 @@ def test_likeliest_start_weighs_prior_and_readings():
         score = [_dense(p._replace(start=s), seen).loglik - 0.5 * a**2 for s, a in zip(each, away, strict=True)]
         smoother = GaussianSmoother(bank, Tangent())
         model = eqx.tree_at(lambda m: m.start, p.model, p.start)
-        found = eqx.filter_jit(smoother.likeliest)(model, p.u, p.y, jnp.asarray(seen), _active(4))
+        found = eqx.filter_jit(smoother.likeliest)(model, Prepared(p.u, p.y, jnp.asarray(seen), _active(4)))
         np.testing.assert_allclose(found.mean, starts.mean[int(np.argmax(score))], rtol=1e-14)
         likeliest = int(np.argmax(np.asarray(score) + 0.5 * away**2))
         chosen.append((int(np.argmax(score)), likeliest))
@@ -242,7 +245,7 @@ def test_single_precision_gives_what_double_does(linearise):
     model = paper_model(start_std=0.05)
     model = eqx.tree_at(lambda m: m.start.cov, model, jnp.diag(jnp.asarray([0.1, 0.05, 0.02, 0.02]) ** 2))
     data = paper_experiment(model, 4, 80, key=jax.random.key(1)).data
-    run = eqx.filter_jit(lambda smoother, m, d: jax.vmap(lambda seq: smoother(m, seq))(d))
+    run = eqx.filter_jit(lambda smoother, m, d: jax.vmap(lambda seq: smoother(m, prepare(m, seq)))(d))
     smoother = GaussianSmoother(StartBank((1,) * 4), linearise)
     double, single = (run(*_cast((smoother, model, data), dtype)) for dtype in (jnp.float64, jnp.float32))
     assert single.state.mean.dtype == jnp.float32 and double.state.mean.dtype == jnp.float64
@@ -306,9 +309,9 @@ def test_what_is_not_measured_may_hold_any_number():
 @pytest.mark.parametrize("linearise", [Tangent(), Cubature()], ids=["tangent", "cubature"])
 def test_extended_filter_is_kalmans_on_a_linear_system(linearise):
     p = _problem(1)
-    observed = jnp.ones(p.y.shape, bool)
-    extended = ekf(p.model, p.start, p.u, p.y, observed, _active(6), linearise)
-    plain = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), p.y, observed, _active(6))
+    seq = Prepared(p.u, p.y, jnp.ones(p.y.shape, bool), _active(6))
+    extended = ekf(p.model, p.start, seq, linearise)
+    plain = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), seq)
     for a, b in zip(jax.tree.leaves(extended), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)  # matrix, offset and noise are rounded, nothing else
 
@@ -418,13 +421,13 @@ def test_nile_likelihood_is_highest_at_the_published_variances():
     """Maximum likelihood estimates 15099 and 1469.1 [Durbin & Koopman 2012, sec. 2.10.3]."""
     p, y = _nile()
     seen = jnp.ones(p.y.shape, bool).at[0].set(False)
+    seq = Prepared(p.u, p.y, seen, _active(len(y)))
 
     @jax.jit
     def loss(log):
         model = eqx.tree_at(lambda m: (m.log_r, m.log_q), p.model, (log[:1], log[1:]))
         start = Gaussian(p.start.mean, jnp.exp(log[:1])[:, None])  # diffuse, conditioned on y_1
-        rows = _reading(p)
-        return -kalman_filter(model.log_q, model.log_r, start, p.affine, rows, p.y, seen, _active(len(y))).loglik
+        return -kalman_filter(model.log_q, model.log_r, start, p.affine, _reading(p), seq).loglik
 
     found = minimize(loss, np.log([1e4, 1e3]), jac=jax.jit(jax.grad(loss)), method="BFGS", options={"gtol": 1e-8})
     # with the constants that their table leaves out: -632.54 in all

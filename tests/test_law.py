@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from nnap_em.law import PARAMETERS, StribeckLaw, describe, fit_law
+from nnap_em.model.law import PARAMETERS, StribeckLaw, describe, fit_law
 
 TRUTH = (0.03, 0.05, 0.4, 0.007, 0.1)  # coulomb, breakaway, stribeck, viscous, smooth
 OFFSET = 0.004

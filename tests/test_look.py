@@ -5,13 +5,16 @@ import jax
 import numpy as np
 import plant
 import pytest
-from test_effects import _model
-from test_unroll import AROUND
+from helpers import around, declared_model
 
+from nnap_em.diagnose.keys import key_of, replaced
+from nnap_em.diagnose.look import held_out_gain
+from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
-from nnap_em.look import held_out_gain, key_of, replaced
-from nnap_em.model import with_effects
-from nnap_em.refit import Trial
+from nnap_em.model.state_space import with_effects
+
+MODEL = declared_model(plant.Case(steps=20, hidden=False))
+AROUND = around(MODEL)
 
 
 def _functions(joint: int, *names: str):
@@ -25,7 +28,7 @@ def test_a_function_of_each_turn_and_one_of_all_turns_are_rivals():
     turning, still = _functions(2, "theta2")
     assert key_of(turning) == key_of(still)
     spring = catalogue["torsional_spring"].candidates(AROUND)[0].start
-    model = with_effects(_model(plant.Case(steps=20, hidden=False)), (spring, turning))
+    model = with_effects(MODEL, (spring, turning))
     assert replaced(still, model) == 1
     assert replaced(turning, model) is None
     assert replaced(_functions(1, "theta1")[1], model) is None
@@ -48,7 +51,7 @@ def test_one_sequence_has_nothing_to_be_held_out(bench, monkeypatch):
     def refit(*_, **__):
         raise AssertionError("refitted to the very sequence that should judge")
 
-    monkeypatch.setattr("nnap_em.look.refit", refit)
+    monkeypatch.setattr("nnap_em.diagnose.look.refit", refit)
     null, full = (Trial(model, rule, path, gain * np.ones(4), np.eye(rule.prior.size)) for gain in (0.0, 100.0))
     assert held_out_gain(null, full, data, np.array([False, True, False, False])) == 0.0
     with pytest.raises(AssertionError, match="very sequence"):

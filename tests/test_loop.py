@@ -9,11 +9,13 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em import cli, close_the_loop, findings, load, look, read_logs, read_rig, specs
-from nnap_em.data import Dataset
-from nnap_em.diagnose import Finding, verdict
+from nnap_em import close_the_loop, findings, load, read_logs, read_rig, specs
+from nnap_em.commands import cli
+from nnap_em.data.dataset import Dataset
+from nnap_em.diagnose import look
+from nnap_em.diagnose.findings import Finding, verdict
+from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
-from nnap_em.refit import Trial
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
@@ -104,7 +106,7 @@ def _table(path):
 
 def test_the_verdict_claims_a_fall_only_where_there_is_one():
     """The same finding with a test error that falls, that rises, and that nobody knows."""
-    effect = catalogue["payload"](jnp.zeros(()), 2)
+    effect = catalogue["payload"](jnp.zeros(()), joint=2)
     found = [Finding(effect, {}, {}, (), "payload")]
     error = {"horizons_s": [1.0], "before": {"theta1": [0.2]}, "after": {"theta1": [0.1]}}
     assert "falls from 0.2 to 0.1" in verdict(found, error)
@@ -112,7 +114,7 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
     assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
     assert verdict(found, None) == "The model lacks payload at joint 2."
-    several = [Finding(catalogue["payload"](jnp.zeros(()), j), {}, {}, (), "") for j in (1, 2, 1)]
+    several = [Finding(catalogue["payload"](jnp.zeros(()), joint=j), {}, {}, (), "") for j in (1, 2, 1)]
     assert verdict(several, error).startswith(
         "The model lacks payload at joint 1, payload at joint 2 and payload at joint"
     )

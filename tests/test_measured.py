@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.build import build
-from nnap_em.data import Dataset, read_logs
-from nnap_em.em import e_step
-from nnap_em.identify import identify
-from nnap_em.rig import Rig, read_rig
-from nnap_em.smoother import ExtendedKalmanSmoother
+from nnap_em.data.dataset import Dataset, read_logs
+from nnap_em.data.rig import Rig, read_rig
+from nnap_em.em.build import build
+from nnap_em.em.identify import identify
+from nnap_em.em.loop import e_step
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.systems import specs
 
 _e_step = eqx.filter_jit(e_step)

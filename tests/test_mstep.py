@@ -10,14 +10,21 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 
-from nnap_em.data import Dataset, fill_missing
-from nnap_em.friction import FrictionNetwork, NoFriction
-from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Tangent, kalman_filter, linear_reading
-from nnap_em.model import StateSpaceModel
-from nnap_em.mstep import ParameterPrior, Quadratic, ScoringMStep, Weights, expand, locals_along, readings_at, spread
-from nnap_em.simulate import simulate
-from nnap_em.smoother import ExtendedKalmanSmoother, Posterior, StartBank, active_steps
+from nnap_em.data.dataset import Dataset, active_steps
+from nnap_em.em.local import local, locals_along, readings_along, readings_at
+from nnap_em.em.mstep import ScoringMStep
+from nnap_em.em.prior import ParameterPrior
+from nnap_em.em.quadratic import Quadratic, quadratic, spread
+from nnap_em.em.weights import Weights
+from nnap_em.model.base import prepare
+from nnap_em.model.friction import FrictionNetwork, NoFriction
+from nnap_em.model.simulate import simulate
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
+from nnap_em.smoother.posterior import Posterior
+from nnap_em.smoother.start import StartBank
 from nnap_em.systems.pendulum import Pendulum
 from nnap_em.systems.slide import Slide
 
@@ -71,8 +78,14 @@ class _Case(NamedTuple):
 def _expand(model, prior, data: Dataset):
     """Posterior and expansion of every sequence, linearised by tangents about the smoother's fixed point."""
     smoother = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)
-    posterior = jax.vmap(lambda seq: smoother(model, seq))(data)
-    return posterior, jax.vmap(lambda p, s: expand(model, prior, NODES, p, s, Tangent()))(posterior, data)
+    posterior = jax.vmap(lambda seq: smoother(model, prepare(model, seq)))(data)
+
+    def expand(posterior, seq):
+        here = local(model, prior, posterior.state, seq, Tangent())
+        read = readings_at(model, posterior, here.seq)
+        return quadratic(model.log_q, model.log_r, model.start, here, NODES, posterior, read)
+
+    return posterior, jax.vmap(expand)(posterior, data)
 
 
 class _Pushed(NamedTuple):
@@ -100,18 +113,16 @@ class _Knobs(NamedTuple):
 @eqx.filter_jit
 def _gradient(case: _Case) -> _Knobs:
     """Gradient of the Kalman likelihood, linearised about the path of `case`, by central differences."""
-    y, observed = fill_missing(case.seq.y)
-    active = active_steps(case.seq.valid)
     model, zero = case.model, jnp.zeros(())
+    seq = prepare(model, case.seq)
 
     def loglik(knobs: _Knobs):
         noisy = eqx.tree_at(lambda m: (m.log_q, m.log_r), MASS.write(model, knobs.mass), knobs[:2])
         pushed = _Pushed(noisy, knobs.force, knobs.damping)
         about = lambda x, u: Tangent()(pushed, Gaussian(x, jnp.eye(2)), u)  # noqa: E731
-        affine = jax.vmap(about)(case.posterior.state.mean, case.seq.u)
-        reading = jax.vmap(lambda x, u: linear_reading(noisy, x, u))(case.posterior.state.mean, case.seq.u)
-        seen = observed & case.seq.valid[:, None]
-        return kalman_filter(noisy.log_q, noisy.log_r, model.start, affine, reading, y, seen, active).loglik
+        affine = jax.vmap(about)(case.posterior.state.mean, seq.inputs)
+        reading = jax.vmap(lambda x, u: linear_reading(noisy, x, u))(case.posterior.state.mean, seq.inputs)
+        return kalman_filter(noisy.log_q, noisy.log_r, model.start, affine, reading, seq).loglik
 
     now = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model))
     flat, unravel = ravel_pytree(now)
@@ -172,7 +183,7 @@ def test_torque_score_at_the_nodes_is_that_of_viscous_friction(slide):
 def _dense_readings(model, seq: Dataset, log_q, log_r):
     """Covariance of all readings of a linear model, and the map from kicks of every step to them."""
     time, n = seq.t.shape[0], 2
-    f = np.asarray(Tangent()(model, Gaussian(jnp.zeros(n), jnp.eye(n)), jnp.zeros(1)).matrix)
+    f = np.asarray(Tangent()(model, Gaussian(jnp.zeros(n), jnp.eye(n)), Inputs.held(jnp.zeros(1))).matrix)
     inside = np.asarray(active_steps(seq.valid))
     transfer = np.zeros((time, time, n, n))  # effect on x_k of what is added at x_j
     for j in range(time):
@@ -295,11 +306,11 @@ def test_sequences_that_are_not_used_have_no_weight(slides):
     """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
     model, data, posterior, each = slides
     rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), shape=model.log_q, linearise=Tangent())
-    read = eqx.filter_jit(jax.vmap(lambda p, s: readings_at(model, p, s)))(posterior, data)
     here = locals_along(model, MASS, posterior.state, data, Tangent())
+    read = readings_along(model, posterior, here.seq)
 
     def step(index, used):
-        parts = jax.tree.map(lambda a: a[np.asarray(index)], (here, posterior, read, data))
+        parts = jax.tree.map(lambda a: a[np.asarray(index)], (here, posterior, read))
         far = jnp.where(jnp.asarray(used), 1.0, 1e3)
         spoilt = eqx.tree_at(lambda p: p[1].kick, parts, parts[1].kick * far[:, None, None, None])
         spoilt = eqx.tree_at(lambda p: p[1].state.mean, spoilt, spoilt[1].state.mean * far[:, None, None])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from nnap_em.ode import RK4, integrate
+from nnap_em.numerics.ode import RK4, integrate
 
 X0 = jnp.asarray([1.2, -0.7])
 

@@ -6,7 +6,10 @@ from html.parser import HTMLParser
 
 import pytest
 
-from nnap_em.page import LEVEL, Picture, label, number, page, with_std
+from nnap_em.effects import catalogue
+from nnap_em.report.page import LEVEL, Picture, page
+from nnap_em.report.vocabulary import MEANINGS, WORDS
+from nnap_em.report.wording import label, number, with_std
 
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
 SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'
@@ -35,6 +38,7 @@ WHOLE = {
         "before": {"theta1": [0.2, 0.807], "dtheta1": [1.0, None]},
         "after": {"theta1": [0.3, 0.0058], "dtheta1": [1.0, float("nan")]},
     },
+    "units": {"theta1": "rad", "dtheta1": "rad/s"},
     "models": {"before": "before.npz", "after": "after.npz"},
     "friction_change": "Friction was bent.",
     "tests": {
@@ -116,14 +120,14 @@ def test_clean_rig_has_one_column_of_errors_and_no_effect():
 
 
 def test_page_says_what_was_found_in_order():
-    text = " ".join(_parsed(page(WHOLE, FIGURES)).text)
+    text = " ".join("".join(_parsed(page(WHOLE, FIGURES)).text).split())
     told = (
         "The model lacks a spring.",
         "0.81 → 0.0058 rad",
         "139 ×",
         "What was found",
         "0.05995 ± 0.00037 N m/rad",
-        "Beyond doubt",
+        "Beyond doubt. The training data speak for it with 1142 nat. Sequences",
         "Before and after",
         "1.5 × larger",
         "1 failed before and none fails after (not counting 1 and none",
@@ -178,6 +182,49 @@ def test_numbers_as_a_reader_writes_them():
     assert with_std(12.3456, 3.21) == "12.3 ± 3.2"
     assert with_std(1.5e-6, 2e-7) == "(1.50 ± 0.20) × 10⁻⁶"
     assert with_std(3.0, None) == "3.000"
+
+
+def test_every_effect_is_explained():
+    """Under the name that the report gives it, and no parameter that it does not have."""
+    for kind in catalogue.values():
+        assert MEANINGS[kind.key()]
+        assert kind.reported_as or set(WORDS.get(kind.key(), {})) <= set(kind.units)
+
+
+def test_a_fit_has_a_page_of_its_own():
+    fitted = {
+        "rig": "arm",
+        "verdict": "Fitted the friction of 1 joint.",
+        "friction_law": [
+            {"joint": 1, "parameters": {}, "text": "theta1: Coulomb 0.03 N m."},
+            {"text": "theta2: rough."},
+        ],
+        "error": {"given_s": 1.0, "horizons_s": [1.0], "fit": {"theta1": [0.02]}},
+        "units": {"theta1": "rad"},
+        "parameters": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
+        "noise": {"measurement": {"theta1": {"std": 0.005, "unit": "rad", "estimated": True}}},
+        "left_out": ["03.csv"],
+        "model": "model.npz",
+    }
+    text = " ".join("".join(_parsed(page(fitted, FIGURES)).text).split())
+    told = (
+        "Identification of arm",
+        "Fitted the friction of 1 joint.",
+        "0.020 rad",
+        "What was learned",
+        "theta1: Coulomb 0.03 N m.",
+        "theta2: rough.",
+        "1.00 ± 0.10 kg",
+        "Prediction error",
+        "the first 1.0 s",
+        "left out of the last epoch: 03.csv",
+        "0.00500 rad (estimated)",
+    )
+    places = [text.find(part) for part in told]
+    assert min(places) >= 0, [part for part, place in zip(told, places, strict=True) if place < 0]
+    assert places == sorted(places)
+    for absent in ("What was found", "could not be told apart", "Nothing is missing", "smaller by"):
+        assert absent not in text
 
 
 def test_label():

@@ -15,7 +15,7 @@ import pytest
 from shell import ENVIRONMENT
 
 from nnap_em.launch import free_address
-from nnap_em.parallel import all_devices, each, over
+from nnap_em.numerics.parallel import all_devices, each, over
 
 
 def _weigh(common, one):
@@ -48,8 +48,9 @@ def test_over_one_device():
 
 OWN_DEVICES = """
 import jax, jax.numpy as jnp
-from nnap_em import commands, parallel
-commands.set_up()
+from nnap_em.commands import common
+from nnap_em.numerics import parallel
+common.set_up()
 seen = []
 run = parallel._run
 parallel._run = lambda function, mesh, *rest: seen.append(mesh.size) or run(function, mesh, *rest)
@@ -74,12 +75,12 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 4)
 import equinox as eqx
 import numpy as np
-from nnap_em.em import fit
-from nnap_em.identify import begin
-from nnap_em.parallel import AXIS, over
-from nnap_em.data import read_logs
-from nnap_em.rig import read_rig
-from nnap_em.smoother import CubatureSmoother, GaussianSmoother
+from nnap_em.em.loop import fit
+from nnap_em.em.identify import begin
+from nnap_em.numerics.parallel import AXIS, over
+from nnap_em.data.dataset import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.smoother.gaussian import CubatureSmoother, GaussianSmoother
 from nnap_em.systems import specs
 from pathlib import Path
 folder = Path(sys.argv[1])
@@ -110,7 +111,9 @@ def rig(tmp_path_factory) -> Path:
 
 
 def _nnap(*command, launch=()):
-    first = [sys.executable, "-m", "nnap_em.launch", *launch] if launch else [sys.executable, "-m", "nnap_em.cli"]
+    first = (
+        [sys.executable, "-m", "nnap_em.launch", *launch] if launch else [sys.executable, "-m", "nnap_em.commands.cli"]
+    )
     done = subprocess.run([*first, *command], env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-4000:]
     return done
@@ -177,7 +180,7 @@ def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
     )
     try:
         deadline = time.monotonic() + 300
-        while not (out / "checkpoint.npz").exists():
+        while not list(out.glob("unfinished/*.npz")):
             assert run.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
         os.killpg(run.pid, signal.SIGINT)  # as a terminal does
@@ -189,13 +192,13 @@ def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dying_process_ends_the_run_and_leaves_the_checkpoint(rig, tmp_path):
+def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, tmp_path):
     out = tmp_path / "out"
     order = [sys.executable, "-m", "nnap_em.launch", "2", "identify", str(rig), "--epochs", "500", "--out", str(out)]
     run = subprocess.Popen(order, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:
         deadline = time.monotonic() + 300
-        while not (out / "checkpoint.npz").exists():
+        while not list(out.glob("unfinished/*.npz")):
             assert run.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()

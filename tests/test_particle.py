@@ -9,10 +9,16 @@ import scipy.stats
 from jax.extend.random import threefry_2x32
 from jaxtyping import Array, Float
 
-from nnap_em.data import Dataset, fill_missing
-from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import Reading, Tangent, kalman_filter
-from nnap_em.particle import (
+from nnap_em.data.dataset import Dataset, fill_missing
+from nnap_em.model.base import AbstractModel, prepare
+from nnap_em.model.simulate import paper_experiment, paper_model
+from nnap_em.model.state_space import Inputs
+from nnap_em.numerics.elementary import exp2
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.numerics.random import normals, threefry, uniforms
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.kalman import Reading, Tangent, kalman_filter
+from nnap_em.smoother.particle import (
     Bootstrap,
     ExactBackward,
     Guided,
@@ -20,25 +26,19 @@ from nnap_em.particle import (
     MetropolisBackward,
     ParticleSmoother,
     Potentials,
-    _cumsum,
-    _exp2,
-    _threefry,
-    _where,
     ffbs,
-    normals,
     particle_filter,
-    systematic,
-    uniforms,
 )
-from nnap_em.simulate import paper_experiment, paper_model
-from nnap_em.smoother import ExtendedKalmanSmoother, StartBank, active_steps
+from nnap_em.smoother.particle.filter import _where
+from nnap_em.smoother.particle.resampling import cumsum, systematic
+from nnap_em.smoother.start import StartBank
 
 PROPOSALS = {"bootstrap": Bootstrap(), "guided": Guided(), "lookahead": Lookahead(1.0), "tempered": Lookahead(0.8)}
 BACKWARD = {"exact": ExactBackward(), "metropolis": MetropolisBackward(10)}
 SEEDS = 200
 
 
-class _Oscillator(eqx.Module):
+class _Oscillator(AbstractModel):
     """A damped mass on a spring, position read: the Kalman smoother is exact."""
 
     matrix: Float[Array, "state state"]
@@ -46,13 +46,12 @@ class _Oscillator(eqx.Module):
     start: Gaussian
     log_q: Float[Array, " state"]
     log_r: Float[Array, " obs"]
+    measured: tuple[int, ...] = eqx.field(static=True, default=(0,))
+    dt: float = eqx.field(static=True, default=0.1)
 
     def transition(self, x, u):
         rows = [self.matrix[i, 0] * x[0] + self.matrix[i, 1] * x[1] + self.drive[i] * u[0] for i in range(2)]
         return jnp.stack(rows)
-
-    def inputs(self, seq):
-        return jnp.asarray(seq.u)
 
     def emission(self, x, u=None):
         return x[:1]
@@ -109,7 +108,7 @@ def _run_linear(model, seq, potentials, keys):
 def _linear_runs(proposal):
     """SEEDS independent runs: the exact answer, log-likelihoods, and the trajectories of both samplers."""
     model = _oscillator()
-    seq = _linear_data(model)
+    seq = prepare(model, _linear_data(model))
     filtered, smoothed = _guide(2).path(model, seq)
     potentials = PROPOSALS[proposal](model, seq, filtered, smoothed)
     return model, filtered, smoothed, _run_linear(model, seq, potentials, jax.random.split(jax.random.key(5), SEEDS))
@@ -158,8 +157,7 @@ def test_scores_of_the_trajectories_are_fishers(proposal):
         affine = jax.vmap(lambda u: Tangent()(moved, Gaussian(jnp.zeros(2), jnp.eye(2)), u))(seq.u)
         rows = jnp.tile(jnp.asarray([[[1.0, 0.0]]]), (*y.shape, 1))
         reading = Reading(rows, jnp.zeros_like(y))
-        active = active_steps(seq.valid)
-        return kalman_filter(log_q, log_r, model.start, affine, reading, y, observed, active).loglik
+        return kalman_filter(log_q, log_r, model.start, affine, reading, prepare(model, seq)).loglik
 
     exact = jnp.concatenate(jax.grad(loglik, argnums=(0, 1, 2))(model.log_q, model.log_r, jnp.zeros(2)))
     x, kick = map(np.asarray, paths["exact"])
@@ -179,11 +177,11 @@ def test_double_precision_gives_what_single_does():
     @jax.jit
     def run(keys):
         smoothers = [ParticleSmoother(_guide(2), Guided(), num_particles=200, dtype=d) for d in (jnp.float32, float)]
-        return [jax.vmap(lambda key, s=s: s(model, seq, key=key))(keys) for s in smoothers]
+        return [jax.vmap(lambda key, s=s: s(model, prepare(model, seq), key=key))(keys) for s in smoothers]
 
     single, double = run(jax.random.split(jax.random.key(8), 100))
     assert single.loglik.dtype == double.loglik.dtype == jnp.float64
-    exact = _guide(2).path(model, seq)
+    exact = _guide(2).path(model, prepare(model, seq))
     for found in (single, double):
         _within(np.asarray(found.state.mean), np.asarray(exact[1].state.mean))
         ratio = np.exp(np.asarray(found.loglik - exact[0].loglik))
@@ -207,7 +205,9 @@ def test_sight_saves_particles():
     assert ess[0] < ess[1] < ess[2]
 
 
-_smooth = eqx.filter_jit(ParticleSmoother(_guide(2), num_particles=50, num_paths=20))
+@eqx.filter_jit
+def _smooth(model, seq, key):
+    return ParticleSmoother(_guide(2), num_particles=50, num_paths=20)(model, prepare(model, seq), key=key)
 
 
 def test_padding_changes_no_number():
@@ -271,7 +271,7 @@ def test_weights_of_the_blind_filter_by_hand():
     rows = seq.t.shape[0]
     blind = Potentials(jnp.zeros((rows, 2)), jnp.zeros((rows, 2, 2)), jnp.zeros((rows, 2)))
     run = eqx.filter_jit(lambda m, s, key: particle_filter(m, blind, s, num_particles=n, key=key, dtype=float))
-    h = run(model, seq, jax.random.key(6))
+    h = run(model, prepare(model, seq), jax.random.key(6))
     x, f = (np.asarray(h.scale)[:, None] * np.asarray(a) for a in (h.x, h.f))
     a, b, u = np.asarray(model.matrix), np.asarray(model.drive), np.asarray(seq.u)
     np.testing.assert_allclose(f[:-1], (a @ x + (b * u)[:, :, None])[:-1], rtol=1e-9, atol=1e-12)
@@ -312,7 +312,7 @@ def _escaped(start, dtype, count=300):
     model, seq, potentials = _escape(start)
 
     def run(key):
-        history = particle_filter(model, potentials, seq, num_particles=count, key=key, dtype=dtype)
+        history = particle_filter(model, potentials, prepare(model, seq), num_particles=count, key=key, dtype=dtype)
         paths = [ffbs(history, rule, num_paths=50, key=key) for rule in BACKWARD.values()]
         return history, paths
 
@@ -363,6 +363,7 @@ def _acrobot():
 
     def run(model, seq, key):
         key_filter, key_exact, key_mcmc = jax.random.split(key, 3)
+        seq = prepare(model, seq)
         filtered, smoothed = _guide(4).path(model, seq)
         potentials = Lookahead()(model, seq, filtered, smoothed)
         history = particle_filter(model, potentials, seq, num_particles=300, key=key_filter)
@@ -395,14 +396,14 @@ def test_exact_and_metropolis_paths_agree():
 def test_kick_is_the_process_noise_of_a_path():
     model, seq, (_, _, _, _, exact, _) = _acrobot()
     step = jax.vmap(jax.vmap(model.transition, in_axes=(0, None)))
-    kick = exact.x[1:] - jax.jit(step)(exact.x[:-1], seq.u[:-1])
+    kick = exact.x[1:] - jax.jit(step)(exact.x[:-1], jax.vmap(Inputs.held)(seq.u[:-1]))
     # the cached f is good to single rounding of the state: some eps * |x| = 6e-7, against a process noise of 2e-4
     np.testing.assert_allclose(exact.kick, kick, atol=1e-5)
 
 
-def test_random_words_are_those_of_threefry():
+def test_random_words_are_those_ofthreefry():
     key, counter = jnp.array([0x13198A2E, 0x03707344], jnp.uint32), jnp.array([0x243F6A88, 5], jnp.uint32)
-    a, b = _threefry(key, counter, jnp.uint32(7))
+    a, b = threefry(key, counter, jnp.uint32(7))
     known = threefry_2x32(key, jnp.concatenate([counter, jnp.full(2, 7, jnp.uint32)]))
     np.testing.assert_array_equal(jnp.concatenate([a, b]), known)
 
@@ -455,7 +456,7 @@ def test_uniforms_are_uniform():
 def test_cumulative_sum_of_blocks_is_the_plain_one():
     x = jax.random.uniform(jax.random.key(2), (3, 1001), jnp.float32)
     x = jnp.where(x < 0.3, 0.0, x)
-    ours = np.asarray(_cumsum(x))
+    ours = np.asarray(cumsum(x))
     np.testing.assert_allclose(ours, np.cumsum(np.asarray(x, float), axis=1), rtol=1e-6)
     # no rounding gives a share to a weight of 0
     assert np.all((np.diff(ours) == 0) == (np.asarray(x)[:, 1:] == 0))
@@ -463,8 +464,8 @@ def test_cumulative_sum_of_blocks_is_the_plain_one():
 
 def test_power_of_two():
     x = np.linspace(-126, 60, 10_001, dtype=np.float32)
-    np.testing.assert_allclose(_exp2(jnp.asarray(x)), 2.0 ** x.astype(float), rtol=4e-6)
-    assert 0 <= float(_exp2(jnp.float32(-np.inf))) < 1e-37
+    np.testing.assert_allclose(exp2(jnp.asarray(x)), 2.0 ** x.astype(float), rtol=4e-6)
+    assert 0 <= float(exp2(jnp.float32(-np.inf))) < 1e-37
 
 
 def test_change_happens_where_it_is_due():

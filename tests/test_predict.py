@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em import parallel
-from nnap_em.data import Dataset
-from nnap_em.gaussian import Gaussian
-from nnap_em.identify import Identified, begin, friction_table, phi_samples
-from nnap_em.model import StateSpaceModel
-from nnap_em.predict import Prediction, given_samples, horizon_errors, predict
-from nnap_em.rig import Declared, Rig
-from nnap_em.simulate import simulate
-from nnap_em.smoother import AbstractSmoother
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import Identified, begin, friction_table, phi_samples
+from nnap_em.em.predict import Prediction, given_samples, horizon_errors, predict, smooth
+from nnap_em.model.simulate import simulate
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.numerics import parallel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import CubatureSmoother
+from nnap_em.smoother.particle import ParticleSmoother
+from nnap_em.smoother.posterior import AbstractSmoother
 from nnap_em.systems.pendulum import Pendulum
 
 DT, ROWS, SAMPLES = 0.02, 80, 400
@@ -72,7 +74,7 @@ def test_without_noise_the_prediction_is_the_integral():
     x, path = found.mean[:, last], []
     step = jax.jit(jax.vmap(model.transition))
     for k in range(last, ROWS - 1):
-        x = step(x, case.data.u[:, k])
+        x = step(x, jax.vmap(Inputs.held)(case.data.u[:, k]))
         path.append(x)
     path = jnp.stack(path, axis=1)
     std = np.asarray(found.std[:, last + 1 :])
@@ -111,7 +113,7 @@ def test_std_grows_as_the_kicks_add_up():
     found = predict(case.fitted, quiet, GIVEN, key=jax.random.key(1), samples=SAMPLES)
     model = case.fitted.model
     last = int(np.sum(given_samples(quiet, GIVEN)[0])) - 1
-    f = np.asarray(jax.jacfwd(model.transition)(jnp.zeros(2), jnp.zeros(1)))
+    f = np.asarray(jax.jacfwd(model.transition)(jnp.zeros(2), Inputs.held(jnp.zeros(1))))
     # steady state of the filter at the last known row, then open loop
     p, r, q = np.asarray(model.start.cov), 1e-6, np.diag(np.exp(np.asarray(model.log_q)))
     for k in range(last + 1):
@@ -125,6 +127,20 @@ def test_std_grows_as_the_kicks_add_up():
     np.testing.assert_allclose(found.std[0, last + 1 :], np.asarray(stds), rtol=4.5 / np.sqrt(2 * SAMPLES))
     total = np.asarray(found.std[0, :, 0])
     assert total[-1] > 3 * total[last + 1] > 3 * total[last]
+
+
+def test_the_smoother_of_the_fit_is_the_one_that_smooths():
+    """A particle smoother gives the states of the Kalman smoother within their error, and says how it was sampled."""
+    case = _case(q=1e-2, information=1.0)
+    kalman = smooth(case.fitted, case.data)
+    drawn = case.fitted._replace(smoother=ParticleSmoother(CubatureSmoother(case.fitted.bank), num_paths=400))
+    found = smooth(drawn, case.data)
+    assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(found.ess) > 100)
+    std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
+    # means of 400 paths through 300 particles: a standard error of .08, 480 of them
+    assert np.max(np.abs(np.asarray(found.state.mean - kalman.state.mean)) / std) < 5 * 0.08
+    again = predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50)
+    np.testing.assert_array_equal(again.mean, predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50).mean)
 
 
 def test_uncertain_friction_widens_the_prediction():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em.data import Dataset, Logs
+from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.identify import begin
-from nnap_em.predict import Prediction
-from nnap_em.rig import Declared, Rig
+from nnap_em.em.identify import begin
+from nnap_em.em.predict import Prediction
 
 RIG = Rig(
     "bench", "pendulum",
@@ -21,7 +21,10 @@ ROWS = 50
 Y = np.sin(np.arange(2.0 * ROWS)).reshape(1, ROWS, 2).repeat(3, axis=0)
 Y[0, :15, 0] = np.nan
 DATA = Dataset(np.tile(0.02 * np.arange(ROWS), (3, 1)), np.zeros((3, ROWS, 1)), Y, np.ones((3, ROWS), bool))
-FITTED = begin(RIG, DATA, key=jax.random.key(0), effects=(catalogue["torque_offset"](jnp.asarray(0.25), 1),))
+FITTED = begin(RIG, DATA, key=jax.random.key(0), effects=(catalogue["torque_offset"](jnp.asarray(0.25), joint=1),))
+SLIDE = Rig("bed", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.02, "sequence", ("x",), {"x": 1e-3}, {})
+SPRING = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
+SLID = begin(SLIDE, DATA._replace(y=Y[..., :1]), key=jax.random.key(0), effects=(SPRING,))
 TABLE = nnap_em.friction_table(FITTED._replace(state=FITTED.state._replace(best=FITTED.state.model)), jnp.ones((1, 3)))
 SYSTEM = "Pendulum: m = 0.5 kg, lc = 0.2 m, I = 0.002 kg m^2, g = 9.81 m/s^2; driven joints: 1"
 SAID = {
@@ -39,6 +42,7 @@ SAID = {
         "torque_offset at joint 1",
         "N m",
     ),
+    "slide": (SLID.model, "x (noise 0.001 m)", "torsional_spring at joint 1, k = 20 N/m, theta0 = 0.05 m"),
     "fitted": (FITTED, "Identified 'bench' after 0 epochs", "estimated: m = 0.5 +- ", " kg", SYSTEM),
     "friction": (FITTED.model.unknown, "FrictionNetwork of 1 joints, up to ", " rad/s"),
     "table": (TABLE, "joint 1: ", " N m over 1 to 1 rad/s, std up to "),

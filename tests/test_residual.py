@@ -1,6 +1,5 @@
 """Statistics against cases with a known answer, and the missing force against one that was put in."""
 
-import io
 import math
 
 import equinox as eqx
@@ -8,32 +7,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.stats
 from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.stats.stattools import jarque_bera
 
-from nnap_em import diagnosis_plots
-from nnap_em.data import pad
-from nnap_em.effects.position import TorsionalSpring
-from nnap_em.identify import FrictionTable, begin
-from nnap_em.model import with_effects
-from nnap_em.residual import (
+from nnap_em.data.dataset import pad
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose.residual import (
     LEVEL,
     Names,
     Residual,
     bias,
-    chi2_tail,
     dependence,
     holm,
     names_of,
     normality,
     residual,
     spread,
-    t_tails,
     whiteness,
 )
-from nnap_em.residual import tests as run_tests
-from nnap_em.rig import Declared, Rig
+from nnap_em.diagnose.residual import tests as run_tests
+from nnap_em.effects.position import TorsionalSpring
+from nnap_em.em.identify import begin
+from nnap_em.model.state_space import with_effects
+from nnap_em.smoother.particle import ParticleSmoother
 
 DT = 0.01
 NAMES = Names(("theta1", "x"), ("dtheta1", "dx"), (True, False), ("u",), (1,), ("theta1", "dx"))
@@ -67,13 +63,6 @@ def test_holm_by_hand():
     np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02], rtol=1e-12)
     np.testing.assert_allclose(holm([0.6, 0.9]), [1.0, 1.0])
     assert holm([]).size == 0
-
-
-def test_tails_are_those_of_scipy():
-    for x, df in ((25.0, 20), (9000.0, 8800), (3.0, 2), (900.0, 4)):
-        assert chi2_tail(x, df) == pytest.approx(scipy.stats.chi2.sf(x, df), rel=1e-6)
-    for t, df in ((2.5, 19), (-4.0, 5), (30.0, 9)):
-        assert t_tails(t, df) == pytest.approx(2 * scipy.stats.t.sf(abs(t), df), rel=1e-6)
 
 
 def test_one_sequence_gives_what_statsmodels_gives():
@@ -120,6 +109,7 @@ def test_autoregression_fails_and_its_coefficient_is_the_size():
     _, p, size = whiteness(e)
     assert p < 1e-9
     assert size == pytest.approx(0.3, abs=4 / math.sqrt(4000))
+    np.testing.assert_allclose(whiteness(7.0 * e), whiteness(e), rtol=1e-9)  # whatever the unit
 
 
 def test_gaps_and_padding_change_no_statistic():
@@ -233,8 +223,20 @@ def test_a_known_force_comes_back_within_its_standard_deviation():
     np.testing.assert_allclose(found.u, data.u)
 
 
+def test_a_force_comes_back_by_particles_too():
+    """Whatever smooths gives all that a residual needs."""
+    fitted, data, truth = _slide(lambda t, x, v: 1.5 * math.sin(2 * t) - 0.8 * x)
+    fitted = _with_kick(fitted, float(np.std(truth)) * DT / 2.0)
+    kalman = residual(fitted, data)
+    found = residual(fitted._replace(smoother=ParticleSmoother(fitted.smoother)), data)
+    assert found.used.all()
+    error = (found.force[:, :-1, 0] - kalman.force[:, :-1, 0]) / kalman.force_std[:, :-1, 0]
+    assert np.sqrt(np.mean(error**2)) < 0.3  # of draws: 100 paths through 300 particles
+    np.testing.assert_allclose(found.innovation, kalman.innovation, atol=1e-6)  # a slide is linear: no path matters
+
+
 def test_adding_an_effect_back_gives_its_force():
-    spring = TorsionalSpring(*map(jnp.asarray, (0.8, 0.24, 0.0, 0.0)), 1)
+    spring = TorsionalSpring(*map(jnp.asarray, (0.8, 0.24, 0.0, 0.0)), joint=1)
     fitted, data, truth = _slide(lambda t, x, v: 0.24 - 0.8 * x)
     fitted = _with_kick(fitted, 1e-3)
     model = with_effects(fitted.model, (spring,))
@@ -246,57 +248,16 @@ def test_adding_an_effect_back_gives_its_force():
     np.testing.assert_allclose(found.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
 
 
+def test_there_is_an_innovation_where_there_is_a_reading():
+    fitted, data, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
+    y = np.where(_noise(15, data.y.shape) > 1, np.nan, data.y)
+    found = residual(fitted, data._replace(y=y))
+    assert np.isnan(y).any()
+    np.testing.assert_array_equal(np.isfinite(found.innovation), np.isfinite(y))
+
+
 def test_names_carry_units():
     fitted, _, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
     names = names_of(fitted)
     assert [names.unit(n) for n in ("x", "dx", "u", "time")] == ["m", "m/s", "N", "s"]
     assert [NAMES.unit(n) for n in ("theta1", "dtheta1", "dx", "u")] == ["rad", "rad/s", "m/s", "N m"]
-
-
-def _labels(figure):
-    return [ax.get_xlabel() for ax in figure.axes]
-
-
-def test_the_cause_of_a_force_has_the_largest_share():
-    found = _found(10)
-    force = found.force.copy()
-    force[..., 0] = 0.3 * force[..., 0] + 2 * np.sin(3 * found.state[..., 0])
-    found = found._replace(force=force)
-    figure = diagnosis_plots.residual_figure(found, NAMES, _found(11))
-    shares = {ax.get_xlabel(): float(ax.get_title(loc="right").split()[0]) for ax in figure.axes[:7] if ax.get_xlabel()}
-    best = max(shares, key=lambda name: shares[name])
-    assert best.startswith("θ₁") and shares[best] > 80
-    alone = diagnosis_plots.cause_figure(found, NAMES)
-    assert _labels(alone)[0].startswith("θ₁") and "joint 1" in alone.axes[0].get_ylabel()
-    assert all("[" in name for name in _labels(figure) if name)
-
-
-@pytest.mark.parametrize("used", [0, 1, 10])
-def test_few_sequences_can_be_drawn(used):
-    found = _found(13, used=np.arange(10) < used)
-    for figure in (diagnosis_plots.residual_figure(found, NAMES), diagnosis_plots.cause_figure(found, NAMES)):
-        assert any(np.isfinite(line.get_ydata()).any() for line in figure.axes[0].get_lines()[:1])
-
-
-def test_figures_of_a_diagnosis_can_be_drawn():
-    found, names = _found(12), NAMES
-    v = np.linspace(-3, 3, 51)
-    table = FrictionTable(
-        jnp.asarray(np.stack([v, v])), jnp.asarray(np.stack([-v, -v])), jnp.tile(1e-4 * jnp.eye(51)[None], (2, 1, 1))
-    )
-    error = {"horizons_s": [0.1, 1.0], "before": {"theta1": [0.1, 1.0]}, "after": {"theta1": [0.05, None]}}
-    pair = found.state[0], np.ones((300, 4))
-    figures = (
-        diagnosis_plots.innovation_figure(found, names, found),
-        diagnosis_plots.error_figure(error),
-        diagnosis_plots.error_figure(error | {side: {"theta1": [None, None]} for side in ("before", "after")}),
-        diagnosis_plots.friction_pair_figure(table, table, list(found.state[..., 2:].reshape(-1, 2).T)),
-        diagnosis_plots.prediction_pair_figure(found.t[0], found.state[0][:, [0, 3]], names, pair, pair, 1.0),
-        diagnosis_plots.effect_figure(v, v**2, 0.1 + 0 * v, label_x="θ₁ [rad]", label_y="torque [N m]", visited=v),
-        diagnosis_plots.screen_figure([("a spring", 30.0), ("a delay", -2.0)], chosen="a spring"),
-        diagnosis_plots.screen_figure([]),
-    )
-    for figure in figures:
-        image = io.BytesIO()
-        figure.savefig(image, format="png", dpi=40)
-        assert image.getvalue().startswith(b"\x89PNG")

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.files import replace_text
-from nnap_em.rig import Declared, Rig, RigError, SystemSpec, nearest, parameter_unit, read_rig, write_rig
+from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, nearest, parameter_unit, read_rig, write_rig
+from nnap_em.storage.files import replace_text
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")
@@ -245,7 +245,7 @@ _fields = st.fixed_dictionaries(
 )
 
 
-@pytest.mark.filterwarnings("ignore::nnap_em.rig.RigWarning")  # of a link of a mile
+@pytest.mark.filterwarnings("ignore::nnap_em.data.rig.RigWarning")  # of a link of a mile
 @settings(deadline=None)  # it writes files
 @given(fields=_fields)
 def test_what_is_written_is_read_back(tmp_path_factory, fields):

@@ -6,16 +6,16 @@ import jax
 import numpy as np
 import plant
 import pytest
+from helpers import swing, swing_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_data import _rig, _swing
 
 from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, specs
-from nnap_em.check import check
-from nnap_em.data import Logs
-from nnap_em.formats import DataError, DataWarning, write_csv
-from nnap_em.plausible import Columns
-from nnap_em.rough import retell, rough, spikes
+from nnap_em.data.dataset import Logs
+from nnap_em.data.formats import DataError, DataWarning, write_csv
+from nnap_em.data.plausible import Columns
+from nnap_em.data.rough import retell, rough, spikes
+from nnap_em.em.check import check
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}
@@ -199,12 +199,12 @@ def _write(folder, columns, kept=None):
 def _read(folder, **options) -> tuple[Logs, list[str]]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        logs = read_logs(folder, _rig(), **options)
+        logs = read_logs(folder, swing_rig(), **options)
     return logs, [str(w.message) for w in said]
 
 
 def test_what_is_masked_is_said_and_kept_aside(tmp_path):
-    columns = _swing() | {"theta1": _swing()["theta1"].copy()}
+    columns = swing() | {"theta1": swing()["theta1"].copy()}
     columns["theta1"][[40, 90]] += 0.5
     _write(tmp_path, columns)
     logs, (said,) = _read(tmp_path)
@@ -228,7 +228,7 @@ def test_a_prediction_knows_nothing_of_later_readings(tmp_path):
     """Not even through a mask: whatever comes after the given time, what a filter sees is the same."""
     seen = []
     for later in ("as it is", "restless"):
-        columns = {name: values.copy() for name, values in _swing().items()}
+        columns = {name: values.copy() for name, values in swing().items()}
         columns["theta1"][[40, 100, 150]] += 0.5  # at .4 s, 1 s and 1.5 s
         if later == "restless":  # beside this the first spike is none
             columns["theta1"][101:] += np.random.default_rng(0).normal(0.0, 0.5, len(columns["time"]) - 101)
@@ -242,7 +242,7 @@ def test_a_prediction_knows_nothing_of_later_readings(tmp_path):
 
 
 def test_lost_rows_come_back_without_readings(tmp_path):
-    columns, kept = _swing(), np.ones(201, bool)
+    columns, kept = swing(), np.ones(201, bool)
     kept[50:60] = kept[100] = False
     _write(tmp_path, columns, kept)
     logs, (said,) = _read(tmp_path)
@@ -254,7 +254,7 @@ def test_lost_rows_come_back_without_readings(tmp_path):
 
 
 def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
-    columns, kept = _swing(), np.ones(201, bool)
+    columns, kept = swing(), np.ones(201, bool)
     columns["u"] = np.random.default_rng(0).standard_normal(201)
     kept[120:125] = False
     _write(tmp_path, columns, kept)
@@ -266,9 +266,9 @@ def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
 
 @pytest.mark.parametrize("kept", [np.arange(201) % 3 > 0, (np.arange(201) < 60) | (np.arange(201) > 140)])
 def test_a_log_with_too_many_gaps_is_refused(tmp_path, kept):
-    _write(tmp_path, _swing(), kept)
+    _write(tmp_path, swing(), kept)
     with pytest.raises(DataError, match=r"a gap|rows are"):
-        read_logs(tmp_path, _rig(clock="session"))
+        read_logs(tmp_path, swing_rig(clock="session"))
 
 
 def test_a_limit_seen_in_one_file_holds_for_all(tmp_path):
@@ -279,7 +279,7 @@ def test_a_limit_seen_in_one_file_holds_for_all(tmp_path):
         columns = {"time": t, "u": 0 * t, "theta1": size / 2 * np.sin(2 * t + 1), "dtheta1": rate}
         write_csv(tmp_path / f"{i}.csv", columns)
     with pytest.warns(DataWarning):
-        logs = read_logs(tmp_path, _rig())
+        logs = read_logs(tmp_path, swing_rig())
     assert {(m.file, m.kind, m.column) for m in logs.masked} == {(f"{i}.csv", "saturated", "dtheta1") for i in range(2)}
     assert not (np.asarray(logs.data.y)[..., 1] == 3.0).any()
 

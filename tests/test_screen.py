@@ -8,29 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.augment import augment, extended, proposals, seeded, surroundings, without
-from nnap_em.data import Dataset, fill_missing
+from nnap_em.data.dataset import Dataset
+from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.propose import extended, proposals, seeded, surroundings
+from nnap_em.diagnose.screen import Sheet, judge, project, sheet, unlike
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.gaussian import Gaussian
-from nnap_em.kalman import CUBATURE, kalman_filter
-from nnap_em.model import with_effects
-from nnap_em.mstep import local
-from nnap_em.screen import Sheet, judge, project, sheet, unlike
-from nnap_em.smoother import active_steps
+from nnap_em.em.local import local
+from nnap_em.model.state_space import with_effects
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.kalman import CUBATURE, kalman_filter
 
 ROWS = 60
 
 
 def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
     """Whitened innovations of `model` linearised about a path, moved by what `full` does otherwise on that path."""
-    y, observed = fill_missing(seq.y)
     here = local(model, rule.prior, path, seq, CUBATURE)
     both = [jax.vmap(m.transition)(path.mean, m.inputs(seq)) for m in (full, model)]
     read = [jax.vmap(m.emission)(path.mean, m.inputs(seq)) for m in (full, model)]
     affine = here.affine._replace(offset=here.affine.offset + both[0] - both[1])
     reading = here.reading._replace(offset=here.reading.offset + read[0] - read[1])
-    active = active_steps(seq.valid)
-    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, y, observed, active).innovation
+    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, here.seq).innovation
 
 
 @pytest.mark.parametrize(
@@ -61,12 +59,12 @@ def test_projection_is_least_squares():
     x[:, 4] += 0.8 * x[:, 0]
     e += 0.4 * x[:, 4]
     table = Sheet((x.T @ e)[None], (x.T @ x)[None], 3, 1e-9 * np.eye(3))
-    one = catalogue["motor_gain"](jnp.zeros(()), 2)
+    one = catalogue["motor_gain"](jnp.zeros(()), joint=2)
     verdict = judge(project(table, np.ones(1)), [Candidate(one, (one, one), one)])[0]
     full = np.linalg.lstsq(x, e, rcond=None)[0]
     rest = np.sum((e - x[:, :3] @ np.linalg.lstsq(x[:, :3], e, rcond=None)[0]) ** 2)
     gain = 0.5 * (rest - np.sum((e - x @ full) ** 2))
-    assert verdict.rank == 2
+    assert verdict.directions == 2
     assert verdict.gain == pytest.approx(gain, rel=1e-3)
     np.testing.assert_allclose(verdict.coefficients, full[3:], rtol=1e-3)
 
@@ -92,15 +90,17 @@ def test_effects_come_and_go(bench):
     rig, model, rule, data, path = bench
     candidates = {c.start.name: c for c in proposals(surroundings(rig, model, data, path, data.t.shape[1]))}
     spring, bristle = candidates["torsional_spring"], candidates["presliding_friction"]
-    one, rule_one = augment(model, rule, seeded(spring, np.ones(1)), spring)
-    two, rule_two = augment(one, rule_one, seeded(bristle, np.ones(1)), bristle)
-    assert two.log_q.shape == (5,)
-    assert extended(two, path, data).mean.shape == (4, ROWS, 5)
-    bare, rule_bare = without(two, rule_two, 0)
-    alone, rule_alone = augment(model, rule, seeded(bristle, np.ones(1)), bristle)
-    assert eqx.tree_equal(bare.effects, alone.effects)
-    assert rule_bare.prior.names == rule_alone.prior.names
-    np.testing.assert_array_equal(rule_bare.prior.std, rule_alone.prior.std)
+    bare = Hypothesis(model, rule)
+    both = bare.plus(seeded(spring, np.ones(1)), spring).plus(seeded(bristle, np.ones(1)), bristle)
+    assert both.model.log_q.shape == (5,)
+    assert extended(both.model, path, data).mean.shape == (4, ROWS, 5)
+    assert [a.effect.name for a in both.additions] == ["torsional_spring", "presliding_friction"]
+    left, alone = both.without(0), bare.plus(seeded(bristle, np.ones(1)), bristle)
+    assert eqx.tree_equal(left.model.effects, alone.model.effects)
+    assert left.m_step.prior.names == alone.m_step.prior.names
+    np.testing.assert_array_equal(left.m_step.prior.std, alone.m_step.prior.std)
+    np.testing.assert_array_equal(left.m_step.prior.mean, alone.m_step.prior.mean)
+    assert left.without(0).m_step.prior.names == rule.prior.names
 
 
 def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
@@ -122,7 +122,7 @@ def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, monkeyp
     rig, model, rule, data, path = bench
     around = surroundings(rig, model, data, path, data.t.shape[1])
     one = next(c for c in catalogue["unknown_function"].candidates(around) if c.start.joint == 2)
-    full, wide = augment(model, rule, one.probes[3], one)
+    full, wide, _ = Hypothesis(model, rule).plus(one.probes[3], one)
     seq, at = jax.tree.map(lambda a: a[0], data), jax.tree.map(lambda a: a[0], path)
 
     def error(dt: float) -> float:

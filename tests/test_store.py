@@ -14,13 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em import files
-from nnap_em.data import Dataset
-from nnap_em.files import StoreError
-from nnap_em.identify import Identified, begin
-from nnap_em.law import StribeckLaw
-from nnap_em.rig import Declared, Rig
-from nnap_em.store import fingerprint, load, read, save
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.identify import Identified, begin
+from nnap_em.em.predict import smooth
+from nnap_em.em.store import fingerprint, load, read, save
+from nnap_em.model.law import StribeckLaw
+from nnap_em.smoother import AbstractSmoother, kinds
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.particle import Guided, MetropolisBackward, ParticleSmoother
+from nnap_em.storage import files
+from nnap_em.storage.files import StoreError
 
 ARM = {
     name: Declared(value, 0.1 * value)
@@ -104,6 +108,57 @@ def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     assert (stored.fingerprint, stored.notes) == ("abc", notes)
     v = jnp.linspace(-3.0, 3.0, len(fitted.model.log_q) // 2)
     np.testing.assert_array_equal(stored.fitted.model.unknown(v), fitted.model.unknown(v))
+
+
+OLD = Path(__file__).parent / "data" / "model_of_91424ac.npz"
+"""Written by the code of commit 91424ac, before smoothers were kept; its notes hold what that code smoothed."""
+
+
+def test_a_model_of_an_older_version_smooths_as_it_did():
+    stored = read(OLD)
+    t = stored.fitted.rig.dt * np.arange(40)
+    data = Dataset(t[None], 0.1 * np.cos(t)[None, :, None], np.sin(3 * t)[None, :, None], np.ones((1, 40), bool))
+    mean = smooth(stored.fitted, data).state.mean[0, ::13]
+    np.testing.assert_allclose(mean, stored.notes["smoothed"], rtol=1e-9, atol=1e-12)  # other programs round otherwise
+    assert (stored.fitted.smoother.inflations, stored.fitted.state.epoch) == ((1.0,), 7)
+
+
+SMOOTHERS = {
+    "cubature": lambda bank: CubatureSmoother(bank, window=30, inflations=(1.0, 2.0)),
+    "extended": ExtendedKalmanSmoother,
+    "particles": lambda bank: ParticleSmoother(
+        CubatureSmoother(bank, iterations=2), Guided(), MetropolisBackward(7), num_particles=31, dtype=float
+    ),
+}
+
+
+@pytest.mark.parametrize("make", SMOOTHERS.values(), ids=SMOOTHERS)
+def test_a_stored_model_keeps_its_smoother(tmp_path, make):
+    fitted = begin(RIGS["arm"], _data(RIGS["arm"]), key=jax.random.key(5), smoother=make)
+    save(tmp_path / "model.npz", fitted)
+    found = load(tmp_path / "model.npz")
+    assert _bits(found) == _bits(fitted)
+    assert jax.tree.structure(found.smoother) == jax.tree.structure(fitted.smoother)  # statics, too
+
+
+class _Own(AbstractSmoother):
+    """Of nobody's catalogue."""
+
+    @property
+    def bytes_per_row(self):
+        return 1
+
+    def __call__(self, model, seq, *, key):
+        raise NotImplementedError
+
+
+def test_a_smoother_from_elsewhere_is_stored_once_it_is_known(tmp_path, monkeypatch):
+    fitted = begin(RIGS["slide"], _data(RIGS["slide"]), key=jax.random.key(5), smoother=lambda bank: _Own())
+    with pytest.raises(StoreError, match="its smoother '_Own' is not known here; first import what adds it"):
+        save(tmp_path / "model.npz", fitted)
+    monkeypatch.setitem(kinds, "_Own", _Own)
+    save(tmp_path / "model.npz", fitted)
+    assert isinstance(load(tmp_path / "model.npz").smoother, _Own)
 
 
 def test_a_path_may_be_a_string(tmp_path):

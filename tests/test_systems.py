@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.gaussian import Gaussian
-from nnap_em.model import StateSpaceModel
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs, systems
 from nnap_em.systems.acrobot import table_i
 
@@ -112,7 +112,7 @@ def test_energy_is_kept_without_friction_and_input(name):
     drift = []
     for substeps in (2, 4):
         model = _model(name, substeps=substeps)
-        step = lambda x, _, model=model: (model.transition(x, jnp.zeros(1)), None)  # noqa: E731
+        step = lambda x, _, model=model: (model.transition(x, Inputs.held(jnp.zeros(1))), None)  # noqa: E731
         x = jax.jit(jax.vmap(lambda x, step=step: jax.lax.scan(step, x, None, length=100)[0]))(x0)
         drift.append(np.max(np.abs(energy(x) - energy(x0)) / (1e-3 + np.abs(energy(x0)))))
     # RK4's energy error falls with h^4 at least (h^5 for oscillators): 16 at half the step, until rounding is left
@@ -123,14 +123,14 @@ def test_energy_is_kept_without_friction_and_input(name):
 @names
 def test_energy_changes_by_the_work_of_the_input(name):
     """Power balance dE/dt = v . B u, and friction only takes."""
-    u = jnp.asarray([0.3])
+    u = Inputs.held(jnp.asarray([0.3]))
     for unknown, friction in ((jnp.zeros_like, 0.0), (lambda v: -0.05 * v, 0.05)):
         model = _model(name, unknown)
         rate = lambda x, model=model: model.rate(x, u, jnp.zeros(x.shape[0] // 2))  # noqa: E731
         for q, v in zip(*_states(name, 4), strict=True):
             x = jnp.concatenate([q, v])
             _, power = jax.jvp(lambda x: _energy(name, x), (x,), (rate(x),))
-            expected = v[INPUTS[name][0] - 1] * u[0] - friction * jnp.sum(v**2)
+            expected = v[INPUTS[name][0] - 1] * u.u[0] - friction * jnp.sum(v**2)
             np.testing.assert_allclose(power, expected, rtol=0, atol=1e-11)  # cancellation of terms of some 10 W
 
 
@@ -145,3 +145,10 @@ def test_inputs_drive_their_joints():
     np.testing.assert_array_equal(arm.drive(jnp.asarray([3.0, 5.0])), [5.0, 3.0])
     np.testing.assert_array_equal(_system("acrobot").drive(jnp.asarray([3.0])), [0.0, 3.0])
     np.testing.assert_array_equal(_system("pendubot").drive(jnp.asarray([3.0])), [3.0, 0.0])
+
+
+def test_units_are_those_of_turning_or_sliding():
+    acrobot, slide = _system("acrobot"), _system("slide")
+    assert [acrobot.unit(name) for name in ("theta2", "dtheta1")] == ["rad", "rad/s"]
+    assert [slide.unit(name) for name in ("x", "dx")] == ["m", "m/s"]
+    assert (acrobot.force_unit(2), slide.force_unit(1)) == ("N m", "N")

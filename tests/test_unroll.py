@@ -5,21 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
+from helpers import around, declared_model
 from jaxtyping import Array, Float
-from test_effects import _model
 
 from nnap_em.effects import catalogue
-from nnap_em.effects.base import Around
-from nnap_em.elementary import cos, sin
-from nnap_em.friction import FrictionNetwork
-from nnap_em.model import with_effects
-from nnap_em.unroll import UnrollError, unroll
+from nnap_em.model.friction import FrictionNetwork
+from nnap_em.model.state_space import Inputs, with_effects
+from nnap_em.numerics.elementary import cos, sin
+from nnap_em.portable.unroll import UnrollError, unroll
 
-MODEL = _model(plant.Case(steps=20, hidden=False))
-AROUND = Around(
-    MODEL.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
-    ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True,
-)  # fmt: skip
+MODEL = declared_model(plant.Case(steps=20, hidden=False))
+AROUND = around(MODEL)
 CANDIDATES = {name: found[0].probes[0] for name, kind in catalogue.items() if (found := kind.candidates(AROUND))}
 
 
@@ -42,9 +38,16 @@ def _agrees(function, **arguments: Float[Array, "..."]) -> str:
 def test_every_effect_of_the_catalogue(name):
     model = with_effects(MODEL, (CANDIDATES[name],))
     x = jnp.asarray(np.random.default_rng(0).normal(scale=3.0, size=model.log_q.shape[0]))
-    u = jnp.asarray([0.2, 1.0, 0.1, 1.0])
-    _agrees(lambda x, u, force: (model.rate(x, u, force),), x=x, u=u, force=jnp.asarray([0.1, 0.2]))
-    _agrees(lambda x, u: (model.emission(x, u), jax.jacfwd(model.emission)(x, u)), x=x, u=u)
+    row = Inputs(jnp.asarray([0.2]), jnp.asarray([0.1]), jnp.asarray(1.0), jnp.asarray(1.0))._asdict()
+
+    def rate(x, force, *row):
+        return (model.rate(x, Inputs(*row), force),)
+
+    def reading(x, *row):
+        return model.emission(x, Inputs(*row)), jax.jacfwd(model.emission)(x, Inputs(*row))
+
+    _agrees(rate, x=x, force=jnp.asarray([0.1, 0.2]), **row)
+    _agrees(reading, x=x, **row)
 
 
 def test_the_network_is_short():

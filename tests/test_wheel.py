@@ -42,7 +42,7 @@ def wheel(tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_wheel_holds_the_package_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
-    source = [p for p in (ROOT / "nnap_em").rglob("*") if p.is_file() and p.suffix != ".pyc"]
+    source = [p for p in (ROOT / "nnap_em").rglob("*") if p.is_file() and p.suffix not in (".pyc", ".md")]
     about = f"nnap_em-{nnap_em.__version__}.dist-info"
     extra = {f"{about}/{name}" for name in ("METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE")}
     assert set(names) == {str(p.relative_to(ROOT)) for p in source} | extra
@@ -59,6 +59,9 @@ def test_installed_command_runs_elsewhere(wheel, tmp_path):
     (Path(site) / "packages_of_the_test.pth").write_text(sysconfig.get_path("purelib") + "\n")
     home = _run(python, "-c", "import nnap_em; print(nnap_em.__file__)", cwd=tmp_path)
     assert home.startswith(site)
+
+    written = _run(python, "-c", "from nnap_em.report.page import page; print(page({}))", cwd=tmp_path)
+    assert "Nothing is missing" in written
 
     command = tmp_path / "env/bin/nnap-em"
     assert "simulate" in _run(command, "--help", cwd=tmp_path)

@@ -3,8 +3,8 @@
 import importlib
 import pkgutil
 
-from .base import AbstractEffect, Around, Candidate, Scene, fields, flat
-from .function import Axis
+from .base import AbstractEffect, Around, Candidate, JointEffect, Scene, SensorEffect, fields, flat
+from .function import Axis, InputAxis, free_form
 
 
 def _leaves(kind: type[AbstractEffect]) -> list[type[AbstractEffect]]:
@@ -15,8 +15,11 @@ for _module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
     importlib.import_module(f"{__name__}.{_module}")
 
 catalogue: dict[str, type[AbstractEffect]] = {kind.name: kind for kind in _leaves(AbstractEffect)}
-"""Effects by the name of the vocabulary."""
-parts: tuple[type, ...] = (Axis,)
+"""Effects by their names."""
+parts: tuple[type, ...] = (Axis, InputAxis)
 """What effects are made of besides numbers."""
 
-__all__ = ["AbstractEffect", "Around", "Candidate", "Scene", "catalogue", "fields", "flat", "parts"]
+__all__ = [
+    "AbstractEffect", "Around", "Candidate", "JointEffect", "Scene", "SensorEffect", "catalogue", "fields", "flat",
+    "free_form", "parts",
+]  # fmt: skip

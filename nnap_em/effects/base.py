@@ -4,6 +4,7 @@ A new effect is one new file in this folder; the catalogue finds it.
 """
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 from ..systems.base import AbstractSystem
 
 Scalar = Float[Array, ""]
+CHANNEL = "unit of the channel"
 
 
 class Scene(NamedTuple):
@@ -59,6 +61,26 @@ class Around(NamedTuple):
     """True where the clock runs on over all sequences."""
     learned: bool
     """True where a friction map is learned."""
+    inputs: tuple[str, ...]
+    """Column of every input."""
+
+    @property
+    def joints(self) -> range:
+        """All joints, counted from 1."""
+        return range(1, len(self.system.coordinates) + 1)
+
+    @property
+    def driven(self) -> list[tuple[int, float]]:
+        """Joints whose input ever moves, with its largest value [N m]."""
+        return [(j, float(size)) for j, size in zip(self.system.joints, self.drive, strict=True) if size > 0]
+
+    def column(self, joint: int) -> str:
+        """Column of the input that drives a joint; "u" where there is one input."""
+        return self.inputs[self.system.joints.index(joint)] if len(self.inputs) > 1 else "u"
+
+    def inertia(self, joint: int) -> float:
+        """Of everything behind a joint, with all joints at zero [kg m^2]."""
+        return float(self.system.mass(jnp.zeros(len(self.system.coordinates)))[joint - 1, joint - 1])
 
 
 class Candidate(NamedTuple):
@@ -79,11 +101,17 @@ class AbstractEffect(eqx.Module):
     """
 
     name: ClassVar[str]
-    """Key of the vocabulary."""
+    """Key of the catalogue, and of the vocabulary if `reported_as` does not name another."""
+    reported_as: ClassVar[str] = ""
+    """Key of the vocabulary for a law that it has no name for."""
+    named: ClassVar[bool] = True
+    """False for a law without a form of its own."""
     confirm: ClassVar[str] = ""
     """What to look at on the machine to be sure."""
     units: ClassVar[dict[str, str]] = {}
     """Reported parameters and their units on a rotary joint."""
+    units_free: ClassVar[dict[str, str]] = {}
+    """Those that are others where it acts on no single joint."""
     memory: ClassVar[int] = 0
     """States of its own."""
     substeps: ClassVar[int] = 1
@@ -97,10 +125,25 @@ class AbstractEffect(eqx.Module):
     read_off: ClassVar[bool] = False
     """True for what is seen in the numbers themselves, before any fit."""
 
-    joint: eqx.AbstractVar[int | None]
+    joint: int | None = eqx.field(static=True, default=None, kw_only=True)
     """The joint that it acts on, counted from 1; None: all, or no joint."""
-    channel: eqx.AbstractVar[str | None]
-    """The reading that it acts on."""
+    channel: str | None = eqx.field(static=True, default=None, kw_only=True)
+    """The reading that it acts on; "all": every one."""
+
+    @classmethod
+    def meaning(cls) -> str:
+        """The law in a sentence."""
+        return " ".join(inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0].split())
+
+    @classmethod
+    def key(cls) -> str:
+        """Key of the vocabulary."""
+        return cls.reported_as or cls.name
+
+    @classmethod
+    def of(cls, *numbers: float, **where):
+        """One of these numbers, in the order of its fields."""
+        return cls(*map(a, numbers), **where)
 
     @classmethod
     def candidates(cls, around: Around) -> list[Candidate]:
@@ -111,18 +154,26 @@ class AbstractEffect(eqx.Module):
         """The reported parameters under the vocabulary's names."""
         return {name: getattr(self, name) for name in self.units}
 
+    def units_on(self, system: AbstractSystem) -> dict[str, str]:
+        """Units of the reported parameters on this machine and channel."""
+        if self.channel in system.coordinates + system.rates:
+            return {name: unit.replace(CHANNEL, system.unit(self.channel)) for name, unit in self.units.items()}
+        if self.joint is None:
+            return self.units | self.units_free
+        force, angle = system.force_unit(self.joint), system.unit(system.coordinates[self.joint - 1])
+        return {name: unit.replace("N m", force).replace("rad", angle) for name, unit in self.units.items()}
+
     def possible(self) -> bool:
         """Whether a fitted value makes physical sense."""
         return True
 
     def inputs_named(self) -> tuple[str, ...]:
-        """Of what it is a function, for laws without a name."""
+        """Of what it is a function, for laws that the vocabulary has no name for."""
         return ()
 
-    @property
-    def named(self) -> bool:
-        """False for a law without a name."""
-        return not self.inputs_named()
+    def signals(self, around: Around) -> tuple[str, ...]:
+        """Of what its force at its joint is a function, where its free form is to be tried."""
+        return ()
 
     def memory_scale(self) -> Float[Array, " memory"]:
         """Typical size of its own states."""
@@ -153,6 +204,28 @@ class AbstractEffect(eqx.Module):
         return value
 
 
+class JointEffect(AbstractEffect):
+    """A law that acts on one joint."""
+
+    joint: int = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
+    """Counted from 1."""
+
+    def own(self, values: Float[Array, " dof"]) -> Scalar:
+        """What stands at its joint."""
+        return values[self.joint - 1]
+
+    def at(self, scene: Scene, value: Scalar) -> Float[Array, " dof"]:
+        """A generalised force at its joint alone."""
+        return jnp.zeros_like(scene.v).at[self.joint - 1].set(value)
+
+
+class SensorEffect(AbstractEffect):
+    """A law of one reading."""
+
+    channel: str = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
+    """The reading; "all": every one."""
+
+
 def known(**options):
     """A field with a number that no fit moves; an array all the same, so that another number is no other program."""
     return eqx.field(converter=a, metadata={"known": True}, **options)
@@ -169,10 +242,25 @@ def flat(effect: AbstractEffect) -> Float[Array, " param"]:
     return jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
 
 
-def at_joint(joint: int | None, value: Scalar, scene: Scene) -> Float[Array, " dof"]:
-    """A generalised force at one joint."""
-    assert joint is not None
-    return jnp.zeros_like(scene.v).at[joint - 1].set(value)
+def one(make: Callable[[Scalar], AbstractEffect], none: float, probe: float, spread: float) -> Candidate:
+    """A candidate of one strength: no effect, a small one, its prior standard deviation."""
+    return Candidate(make(a(none)), (make(a(probe)),), make(a(spread)))
+
+
+def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inner: tuple[float, float]) -> Candidate:
+    """A candidate of two strengths, as sine and cosine, and of inner parameters: each a value and its spread."""
+    at, wide = [value for value, _ in inner], [std for _, std in inner]
+    probes = make(probe, 0.0, *at), make(0.0, probe, *at)
+    return Candidate(make(0.0, 0.0, *at), probes, make(spread, spread, *wide))
+
+
+def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge: float) -> Scalar:
+    """What a spring and a damper answer that are pressed in, on either side, and never pull.
+
+    The damper comes on within `edge`, so that a fit can move the place of contact.
+    """
+    push = stiffness * deep + damping * jnp.tanh(jnp.abs(deep) / edge) * rate
+    return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))
 
 
 def a(value: float | Scalar) -> Scalar:

@@ -1,13 +1,11 @@
-# pyright: reportCallIssue=false, reportArgumentType=false
-# (pyright takes equinox's abstract fields for fields of the constructor)
 """Bodies that are not as declared: masses, inertias, lengths; each system says how it varies."""
 
+from functools import partial
 from typing import ClassVar
 
-import equinox as eqx
 import jax
 
-from .base import AbstractEffect, Around, Candidate, Scalar, a, known
+from .base import Around, Candidate, JointEffect, Scalar, known, one
 
 
 def varieties(around: Around, name: str) -> list[tuple[int, float]]:
@@ -16,16 +14,14 @@ def varieties(around: Around, name: str) -> list[tuple[int, float]]:
     return [(j, float(size(around.system))) for j, size in found]
 
 
-class Variation(AbstractEffect):
+class Variation(JointEffect):
     """A body that differs by an amount; the machine knows what that changes."""
 
     amount: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
-        return [Candidate(cls(a(0.0), j), (cls(a(0.05 * s), j),), cls(a(s), j)) for j, s in varieties(around, cls.name)]
+        return [one(partial(cls, joint=j), 0.0, 0.05 * size, size) for j, size in varieties(around, cls.name)]
 
     def values(self):
         return dict.fromkeys(self.units, self.amount)
@@ -66,7 +62,7 @@ class CenterOfMass(Variation):
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
 
 
-class PayloadStep(AbstractEffect):
+class PayloadStep(JointEffect):
     """A payload that comes on at a moment of the clock; the edge is some samples wide, so that a fit can move it."""
 
     name: ClassVar[str] = "payload_step"
@@ -74,9 +70,7 @@ class PayloadStep(AbstractEffect):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "time": "s"}
     mass: Scalar
     time: Scalar
-    joint: int | None = eqx.field(static=True)
     edge: Scalar = known()
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
@@ -85,10 +79,10 @@ class PayloadStep(AbstractEffect):
         first, last = around.duration
         out = []
         for j, size in varieties(around, "payload"):
-            for i in range(1, 24):
-                time = first + (last - first) * i / 24
-                make = lambda mass, time, j=j: cls(a(mass), a(time), j, 3 * around.dt)  # noqa: E731
-                out.append(Candidate(make(0.0, time), (make(0.05 * size, time),), make(size, (last - first) / 24)))
+            make, apart, edge = partial(cls.of, joint=j), (last - first) / 24, 3 * around.dt
+            for time in (first + apart * i for i in range(1, 24)):
+                probe, spread = make(0.05 * size, time, edge), make(size, apart, edge)
+                out.append(Candidate(make(0.0, time, edge), (probe,), spread))
         return out
 
     def physics(self, system, time):

@@ -1,9 +1,10 @@
-# pyright: reportCallIssue=false, reportArgumentType=false
-# (pyright takes equinox's abstract fields for fields of the constructor)
-"""A law without a name: an unknown function of some inputs, learned as a network of radial basis functions."""
+"""A law without a form: an unknown function of some signals, learned as a network of radial basis functions."""
 
 import itertools
 import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Candidate, Scalar, a, at_joint
-from .position import joints
+from ..systems.base import AbstractSystem
+from .base import AbstractEffect, Around, Candidate, JointEffect, Scalar, Scene, a
 
 
-class Axis(eqx.Module):
-    """One axis of the function: a sum of signals, and where its basis functions stand."""
+class AbstractAxis(eqx.Module):
+    """One axis of the function: what it reads, and where its basis functions stand."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     low: Scalar = eqx.field(converter=a)
@@ -25,11 +26,19 @@ class Axis(eqx.Module):
     """True for an angle that goes round: the basis is periodic."""
     count: int = eqx.field(static=True)
 
+    @abstractmethod
+    def value(self, scene: Scene) -> Scalar:
+        """What it reads."""
+
+    @abstractmethod
+    def unit(self, system: AbstractSystem) -> str:
+        """Of what it reads."""
+
     def centres(self) -> Float[Array, " basis"]:
         """Places of the basis functions."""
         return jnp.linspace(self.low, self.high, self.count, endpoint=not self.turns)
 
-    def basis(self, value: Float[Array, ""]) -> Float[Array, " basis"]:
+    def basis(self, value: Scalar) -> Float[Array, " basis"]:
         """Basis functions at a value."""
         centres = self.centres().astype(value.dtype)
         width = (self.high - self.low) / (self.count - (not self.turns))
@@ -38,44 +47,57 @@ class Axis(eqx.Module):
         return jnp.exp(-0.5 * (away / width) ** 2)
 
 
-class UnknownFunction(AbstractEffect):
+class Axis(AbstractAxis):
+    """A coordinate, a rate, the time, or a sum of angles."""
+
+    def value(self, scene):
+        system = scene.system
+        signals = dict(zip(system.coordinates + system.rates, (*scene.q, *scene.v), strict=True))
+        first = scene.drive[system.joints[0] - 1] if system.joints else 0.0
+        signals |= {"time": scene.time, "u": first}  # "u": models saved before every input was an axis of its own
+        return jnp.sum(jnp.stack([signals[name] for name in self.names]))
+
+    def unit(self, system):
+        name = self.names[0]
+        if name == "u":
+            return system.force_unit(system.joints[0])
+        return "s" if name == "time" else system.unit(name)
+
+
+class InputAxis(AbstractAxis):
+    """An input by its column, as it reaches its joint [N m]."""
+
+    index: int = eqx.field(static=True, kw_only=True)
+    """Place among the inputs of the rig, counted from 0."""
+
+    def value(self, scene):
+        return scene.drive[scene.system.joints[self.index] - 1]
+
+    def unit(self, system):
+        return system.force_unit(system.joints[self.index])
+
+
+class UnknownFunction(JointEffect):
     """A torque sum_i w_i phi_i(inputs) at one joint [Broomhead & Lowe 1988]."""
 
     name: ClassVar[str] = "unknown_function"
+    named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Repeat the motion with what stands under suspicion taken off."
     held: ClassVar[bool] = True
     weights: Float[Array, " basis"]
-    axes: tuple[Axis, ...]
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
+    axes: tuple[AbstractAxis, ...]
 
     @classmethod
     def candidates(cls, around):
-        system = around.system
-        limits = {}
-        for i, (q, v) in enumerate(zip(system.coordinates, system.rates, strict=True)):
-            limits[q,] = _range(float(around.low[i]), float(around.high[i]), system.angles[i])
-            limits[v,] = (-0.7 * float(around.speed[i]), 0.7 * float(around.speed[i]), False)
-        if all(system.angles) and len(system.angles) == 2:
-            limits[system.coordinates] = (-np.pi, np.pi, True)
-        if around.drive.size:
-            limits["u",] = (-float(around.drive[0]), float(around.drive[0]), False)
-        limits["time",] = (around.duration[0], around.ending, False)
-        grids = [(Axis(name, *limits[name], 20),) for name in limits if name[0] not in system.rates]
+        system, axes = around.system, _axes(around)
+        alone = [axes[name](20) for name in axes if name not in {(rate,) for rate in system.rates}]
         # an angle that goes round, where each turn is another place, as with a cable
-        apart = [(q,) for i, q in enumerate(system.coordinates) if system.angles[i] and limits[q,][2]]
-        grids += [(Axis(name, -2 * np.pi, 2 * np.pi, False, 43),) for name in apart]
-        pairs = ((one, other) for one, other in itertools.combinations(limits, 2) if _apart(one, other))
-        grids += [tuple(Axis(name, *limits[name], 6) for name in pair) for pair in pairs]
-        out = []
-        for j in joints(around):
-            size = float(around.torque[j - 1])
-            for axes in grids:
-                number = math.prod(axis.count for axis in axes)
-                make = lambda w, axes=axes, j=j: cls(jnp.asarray(w, float), axes, j)  # noqa: E731
-                probes = tuple(make(0.05 * size * row) for row in np.eye(number))
-                out.append(Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size))))
-        return out
+        round_ = [axis.names for axis in alone if axis.turns and len(axis.names) == 1]
+        turns = [Axis(names, -2 * np.pi, 2 * np.pi, False, 43) for names in round_]
+        states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
+        pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
+        grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
+        return [_function(j, grid, around) for j in around.joints for grid in grids]
 
     def values(self):
         return {}
@@ -83,28 +105,53 @@ class UnknownFunction(AbstractEffect):
     def inputs_named(self):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.names))
 
-    def torque(self, signals: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
-        """The learned function [N m]."""
+    def torque(self, values: Sequence[Scalar]) -> Scalar:
+        """The learned function at a value of every axis [N m]."""
         product = jnp.ones(1, self.weights.dtype)
-        for axis in self.axes:
-            value = sum((signals[name] for name in axis.names[1:]), signals[axis.names[0]])
+        for axis, value in zip(self.axes, values, strict=True):
             product = (product[:, None] * axis.basis(value)[None]).ravel()
         return self.weights @ product
 
     def force(self, scene, memory):
-        system = scene.system
-        signals = dict(zip(system.coordinates + system.rates, (*scene.q, *scene.v), strict=True))
-        driven = system.joints[0] - 1 if system.joints else 0
-        return at_joint(self.joint, self.torque(signals | {"u": scene.drive[driven], "time": scene.time}), scene)
+        return self.at(scene, self.torque([axis.value(scene) for axis in self.axes]))
+
+
+def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:
+    """The unknown functions of the same signals at the same joint: what `effect` would be, were its form not known."""
+    axes = _axes(around)
+    names = [(name,) for name in effect.signals(around)]
+    if effect.joint is None or not names or not all(name in axes for name in names):
+        return []
+    return [_function(effect.joint, tuple(axes[name](20 if len(names) == 1 else 6) for name in names), around)]
+
+
+def _function(joint: int, axes: tuple[AbstractAxis, ...], around: Around) -> Candidate:
+    """An unknown function at a joint, a probe for every weight."""
+    size, number = float(around.torque[joint - 1]), math.prod(axis.count for axis in axes)
+    make = lambda w: UnknownFunction(jnp.asarray(w, float), axes, joint=joint)  # noqa: E731
+    probes = tuple(make(0.05 * size * row) for row in np.eye(number))
+    return Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size)))
+
+
+def _axes(around: Around) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:
+    """Axes that a function may have, of any number of basis functions, by the names of what they read."""
+    system = around.system
+    ranges = {}
+    for i, (q, v) in enumerate(zip(system.coordinates, system.rates, strict=True)):
+        ranges[q,] = _range(float(around.low[i]), float(around.high[i]), system.angles[i])
+        ranges[v,] = (-0.7 * float(around.speed[i]), 0.7 * float(around.speed[i]), False)
+    for n in range(2, len(system.coordinates) + 1):  # the angle of a link in the world
+        if all(system.angles[:n]):
+            ranges[system.coordinates[:n]] = (-np.pi, np.pi, True)
+    states = {name: partial(Axis, name, *limits) for name, limits in ranges.items() if limits[0] < limits[1]}
+    inputs = {
+        (around.column(j),): partial(InputAxis, (around.column(j),), -size, size, False, index=system.joints.index(j))
+        for j, size in around.driven
+    }
+    return {**states, **inputs, ("time",): partial(Axis, ("time",), around.duration[0], around.ending, False)}
 
 
 def _range(low: float, high: float, angle: bool) -> tuple[float, float, bool]:
     """The range of a coordinate; once it goes round, a whole turn."""
     margin = 0.02 * (high - low)
     return (-np.pi, np.pi, True) if angle and high - low > 5.0 else (low - margin, high + margin, False)
-
-
-def _apart(a: tuple[str, ...], b: tuple[str, ...]) -> bool:
-    """Pairs worth a look: no sum beside its own terms, no clock or input beside another signal."""
-    alone = {"u", "time"}
-    return not (set(a) & set(b)) and not ({*a, *b} & alone)

@@ -1,30 +1,32 @@
-# pyright: reportCallIssue=false, reportArgumentType=false
-# (pyright takes equinox's abstract fields for fields of the constructor)
-"""Forces that depend on the position: springs, tilt, cogging, stops, magnets of a brake."""
+"""Forces that depend on the position: springs, cogging, stops, magnets of a brake."""
 
 import itertools
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import AbstractEffect, Around, Candidate, Scalar, a, at_joint, known
+from .base import Candidate, JointEffect, Scalar, a, contact, known, one, pair
 
 
-def joints(around: Around) -> range:
-    """Joints, counted from 1."""
-    return range(1, len(around.system.coordinates) + 1)
+class PlaceEffect(JointEffect):
+    """A force that depends on the position of its own joint alone."""
+
+    place: ClassVar[bool] = True
+
+    def signals(self, around):
+        return (around.system.coordinates[self.joint - 1],)
 
 
-class TorsionalSpring(AbstractEffect):
+class TorsionalSpring(PlaceEffect):
     """-k (theta_j - theta0), which may stiffen or soften with the angle.
 
     Inside a cubic in the angle, which is linear in what is estimated: k is its slope where it pulls to neither side.
     """
 
     name: ClassVar[str] = "torsional_spring"
-    place: ClassVar[bool] = True
     confirm: ClassVar[str] = (
         "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
     )
@@ -37,19 +39,17 @@ class TorsionalSpring(AbstractEffect):
     """[N m/rad^2]"""
     cube: Scalar
     """[N m/rad^3]"""
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
         out = []
-        for j in joints(around):
+        for j in around.joints:
             reach = max(abs(around.low[j - 1]), abs(around.high[j - 1]), 1e-3)
             size = float(around.torque[j - 1]) / reach
-            none = a(0.0)
-            start, probe = cls(none, none, none, none, j), cls(a(0.1 * size), none, none, none, j)
+            make = partial(cls.of, joint=j)
             bend = 0.3 * size / reach
-            out.append(Candidate(start, (probe,), cls(a(size), a(size * reach), a(bend), a(bend / reach), j)))
+            spread = make(size, size * reach, bend, bend / reach)
+            out.append(Candidate(make(0.0, 0.0, 0.0, 0.0), (make(0.1 * size, 0.0, 0.0, 0.0),), spread))
         return out
 
     def values(self):
@@ -69,59 +69,34 @@ class TorsionalSpring(AbstractEffect):
         return self.slope + angle * (2 * self.square + 3 * angle * self.cube)
 
     def force(self, scene, memory):
-        assert self.joint is not None
-        return at_joint(self.joint, self._pull(scene.q[self.joint - 1]), scene)
+        return self.at(scene, self._pull(self.own(scene.q)))
 
 
-class BaseTilt(AbstractEffect):
-    """Gravity acts on theta1 + angle."""
-
-    name: ClassVar[str] = "base_tilt"
-    confirm: ClassVar[str] = "Put a level on the base, and let the machine hang at rest: where does it read zero?"
-    units: ClassVar[dict[str, str]] = {"angle": "rad"}
-    angle: Scalar
-    joint: int | None = eqx.field(static=True, default=None)
-    channel: str | None = eqx.field(static=True, default=None)
-
-    @classmethod
-    def candidates(cls, around):
-        if not hasattr(around.system, "g"):
-            return []
-        return [Candidate(cls(a(0.0)), (cls(a(0.03)),), cls(a(0.5)))]
-
-    def force(self, scene, memory):
-        tilted = scene.q.at[0].add(self.angle)
-        return scene.system.bias(scene.q, scene.v) - scene.system.bias(tilted, scene.v)
-
-
-class Cogging(AbstractEffect):
+class Cogging(PlaceEffect):
     """amplitude sin(k theta_j + phase), and an overtone of twice k: detents are seldom pure."""
 
     name: ClassVar[str] = "cogging"
-    place: ClassVar[bool] = True
     confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
     sine: Scalar
     cosine: Scalar
     k: Scalar
-    joint: int | None = eqx.field(static=True)
     near: Scalar = known(default=1.0)
     """Where k was found; far from there it is another law in disguise."""
     sine2: Scalar = eqx.field(default=0.0, converter=a)
     cosine2: Scalar = eqx.field(default=0.0, converter=a)
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
         out = []
-        for j in joints(around):
+        for j in around.joints:
             if not around.system.angles[j - 1]:
                 continue
             size = float(around.torque[j - 1])
-            for k in (*np.arange(1.0, 8.1, 0.5), *range(9, 13), 14, 16, 18, 20, 24):
-                make = lambda sine, cosine, k=float(k), j=j: cls(a(sine), a(cosine), a(k), j, k)  # noqa: E731
-                spread = cls(a(0.5 * size), a(0.5 * size), a(0.1), j, float(k), 0.1 * size, 0.1 * size)
-                out.append(Candidate(make(0.0, 0.0), (make(0.05 * size, 0.0), make(0.0, 0.05 * size)), spread))
+            for k in (*np.arange(1.0, 8.1, 0.5), 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0):
+                none, *probes = (cls.of(s * size, c * size, k, k, joint=j) for s, c in ((0, 0), (0.05, 0), (0, 0.05)))
+                spread = cls.of(0.5 * size, 0.5 * size, 0.1, k, 0.1 * size, 0.1 * size, joint=j)
+                out.append(Candidate(none, tuple(probes), spread))
         return out
 
     def values(self):
@@ -132,40 +107,33 @@ class Cogging(AbstractEffect):
         return float(self.k) > 0.7 and abs(float(self.k) - float(self.near)) < 0.3
 
     def force(self, scene, memory):
-        assert self.joint is not None
-        angle = self.k * scene.q[self.joint - 1]
+        angle = self.k * self.own(scene.q)
         tone = self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
         tone = tone + self.sine2 * jnp.sin(2 * angle) + self.cosine2 * jnp.cos(2 * angle)
-        return at_joint(self.joint, tone, scene)
+        return self.at(scene, tone)
 
 
-class TorqueOffset(AbstractEffect):
+class TorqueOffset(JointEffect):
     """A constant torque; a learned friction map holds it."""
 
     name: ClassVar[str] = "torque_offset"
     confirm: ClassVar[str] = "Let the unpowered joint settle from both sides and compare."
     units: ClassVar[dict[str, str]] = {"value": "N m"}
     value: Scalar
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
-        size = [float(t) for t in around.torque]
-        return [
-            Candidate(cls(a(0.0), j), (cls(a(0.05 * size[j - 1]), j),), cls(a(0.5 * size[j - 1]), j))
-            for j in joints(around)
-        ]
+        sizes = zip(around.joints, map(float, around.torque), strict=True)
+        return [one(partial(cls, joint=j), 0.0, 0.05 * size, 0.5 * size) for j, size in sizes]
 
     def force(self, scene, memory):
-        return at_joint(self.joint, self.value, scene)
+        return self.at(scene, self.value)
 
 
-class HardStop(AbstractEffect):
+class HardStop(PlaceEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
     name: ClassVar[str] = "hard_stop"
-    place: ClassVar[bool] = True
     confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
     substeps: ClassVar[int] = 4
@@ -176,28 +144,24 @@ class HardStop(AbstractEffect):
     """Log of the contact stiffness [N m/rad]."""
     damping: Scalar
     """Log of the contact damping [N m s/rad]."""
-    joint: int | None = eqx.field(static=True)
     reach: Scalar = known()
     """Range of the joint on the paths; stops that nearly touch each other are a spring in disguise."""
     soft: Scalar = known()
     """Log of the stiffness [N m/rad] at which a typical torque goes half a radian into a stop, which is none then."""
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
         out = []
-        for j in joints(around):
+        for j in around.joints:
             low, high = float(around.low[j - 1]), float(around.high[j - 1])
             k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
             middle = 0.5 * (low + high)
-            fixed = (j, 2 * size, np.log(0.1 * k))
-            spread = cls(a(0.2 * size), a(0.2 * size), a(1.0), a(1.0), *fixed)
-            start = cls(a(1e3), a(-1e3), a(np.log(k)), a(np.log(0.02 * k)), *fixed)
+            make, given = partial(cls.of, joint=j), (np.log(k), np.log(0.02 * k), 2 * size, np.log(0.1 * k))
+            start, spread = make(1e3, -1e3, *given), make(0.2 * size, 0.2 * size, 1.0, 1.0, *given[2:])
             shares = (0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
             for above, below in itertools.product(shares, shares):
                 up, down = middle + above * size, middle - below * size
-                probe = cls(a(up), a(down), a(np.log(k)), a(np.log(0.02 * k)), *fixed)
-                out.append(Candidate(start, (probe,), spread))
+                out.append(Candidate(start, (make(up, down, *given),), spread))
         return out
 
     def possible(self):
@@ -205,15 +169,12 @@ class HardStop(AbstractEffect):
         return apart and float(self.stiffness) > float(self.soft)
 
     def force(self, scene, memory):
-        assert self.joint is not None
-        q, v = scene.q[self.joint - 1], scene.v[self.joint - 1]
-        above, below = jnp.maximum(q - self.upper, 0.0), jnp.maximum(self.lower - q, 0.0)
-        touch = jnp.tanh((above + below) / 0.01)
-        push = jnp.exp(self.stiffness) * (below - above) - jnp.exp(self.damping) * touch * v
-        return at_joint(self.joint, push, scene)
+        q, v = self.own(scene.q), self.own(scene.v)
+        deep = jnp.maximum(q - self.upper, 0.0) - jnp.maximum(self.lower - q, 0.0)
+        return self.at(scene, -contact(deep, v, jnp.exp(self.stiffness), jnp.exp(self.damping), 0.01))
 
 
-class EddyBrake(AbstractEffect):
+class EddyBrake(JointEffect):
     """-c cos^2(theta_j - center) w_j."""
 
     name: ClassVar[str] = "eddy_brake"
@@ -223,27 +184,26 @@ class EddyBrake(AbstractEffect):
     """c cos(2 center)."""
     odd: Scalar
     """c sin(2 center)."""
-    joint: int | None = eqx.field(static=True)
-    channel: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
         out = []
-        for j in joints(around):
+        for j in around.joints:
             if not around.system.angles[j - 1]:
                 continue
             size = float(around.torque[j - 1] / around.speed[j - 1])
-            probes = (cls(a(0.1 * size), a(0.0), j), cls(a(0.0), a(0.1 * size), j))
-            out.append(Candidate(cls(a(0.0), a(0.0), j), probes, cls(a(size), a(size), j)))
+            out.append(pair(partial(cls.of, joint=j), 0.1 * size, size))
         return out
 
     def values(self):
         c = jnp.sqrt(self.even**2 + self.odd**2 + 1e-30)
         return {"c": c, "center": 0.5 * jnp.arctan2(self.odd, self.even)}
 
+    def signals(self, around):
+        return around.system.coordinates[self.joint - 1], around.system.rates[self.joint - 1]
+
     def force(self, scene, memory):
-        assert self.joint is not None
-        twice = 2 * scene.q[self.joint - 1]
+        twice = 2 * self.own(scene.q)
         level = jnp.sqrt(self.even**2 + self.odd**2 + 1e-16)
         share = 0.5 * (level + self.even * jnp.cos(twice) + self.odd * jnp.sin(twice))
-        return at_joint(self.joint, -share * scene.v[self.joint - 1], scene)
+        return self.at(scene, -share * self.own(scene.v))

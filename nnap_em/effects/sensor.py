@@ -1,38 +1,32 @@
-# pyright: reportCallIssue=false, reportArgumentType=false
-# (pyright takes equinox's abstract fields for fields of the constructor)
 """Readings that are not what they stand for."""
 
+from functools import partial
 from typing import ClassVar
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from .base import AbstractEffect, Candidate, Scalar, a
+from .base import Scalar, SensorEffect, one
 
 
-class SensorBias(AbstractEffect):
+class SensorBias(SensorEffect):
     """value + bias."""
 
     name: ClassVar[str] = "sensor_bias"
     confirm: ClassVar[str] = "Bring the joint to a known position and read the sensor."
     units: ClassVar[dict[str, str]] = {"bias": "unit of the channel"}
     bias: Scalar
-    channel: str | None = eqx.field(static=True)
-    joint: int | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
-        return [
-            Candidate(cls(a(0.0), name), (cls(a(0.03 * float(size)), name),), cls(a(0.5 * float(size)), name))
-            for name, size in zip(around.measured, around.reading, strict=True)
-        ]
+        sizes = zip(around.measured, map(float, around.reading), strict=True)
+        return [one(partial(cls, channel=name), 0.0, 0.03 * size, 0.5 * size) for name, size in sizes]
 
     def reading(self, value, past):
         return value + self.bias
 
 
-class SensorScale(AbstractEffect):
+class SensorScale(SensorEffect):
     """scale value."""
 
     name: ClassVar[str] = "sensor_scale"
@@ -40,12 +34,10 @@ class SensorScale(AbstractEffect):
     units: ClassVar[dict[str, str]] = {"scale": "-"}
     excess: Scalar
     """scale - 1."""
-    channel: str | None = eqx.field(static=True)
-    joint: int | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
-        return [Candidate(cls(a(0.0), name), (cls(a(0.03), name),), cls(a(0.5), name)) for name in around.measured]
+        return [one(partial(cls, channel=name), 0.0, 0.03, 0.5) for name in around.measured]
 
     def values(self):
         return {"scale": 1 + self.excess}
@@ -54,23 +46,18 @@ class SensorScale(AbstractEffect):
         return (1 + self.excess) * value
 
 
-class SensorDelay(AbstractEffect):
+class SensorDelay(SensorEffect):
     """The value some time ago."""
 
     name: ClassVar[str] = "sensor_delay"
     confirm: ClassVar[str] = "Tap the link and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     delay: Scalar
-    channel: str | None = eqx.field(static=True)
-    joint: int | None = eqx.field(static=True, default=None)
 
     @classmethod
     def candidates(cls, around):
         names = (*around.measured, *(("all",) if len(around.measured) > 1 else ()))
-        return [
-            Candidate(cls(a(0.0), name), (cls(a(0.5 * around.dt), name),), cls(a(3 * around.dt), name))
-            for name in names
-        ]
+        return [one(partial(cls, channel=name), 0.0, 0.5 * around.dt, 3 * around.dt) for name in names]
 
     def possible(self):
         return float(self.delay) > 0
@@ -79,7 +66,7 @@ class SensorDelay(AbstractEffect):
         return past(self.delay)
 
 
-class SensorQuantization(AbstractEffect):
+class SensorQuantization(SensorEffect):
     """The value rounded to a multiple of step: as noise, of variance step^2 / 12.
 
     The score test cannot see it; `grid_step` reads it off the numbers themselves.
@@ -90,8 +77,6 @@ class SensorQuantization(AbstractEffect):
     units: ClassVar[dict[str, str]] = {"step": "unit of the channel"}
     read_off: ClassVar[bool] = True
     step: Scalar
-    channel: str | None = eqx.field(static=True)
-    joint: int | None = eqx.field(static=True, default=None)
 
 
 def grid_step(values: Float[np.ndarray, " sample"]) -> float:

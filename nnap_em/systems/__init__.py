@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from ..rig import SystemSpec
+from ..data.rig import SystemSpec
 from . import acrobot, pendubot, pendulum, slide
 from .base import AbstractSystem
 

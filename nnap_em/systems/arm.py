@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..elementary import cos, sin
+from ..numerics.elementary import cos, sin
 from .base import AbstractSystem
 
 Scalar = Float[Array, ""]

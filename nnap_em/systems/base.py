@@ -9,7 +9,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..rig import quantities
+from ..data.rig import quantities
+
+
+def state_unit(angle: bool, *, rate: bool) -> str:
+    """SI unit of a coordinate or of its rate: of an angle or of a position."""
+    return ("rad" if angle else "m") + ("/s" if rate else "")
+
+
+def force_unit(angle: bool) -> str:
+    """SI unit of the generalised force that belongs to an angle or to a position."""
+    return "N m" if angle else "N"
 
 
 class AbstractSystem(eqx.Module):
@@ -35,6 +45,15 @@ class AbstractSystem(eqx.Module):
         driven = ", ".join(map(str, self.joints)) or "none"
         return f"{type(self).__name__}: {quantities(values)}; driven joints: {driven}"
 
+    def unit(self, name: str) -> str:
+        """SI unit of a coordinate or rate."""
+        place, dof = (self.coordinates + self.rates).index(name), len(self.coordinates)
+        return state_unit(self.angles[place % dof], rate=place >= dof)
+
+    def force_unit(self, joint: int) -> str:
+        """SI unit of the generalised force at a joint, counted from 1."""
+        return force_unit(self.angles[joint - 1])
+
     @abstractmethod
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         """Mass matrix M(q) [kg m^2, or kg on a slide]."""
@@ -50,9 +69,9 @@ class AbstractSystem(eqx.Module):
             force[joint - 1] = force[joint - 1] + u[i]
         return jnp.stack(force)
 
-    def vary(self, kind: str, joint: int | None, amount: Float[Array, ""]) -> "AbstractSystem":
+    def vary(self, kind: str, joint: int, amount: Float[Array, ""]) -> "AbstractSystem":
         """The machine with one body changed by `amount` (an entry of `variations`)."""
-        return self.variations[kind, joint or 1][0](self, amount)
+        return self.variations[kind, joint][0](self, amount)
 
     def tip(self, q: Float[Array, " dof"]) -> Float[Array, " axis"] | None:
         """Place of the tip [m], where the machine has one that air could brake."""

@@ -1,0 +1,295 @@
+"""The command line: arguments in, exit status out; the work is in `commands`, and JAX is loaded only for it."""
+
+import argparse
+import importlib
+import math
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, TypeVar
+
+from .. import __version__
+
+_MAIN = """\
+examples:
+  nnap-em simulate bench                            the paper's acrobot: a data set with known truth
+  nnap-em init bench/train/01.csv --system acrobot  a first rig.toml from the log, to be filled in
+  nnap-em check bench                               whether the logs can identify what is asked
+  nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
+  nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
+  nnap-em predict fit bench/test --given 1 --out prediction
+  nnap-em smooth fit bench/test --out smoothed
+  nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
+
+A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
+"""
+_SIMULATE = """\
+examples:
+  nnap-em simulate bench
+  nnap-em simulate bench --system slide --sequences 8 --test 4 --steps 300 --seed 7
+  nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
+
+OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
+_INIT = """\
+examples:
+  nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
+  nnap-em init log.csv --out bench
+
+Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
+filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
+"""
+_CHECK = """\
+example:
+  nnap-em check bench
+
+One line per question: ok, look (it may do, but look at it) or bad (a fit would be in vain).  Length, missing samples,
+sampling rate, noise, torques, the velocities that each joint visits, and whether the readings tell the whole state.
+Nothing is fitted and nothing is written.  Exit status 1 where something is bad.
+"""
+_IDENTIFY = """\
+examples:
+  nnap-em identify bench --out fit
+  nnap-em identify bench --out fit --smoother particle --particles 1000 --epochs 30
+  nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
+
+OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
+test/ serves for the reported prediction error only, never for the fit.
+"""
+_DIAGNOSE = """\
+examples:
+  nnap-em diagnose bench --out found
+  nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
+
+Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
+report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
+test/ serves for the reported errors only.
+"""
+_PREDICT = """\
+examples:
+  nnap-em predict fit bench/test --given 1.0 --out prediction
+  nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
+
+Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
+time, all states, and their standard deviations without measurement noise.
+"""
+_SMOOTH = """\
+example:
+  nnap-em smooth fit bench/test --out smoothed
+
+DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+"""
+_EXPORT = """\
+examples:
+  nnap-em export fit --out exported
+  nnap-em export found/after.npz --out exported
+
+OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
+python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
+"""
+SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
+SMOOTHERS = {
+    "cubature": "gaussian.CubatureSmoother",
+    "ekf": "gaussian.ExtendedKalmanSmoother",
+    "particle": "particle.smoother.banked",
+}
+"""Where in `nnap_em.smoother` a smoother with its options is made of the hypotheses of the start."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands with their options."""
+    top = _new(argparse.ArgumentParser, "Identify unknown friction of machines from logs.", _MAIN, prog="nnap-em")
+    top.add_argument("--version", action="version", version=f"nnap-em {__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, summary: str, examples: str) -> argparse.ArgumentParser:
+        return _new(commands.add_parser, f"{summary[0].upper()}{summary[1:]}.", examples, name=name, help=summary)
+
+    simulate = command("simulate", "write a data set with known truth", _SIMULATE)
+    simulate.add_argument("out", metavar="OUT", type=Path, help="the new folder")
+    simulate.add_argument("--system", choices=SYSTEMS, default="acrobot", help="the machine (default: acrobot)")
+    simulate.add_argument("--sequences", type=_count, default=20, metavar="N", help="training sequences (20)")
+    simulate.add_argument("--test", type=_natural, default=5, metavar="N", help="test sequences (5)")
+    simulate.add_argument("--steps", type=_count, default=500, metavar="N", help="sample intervals of each (500)")
+    simulate.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    simulate.add_argument("--measured", nargs="+", metavar="STATE", help="which states are read")
+    for kind, what in (("process", "kick per step"), ("measurement", "readings")):
+        simulate.add_argument(
+            f"--{kind}-noise",
+            nargs=2,
+            type=_positive,
+            metavar=("POSITION", "RATE"),
+            help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
+        )
+
+    init = command("init", "write a first rig.toml for a log", _INIT)
+    init.add_argument("csv", metavar="CSV", type=Path, help="a log with a header")
+    init.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    init.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
+    )
+
+    check = command("check", "say whether the logs can identify what is asked", _CHECK)
+    check.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+
+    identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
+    identify.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+    identify.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
+    identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
+    identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
+    identify.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    identify.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
+    identify.add_argument("--quiet", action="store_true", help="no lines of progress")
+
+    diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
+    diagnose.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+    diagnose.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    diagnose.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+    diagnose.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
+    diagnose.add_argument("--quiet", action="store_true", help="no lines of progress")
+
+    predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
+    smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)
+    for use in (predict, smooth):
+        use.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
+        use.add_argument("folder", metavar="FOLDER", type=Path, help="the logs, such as bench/test")
+        use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
+    predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
+    predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
+
+    for reads in (check, identify, diagnose, predict, smooth):
+        reads.add_argument(
+            "--trust-readings", action="store_true", help="use spikes and what a stuck, late or saturated sensor reads"
+        )
+
+    export = command("export", "write a fitted model for other programs", _EXPORT)
+    export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
+    export.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the files")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command: 0 is done, 1 a check that found something bad, 2 refused with one line on stderr, 130 Ctrl-C."""
+    arguments = parser()
+    args = arguments.parse_args(argv)
+    if args.command == "identify" and args.particles and args.smoother != "particle":
+        arguments.error("--particles goes with --smoother particle")
+    try:
+        # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        from . import common  # loads JAX
+
+        with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:
+            warnings.showwarning = _warn
+            for kind in common.WARNINGS:
+                warnings.simplefilter("always", kind)
+            common.set_up()
+            return importlib.import_module(f".{args.command}", __package__).run(args, say) or 0
+    except KeyboardInterrupt as stopped:
+        _say(str(stopped) or "stopped; the files that were written are whole")
+        return 130
+    except Exception as error:
+        line = _line(error)
+        if line is None:
+            raise
+        _say(f"error: {line}")
+        return 2
+
+
+@contextmanager
+def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """`say`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped, noisily."""
+    asked = False
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.default_int_handler(number, frame)
+
+    def line(text: str) -> None:
+        say(text)
+        if asked:
+            raise KeyboardInterrupt
+
+    def dropped(lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            unraisable(lost)
+
+    unraisable = sys.unraisablehook
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
+    if ours:
+        signal.signal(signal.SIGINT, handle)
+        sys.unraisablehook = dropped
+    try:
+        yield line
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            sys.unraisablehook = unraisable
+
+
+def _line(error: Exception) -> str | None:
+    """The one line for a mistake of the caller or of the machine; None for one of ours."""
+    from . import common
+
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error)
+    return " ".join(str(error).split()) if isinstance(error, common.MISTAKES) else None
+
+
+def _warn(message: Warning | str, category: type[Warning], *_) -> None:
+    if "persistent compilation cache" not in str(message):
+        _say(f"warning: {message}")
+
+
+def _say(text: str) -> None:
+    print(f"nnap-em: {text}", file=sys.stderr, flush=True)
+
+
+def _silent(text: str) -> None:
+    """Say nothing."""
+
+
+def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):
+    form = argparse.RawDescriptionHelpFormatter
+    return make(description=summary, epilog=examples, formatter_class=form, allow_abbrev=False, **options)
+
+
+_N = TypeVar("_N", int, float)
+
+
+def _number(text: str, kind: type[_N], low: int | float, wanted: str) -> _N:
+    try:
+        if low <= (value := kind(text)) < math.inf:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"found {text!r}; give {wanted}")
+
+
+def _count(text: str) -> int:
+    return _number(text, int, 1, "a whole number of 1 or more")
+
+
+def _natural(text: str) -> int:
+    return _number(text, int, 0, "a whole number of 0 or more")
+
+
+def _time(text: str) -> float:
+    return _number(text, float, 0.0, "seconds, 0 or more")
+
+
+def _positive(text: str) -> float:
+    return _number(text, float, 5e-324, "a number above 0")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

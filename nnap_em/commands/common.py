@@ -1,0 +1,184 @@
+"""What the commands share: set-up, data sets, model files, and runs that go on after a stop."""
+
+import argparse
+import dataclasses
+import os
+import shlex
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ..data.dataset import Logs, check_split, read_logs
+from ..data.formats import DataError, DataWarning, has_logs, write_csv
+from ..data.rig import Rig, RigError, RigWarning, read_rig
+from ..em.build import build_system, measure_scales
+from ..em.check import BAD, torques
+from ..em.identify import Identified
+from ..em.loop import FitError
+from ..em.predict import GIVEN
+from ..em.store import fingerprint
+from ..numerics.parallel import use_every_device
+from ..portable.export import ExportError
+from ..storage.files import StoreError, cores, sweep
+from ..storage.journal import Journal, keeping
+from ..systems import specs
+
+
+class Halted(RuntimeError):
+    """A file could not be written: the message names it, and says what is kept and how to go on."""
+
+
+MISTAKES = (RigError, DataError, StoreError, FitError, ExportError, Halted)
+WARNINGS = (RigWarning, DataWarning)
+MODEL = "model.npz"
+UNFINISHED = "unfinished"
+"""Folder of the finished steps of a run that is not."""
+MOST = 64
+"""Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
+Say = Callable[[str], None]
+"""Where lines of progress go."""
+
+
+def set_up() -> None:
+    """64-bit numbers, every core, and compiled programs kept for the next call if there is a place for them."""
+    jax.config.update("jax_enable_x64", True)
+    if not jax.distributed.is_initialized():  # or they are dealt out
+        if "JAX_NUM_CPU_DEVICES" not in os.environ:
+            with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
+                jax.config.update("jax_num_cpu_devices", min(MOST, cores()))
+        use_every_device()
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "nnap_em" / "jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
+
+
+class Bench(NamedTuple):
+    """A data set."""
+
+    rig: Rig
+    train: Logs
+    test: Logs | None
+    """Only where there are any; as predictions of the reported error may see them."""
+
+
+def read_bench(folder: Path, trust: bool) -> Bench:
+    """A data set; `trust`: no reading is masked."""
+    rig = read_rig(folder / "rig.toml", specs)
+    train = read_logs(folder / "train", rig, trust=trust)
+    test = read_logs(folder / "test", rig, trust=trust, until=GIVEN) if has_logs(folder / "test") else None
+    check_split(train, test)
+    return Bench(rig, train, test)
+
+
+def warn_of_torques(folder: Path, bench: Bench) -> None:
+    """Warn where the inputs cannot be those of the declared bodies."""
+    rig, data = bench.rig, bench.train.data
+    system = build_system(rig)
+    for finding in torques(rig, system, data, measure_scales(rig, system, data)):
+        if finding.mark == BAD:
+            warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
+
+
+def model_file(path: Path) -> Path:
+    """The model that is meant by a file, or by the folder that holds it."""
+    return path / MODEL if path.is_dir() else path
+
+
+def write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> None:
+    """One file per sequence; a value that is no number becomes an empty field, and is told."""
+    states = specs[fitted.rig.system].states
+    for i, file in enumerate(logs.files):
+        rows = np.asarray(logs.data.valid[i])
+        values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)
+        if not np.isfinite(values).all():
+            warnings.warn(f"{file}: {np.count_nonzero(~np.isfinite(values))} values run away: empty", DataWarning, 2)
+            values = np.where(np.isfinite(values), values, np.nan)
+        names = (*states, *(f"{name}_std" for name in states))
+        time = {"time": np.asarray(logs.data.t[i])[rows]}
+        write_csv((folder / file).with_suffix(".csv"), time | dict(zip(names, values.T, strict=True)))
+
+
+# --- runs that go on after a stop
+
+
+@contextmanager
+def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[None]:
+    """Keep every finished step of what is done inside until all of it is; with --resume go on from what is kept.
+
+    Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
+    """
+    same = _given(args, "smoother", "particles", "seed", none=True)
+    of = {"rig.toml": dataclasses.asdict(bench.rig), "training data": fingerprint(bench.train.data), **same}
+    journal = Journal(args.out / UNFINISHED, of)
+    if args.resume:
+        journal.check()
+        found = f"resumed with {len(journal)} finished steps"
+        say(found if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
+    with _folder(args.out), _telling(lambda: _how_to_go_on(args, journal)):
+        if args.resume:
+            sweep(journal.folder)
+        else:
+            journal.clear()
+        count, rows = bench.train.data.valid.shape
+        say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
+        with keeping(journal):
+            yield
+        journal.clear()
+
+
+def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
+    """Those of these options that the command has; `none`: also where they were left out."""
+    found = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
+    return {name: value for name, value in found.items() if none or value is not None}
+
+
+def _how_to_go_on(args: argparse.Namespace, journal: Journal) -> str:
+    if not len(journal):
+        return "stopped before the end of the first step; nothing was kept"
+    command = ["nnap-em", args.command, str(args.folder), "--out", str(args.out)]
+    for name, value in _given(args, "smoother", "particles", "epochs", "seed").items():
+        command += [name, str(value)]
+    command += ["--trust-readings"] * args.trust_readings
+    return f"stopped with {len(journal)} finished steps kept; to go on: {shlex.join([*command, '--resume'])}"
+
+
+@contextmanager
+def _telling(kept: Callable[[], str]) -> Iterator[None]:
+    """Say what is kept where one is stopped, or where a file cannot be written."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(kept()) from None
+    except OSError as error:
+        file = f"{error.filename}: " if error.filename else ""
+        raise Halted(f"{file}{error.strerror or error}; {kept()}") from error
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """A folder that can be written to; a new one does not stay behind empty when something fails."""
+    new = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=path):
+        pass
+    sweep(path)
+    try:
+        yield
+    finally:
+        for empty in (path / UNFINISHED, path) if new else ():
+            with suppress(OSError):  # it is not
+                empty.rmdir()

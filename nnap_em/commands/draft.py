@@ -1,0 +1,224 @@
+"""A first rig.toml from the header and the numbers of a log; what cannot be read stands as a commented line."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.formats import DataError, csv_fields
+from ..data.rig import SystemSpec, parameter_unit, toml_text
+from ..em.build import reading_noise
+
+_NAMES = {  # what people call a column, its number apart
+    "time": re.compile(r"(time|t|timestamp|clock)()$"),
+    "input": re.compile(r"(?:u|tau|torque|force|f|input|effort)_?(\d?)()$"),
+    "dtheta": re.compile(r"(?:d_?theta|theta_?dot|dq|qd|qdot|omega|w|vel|velocity|speed)_?(\d?)()$"),
+    "dtheta ": re.compile(r"(?:theta|q)_?(\d)_?dot()$"),
+    "theta": re.compile(r"(?:theta|th|q|angle|phi|pos|position)_?(\d?)()$"),
+    "dx": re.compile(r"(?:dx|x_?dot|v|vel|velocity|speed)()$"),
+    "x": re.compile(r"(?:x|pos|position)()$"),
+}
+_EITHER = ("pos", "position", "vel", "velocity", "speed")  # of a joint with a number, of a slide without
+_UNITS = {  # how the end of a name says a unit, and what it is in SI; none: it is SI
+    "deg/s": "rad/s", "deg": "rad", "rpm": "rad/s", "mm/s": "m/s", "mm": "m", "ms": "s", "us": "s", "mnm": "N m",
+    "nmm": "N m", "rad/s": "", "rad": "", "m/s": "", "nm": "", "n m": "", "n": "", "m": "", "s": "",
+}  # fmt: skip
+_UNIT = re.compile(rf"(.+?)[ _]*[ _(\[]({'|'.join(_UNITS)})[\])]?$")
+_PARAMETERS = {
+    "m": "mass",
+    "l": "length of the link",
+    "lc": "distance of the centre of mass from the joint",
+    "I": "inertia about the centre of mass",
+    "g": "gravity",
+    "Ir": "rotor inertia of the drives",
+    "gr": "gear ratio of the drives",
+}
+_HEAD = """\
+format = 1
+name = {name}
+
+# SI units: s, kg, m, rad, N m.  Fill in the lines of the form  # key = ...  and take their first # away.
+"""
+
+
+class Draft(NamedTuple):
+    """A rig.toml to fill in."""
+
+    text: str
+    notes: tuple[str, ...]
+    """What to change in the log."""
+
+    @property
+    def missing(self) -> list[str]:
+        """The keys that stand as comments."""
+        return re.findall(r"(?m)^# (\w+) = \.\.\.", self.text)
+
+
+class _Column(NamedTuple):
+    """What a name of the header seems to mean."""
+
+    name: str
+    kind: str
+    """`time`, `input`, the name of a state, or nothing."""
+    number: int | None
+    unit: str
+    """Where the name says one that is not SI."""
+
+
+def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
+    """The rig.toml that a CSV log calls for; `system` where its columns do not tell it.
+
+    Raises DataError where the log cannot be read or the system not be told.
+    """
+    table = _numbers(path)
+    columns = _from_one([_meaning(name) for name in table])
+    system = system or _system(path, columns, specs)
+    spec = specs[system]
+    measured = [name for name in table if name in spec.states]
+    name = toml_text(path.resolve().parent.name or "rig")
+    lines = [
+        *_model(system, spec),
+        *_input(spec, columns),
+        *_sampling(table, columns),
+        *_measurement(table, measured, spec),
+    ]
+    return Draft("\n".join([_HEAD.format(name=name), *lines]) + "\n", tuple(_notes(columns, spec)))
+
+
+def _numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
+    """The columns of a CSV file that hold numbers; NaN where a field is empty."""
+    if path.suffix.lower() != ".csv":
+        raise DataError(f"{path}: its name does not end in .csv; give a CSV file")
+    names, rows = csv_fields(path)
+    found = {}
+    for name, texts in zip(names, zip(*rows, strict=True), strict=True):
+        try:
+            found[name] = np.array([float(text.strip() or "nan") for text in texts])
+        except ValueError:
+            continue
+    return found
+
+
+def _meaning(name: str) -> _Column:
+    """What a column seems to hold, by its name."""
+    word, unit = name.strip().lower(), ""
+    if not any(pattern.match(word) for pattern in _NAMES.values()) and (match := _UNIT.match(word)):
+        word, unit = match[1], match[2]
+    for kind, pattern in _NAMES.items():
+        if match := pattern.match(word):
+            number = int(match[1]) if match[1].isdigit() else None
+            if "theta" in kind and number is None and word in _EITHER:
+                continue
+            state = f"{kind.strip()}{1 if number is None else number}" if "theta" in kind else kind
+            return _Column(name, state, number, unit if _UNITS.get(unit) else "")
+    return _Column(name, "", None, "")
+
+
+def _from_one(columns: Sequence[_Column]) -> list[_Column]:
+    """The joints of states, and those of inputs, counted from 1 where names count them from 0."""
+    shift = {c.kind == "input" for c in columns if c.number == 0}
+
+    def one(c: _Column) -> _Column:
+        if c.number is None or (c.kind == "input") not in shift:
+            return c
+        return c._replace(number=c.number + 1, kind=re.sub(r"\d$", str(c.number + 1), c.kind))
+
+    return [one(column) for column in columns]
+
+
+def _system(path: Path, columns: Sequence[_Column], specs: Mapping[str, SystemSpec]) -> str:
+    """The system that the names call for."""
+    kinds = {column.kind for column in columns}
+    angles = any("theta" in kind for kind in kinds)
+    if kinds & {"x", "dx"} and not angles:
+        return "slide"
+    if kinds & {"theta2", "dtheta2"} and not kinds & {"x", "dx"}:
+        return "pendubot" if [c.number for c in columns if c.kind == "input"] == [1] else "acrobot"
+    if kinds & {"x", "dx"}:
+        found = "a coordinate x and an angle are of no machine that is known by its columns"
+    elif angles:
+        found = "theta1 may be of a pendulum or of an arm with a hidden joint"
+    else:
+        found = "no column is named as a state"
+    raise DataError(f"{path}: line 1: {found}; give --system {', '.join(sorted(specs))}")
+
+
+def _model(system: str, spec: SystemSpec) -> Iterator[str]:
+    yield from ("[model]", f"type = {toml_text(system)}")
+    yield "# A number is trusted; { mean = 0.2, std = 0.02 } is estimated, with that belief."
+    for name in spec.parameters:
+        what = _what(name)
+        yield f"g = 9.81    # {what}" if name == "g" else f"# {name} = ...    # {what}"
+    for name, value in spec.optional.items():
+        yield f"# {name} = {value:g}    # {_what(name)}; may be left out"
+    yield 'friction = "unknown"    # learned in every joint; or "none"'
+
+
+def _what(name: str) -> str:
+    """The unit of a parameter, and what it is where its name is a usual one."""
+    return ": ".join(filter(None, (parameter_unit(name), _PARAMETERS.get(name.rstrip("0123456789")))))
+
+
+def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
+    found = [(c.name, spec.driven if c.number is None else c.number) for c in columns if c.kind == "input"]
+    found = [(name, joint) for name, joint in found if joint <= spec.joints]
+    names = f"[{', '.join(toml_text(name) for name, _ in found)}]" if found else "..."
+    joints = str([joint for _, joint in found]) if found else "..."
+    mark = "" if found else "# "
+    yield from ("", "[input]", f'{mark}columns = {names}    # N m, or N on a slide; such as ["u"]')
+    yield f"{mark}joints = {joints}    # the joint that each drives, counted from 1; such as [1]"
+
+
+def _sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Iterator[str]:
+    yield from ("", "[sampling]")
+    time = next((column for column in columns if column.kind == "time"), None)
+    t = table[time.name] * {"ms": 1e-3, "us": 1e-6}.get(time.unit, 1.0) if time else np.zeros(2)
+    steps = np.diff(t)
+    dt = float(f"{np.median(steps):.6g}")
+    if dt > 0 and np.max(np.abs(steps - dt)) <= 0.01 * dt:
+        yield f"dt = {dt!r}    # s" + ("; is the clock in ms?" if dt > 0.5 else "")
+    else:
+        between = f"{np.min(steps):.3g} to {np.max(steps):.3g} s" if time else "no time"
+        yield f"# dt = ...    # s; the rows of this log are {between} apart: resample it to uniform rows"
+    yield 'input_hold = "zero-order"'
+    clock = "sequence" if abs(t[0]) <= 0.01 * max(dt, 0.0) else "session"
+    yield f'clock = "{clock}"    # "sequence": time starts at 0 in each file; "session": it runs on over all files'
+
+
+def _measurement(table: Mapping[str, np.ndarray], measured: Sequence[str], spec: SystemSpec) -> Iterator[str]:
+    yield from ("", "[measurement]")
+    names = f"[{', '.join(map(toml_text, measured))}]"
+    states = ", ".join(map(toml_text, spec.states))
+    yield f"columns = {names}    # of {states}" if measured else f"# columns = ...    # such as [{states}]"
+    yield from ("", "[measurement.noise_std]    # read off the high frequencies; what is left out is estimated")
+    for name in measured:
+        noise = reading_noise(table[name][None])
+        sure = 0 < noise < 0.3 * np.nanstd(table[name])
+        yield f"{'' if sure else '# '}{name} = {noise:.2g}    # {parameter_unit(name)}"
+    yield from ("", "[start]    # the state in the first row, where it is known but not measured")
+    for name in spec.states:
+        if name not in measured:
+            yield f"# {name} = {{ mean = 0.0, std = 0.5 }}    # {parameter_unit(name)}; may be left out"
+
+
+def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
+    """What to rename or convert in the log."""
+    names = {column.name for column in columns}
+    for column in columns:
+        if column.number and column.name.strip().endswith(str(column.number - 1)):
+            yield f"column {column.name!r}: counted from 0, so taken for joint {column.number}"
+    for column in columns:
+        state = column.kind in (*spec.states, "time")
+        if not state and column.kind != "input":
+            continue
+        if state and column.kind != column.name and column.kind in names:
+            continue
+        mends = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
+        mends += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
+        if mends:
+            yield f"column {column.name!r}: {' and '.join(mends)}"
+    if "time" not in {column.kind for column in columns}:
+        yield "no column 'time': add one [s]"

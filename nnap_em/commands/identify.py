@@ -1,0 +1,85 @@
+"""nnap-em identify: fit the declared unknowns to the training logs."""
+
+import argparse
+import functools
+import importlib
+import math
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..data.rig import Rig
+from ..em.identify import MakeSmoother, Watch, identify
+from ..em.loop import EMState
+from ..em.store import fingerprint, save
+from ..report.identification import write_identification
+from .cli import SMOOTHERS
+from .common import MODEL, Say, read_bench, resumable, warn_of_torques
+
+
+def run(args: argparse.Namespace, say: Say) -> None:
+    """Fit, and report; the test logs serve for the reported error alone."""
+    began = time.perf_counter()
+    bench = read_bench(args.folder, args.trust_readings)
+    warn_of_torques(args.folder, bench)
+    data, epochs = bench.train.data, []
+    with resumable(args, bench, say):
+        watch, key = _watch(bench.rig, args.epochs, epochs, say), jax.random.key(args.seed)
+        fitted = identify(bench.rig, data, key=key, smoother=smoother(args), epochs=args.epochs, watch=watch)
+        for name in ("report.json", "report.html"):  # older ones are not of the model that is written now
+            (args.out / name).unlink(missing_ok=True)
+        settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
+        notes = {"settings": settings, "epochs": epochs}
+        save(args.out / MODEL, fitted, fingerprint=fingerprint(data), notes=notes)
+        write_identification(
+            args.out, fitted, bench.train, bench.test, epochs,
+            smoother=args.smoother, seed=args.seed, began=began, say=say,
+        )  # fmt: skip
+
+
+def smoother(args: argparse.Namespace) -> MakeSmoother:
+    """The E-step that was asked for."""
+    options = {} if args.particles is None else {"num_particles": args.particles}
+    home, _, name = SMOOTHERS[args.smoother].rpartition(".")
+    return functools.partial(getattr(importlib.import_module(f"nnap_em.smoother.{home}"), name), **options)
+
+
+class Epoch(NamedTuple):
+    """One line of progress."""
+
+    epoch: int
+    horizon_s: float
+    log_likelihood: float
+    left_out: list[int]
+    """Sequences that took no part."""
+    seconds: float
+
+
+def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch:
+    """After every epoch: an entry in `epochs`, and a line."""
+    last = time.perf_counter()
+
+    def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
+        nonlocal last
+        now, out = time.perf_counter(), np.flatnonzero(~np.asarray(used)).tolist()
+        epoch = Epoch(state.epoch, seen * rig.dt, float(state.loglik[-1]), out, now - last)
+        epochs.append(epoch._asdict())
+        last = now
+        noise = _noise(rig, np.asarray(state.best.log_r))
+        sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
+        say(
+            f"epoch {state.epoch:3d} of {most}  horizon {epoch.horizon_s:.2f} s"
+            f"  log-likelihood {epoch.log_likelihood:.2f} per sequence"
+            f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {epoch.seconds:.1f} s"
+        )
+
+    return watch
+
+
+def _noise(rig: Rig, log_r: Float[np.ndarray, " obs"]) -> str:
+    """Of the readings whose noise is estimated."""
+    pairs = zip(rig.measured, np.exp(0.5 * log_r), strict=True)
+    return ", ".join(f"{name} {std:.3g}" for name, std in pairs if name not in rig.noise_std) or "as declared"

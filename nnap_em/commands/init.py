@@ -1,0 +1,22 @@
+"""nnap-em init: a first rig.toml for a log."""
+
+import argparse
+
+from ..data.formats import DataError
+from ..storage.files import replace_text
+from ..systems import specs
+from .common import Say
+from .draft import draft
+
+
+def run(args: argparse.Namespace, say: Say) -> None:
+    """Write it, to be filled in; one that is there stays as it is."""
+    home = args.csv.parent.parent if args.csv.parent.name in ("train", "test") else args.csv.parent
+    path = (args.out or home) / "rig.toml"
+    if path.exists():
+        raise DataError(f"{path}: is there already; give another --out, or remove it")
+    found = draft(args.csv, args.system, specs)
+    replace_text(path, found.text)
+    for note in found.notes:
+        say(f"in the log: {note}")
+    say(f"wrote {path}" + (f"; fill in {', '.join(found.missing)}" if found.missing else ""))

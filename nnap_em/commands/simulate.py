@@ -1,0 +1,65 @@
+"""nnap-em simulate: a data set with known truth."""
+
+import argparse
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..data.formats import DataError, write_csv
+from ..data.rig import Rig, nearest, write_rig
+from ..model.simulate import Experiment, declared, examples, sensed, sweep_experiment
+from ..model.state_space import StateSpaceModel
+from ..report.tables import visited_nodes, write_friction
+from ..systems import specs
+from .common import Say
+
+
+def run(args: argparse.Namespace, say: Say) -> None:
+    """Write it, whole or not at all."""
+    if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
+        raise DataError(f"{args.out}: is there already; give a new folder, or empty this one")
+    model, sweep = examples[args.system]()
+    measured = args.measured and _states(args.measured, specs[args.system].states)
+    model = sensed(model, measured, args.process_noise, args.measurement_noise)
+    count, key = args.sequences + args.test, jax.random.key(args.seed)
+    experiment = sweep_experiment(model, sweep, count, args.steps, key=key)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f".{args.out.name}.", dir=args.out.parent))
+    try:
+        _write(part, model, declared(args.system, model), experiment, args.sequences)
+        part.chmod(0o755)
+        os.replace(part, args.out)
+        say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:
+    """The states to be read, refused where there is none of that name or one twice."""
+    for name in names:
+        if name not in states:
+            raise DataError(f"--measured {name}: no state of this system; {nearest(name, states)}")
+    if len(set(names)) < len(names):
+        raise DataError(f"--measured {' '.join(names)}: a state stands there twice; name each once")
+    return tuple(names)
+
+
+def _write(folder: Path, model: StateSpaceModel, rig: Rig, experiment: Experiment, training: int) -> None:
+    """The rig, the logs, and what is true: all states, and the friction over the visited velocities."""
+    write_rig(rig, folder / "rig.toml")
+    system, dof = model.system, len(model.system.rates)
+    for i, x in enumerate(np.asarray(experiment.x)):
+        t, u, y, _ = (np.asarray(a[i]) for a in experiment.data)
+        known = {"time": t} | dict(zip(rig.input_columns, u.T, strict=True))
+        file = f"train/{i:03d}.csv" if i < training else f"test/{i - training:03d}.csv"
+        write_csv(folder / file, known | dict(zip(rig.measured, y.T, strict=True)))
+        write_csv(folder / "truth" / file, known | dict(zip(system.coordinates + system.rates, x.T, strict=True)))
+    velocity = visited_nodes(np.asarray(experiment.x)[..., dof:].reshape(-1, dof))
+    torque = np.asarray(jax.vmap(model.unknown)(jnp.asarray(velocity.T)).T)
+    write_friction(folder / "truth" / "friction.csv", velocity, torque, np.zeros_like(torque))

@@ -1,0 +1,268 @@
+"""One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with its mend."""
+
+import importlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
+
+import jax
+import numpy as np
+from jaxtyping import Float, Real
+
+from ..storage.files import replace_text
+from .rig import nearest
+
+Array = jax.Array | np.ndarray  # host or device
+LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
+
+
+class DataError(ValueError):
+    """A mistake in a log: the message names the file, the place, what was found and the mend."""
+
+
+class DataWarning(UserWarning):
+    """Something in a log that is possible but seldom meant."""
+
+
+def has_logs(folder: Path) -> bool:
+    """Whether there is a log in the folder."""
+    return bool(_logs(folder))
+
+
+def log_files(folder: Path) -> list[Path]:
+    """The logs of a folder by name; DataError where there is none, or two for one sequence."""
+    files = _logs(folder)
+    if not files:
+        every = sorted(path for path in folder.glob("*") if not path.name.startswith("."))
+        found = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
+        others = f"; found there: {', '.join(path.name for path in every[:3])}" if every else ""
+        raise DataError(f"{folder}: {found}{others}; put one CSV file per sequence there")
+    for one, two in pairwise(sorted(files, key=lambda path: (path.stem, path.name))):
+        if one.stem == two.stem:
+            raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
+    return files
+
+
+def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+    """The columns `required`, then `gaps`, of a log in the format that its name ends in; NaN = missing (`gaps` only).
+
+    Raises DataError that names the row and the column.
+    """
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if size > LARGEST:
+        mend = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
+        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {mend}")
+    return _readers[path.suffix.lower()](path, required, gaps)
+
+
+def place(path: Path, column: str, row: int | None = None) -> str:
+    """How a message names a column, or a field of it: by the line of a CSV file, or by the row of another."""
+    if row is None:
+        return f"column {column!r}"
+    return f"{f'line {row + 2}' if path.suffix.lower() == '.csv' else f'row {row + 1}'}, column {column!r}"
+
+
+def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
+    """Raise the DataError."""
+    raise DataError(f"{path}: {where}: {found}; {mend}")
+
+
+def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
+    """Write columns of one length, 12 digits (a late clock: all), NaN as an empty field; the file is whole or absent.
+
+    Raises DataError if the lengths differ or a value is infinite.
+    """
+    table = {name: np.asarray(values, np.float64) for name, values in columns.items()}
+    if len({values.shape for values in table.values()}) != 1 or np.isinf([*table.values()]).any():
+        shapes = {name: values.shape for name, values in table.items()}
+        raise DataError(f"{path}: columns {shapes}; write finite columns (NaN = missing) of one length")
+    line = ",".join([_digits(name, values) for name, values in table.items()])
+    body = "\n".join([line % row for row in zip(*(values.tolist() for values in table.values()), strict=True)])
+    replace_text(path, f"{','.join(table)}\n{body.replace('nan', '')}\n")
+
+
+def _digits(name: str, values: Float[np.ndarray, " time"]) -> str:
+    """12 digits, or all where a clock runs on from so long ago that samples would fall together."""
+    return "%r" if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4 else "%.12g"
+
+
+def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
+    """The names in the header of a CSV file, and the fields of every row under it."""
+    text = _text(path)
+    return _header(text), _rows(path, text)
+
+
+def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+    """The columns `required`, then `gaps`, of a CSV file with a header, in file units; NaN = empty field (`gaps` only).
+
+    Raises DataError that names the line and the column.
+    """
+    text = _text(path)
+    names = _header(text)
+    other = next((mark for mark in (";", "\t") if mark in text.split("\n", 1)[0]), None)
+    mend = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
+    _check_names(path, names, (*required, *gaps), "line 1, ", mend)
+    columns = list(zip(*_rows(path, text), strict=True))
+    return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
+
+
+def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+    """The same of a Parquet file, where null and NaN are missing samples."""
+    parquet = _extra(path, "pyarrow.parquet", "pyarrow")
+    with _damaged(path, "Parquet"):
+        file = parquet.ParquetFile(path)
+        names = file.schema_arrow.names
+    _check_names(path, names, (*required, *gaps))
+    with _damaged(path, "Parquet"):
+        table = file.read(columns=[*required, *gaps])
+        columns = {name: table[name].to_numpy() for name in (*required, *gaps)}
+    return _stack(path, columns, gaps)
+
+
+def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+    """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
+    io = _extra(path, "scipy.io", "scipy")
+    with _damaged(path, "MAT"):
+        try:
+            content = io.loadmat(path, squeeze_me=True, struct_as_record=True)
+        except NotImplementedError:
+            refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
+    found = {name: value for name, value in content.items() if not name.startswith("__")}
+    if len(found) == 1 and (only := next(iter(found.values()))).dtype.names:
+        found = {name: np.asarray(only[name].item()) for name in only.dtype.names}
+    _check_names(path, list(found), (*required, *gaps))
+    return _stack(path, {name: np.asarray(found[name]) for name in (*required, *gaps)}, gaps)
+
+
+_readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
+
+
+def _logs(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in _readers and not p.name.startswith("."))
+
+
+class _damaged:
+    """Whatever a parser raises on bytes that are none of its format, as a DataError."""
+
+    def __init__(self, path: Path, format: str) -> None:
+        self.path, self.format = path, format
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, DataError):
+            if isinstance(error, OSError) and error.errno:
+                raise _unreadable(self.path, error) from None
+            mend = "use another copy, or write it as CSV"
+            raise DataError(f"{self.path}: no {self.format} file, or damaged or cut short; {mend}") from None
+
+
+def _extra(path: Path, module: str, package: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without {package}; {mend}") from None
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    return DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights")
+
+
+def _text(path: Path) -> str:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise DataError(f"{path}: line {line}: not UTF-8; save the file as plain UTF-8 text") from None
+    if not text.strip():
+        refuse(path, "line 1", "the file is empty", "write a header and one row per sample, or remove the file")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _header(text: str) -> list[str]:
+    return [name.strip().strip('"').strip() for name in text.split("\n", 1)[0].split(",")]
+
+
+def _rows(path: Path, text: str) -> list[list[str]]:
+    """The fields of every row under the header, as many as it has names."""
+    lines = text.rstrip().split("\n")
+    if len(lines) < 3:
+        refuse(path, f"line {len(lines)}", f"found {len(lines) - 1} rows", "write a header and 2 rows or more")
+    rows = [line.split(",") for line in lines[1:]]
+    names = lines[0].count(",") + 1
+    for number, row in enumerate(rows, 2):
+        if len(row) != names:
+            mend = "separate columns by ',', write decimals with '.', and give every column a field"
+            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", mend)
+    return rows
+
+
+def _check_names(
+    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", mend: str | None = None
+) -> None:
+    spare = [name for name in names if name not in wanted]
+    for name in wanted:
+        if name not in names:
+            refuse(path, f"{line}column {name!r}", "missing", mend or nearest(name, spare))
+        if names.count(name) > 1:
+            refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
+
+
+def _numbers(path: Path, name: str, texts: Sequence[str], gaps: bool) -> Float[np.ndarray, " time"]:
+    """The numbers of one column at full speed; where that fails, field by field to find the mistake."""
+    try:
+        values = np.array([float(text) if text else math.nan for text in texts])
+        plain = np.isfinite(values).all() if not gaps else not np.isinf(values).any()
+        if plain and "_" not in "".join(texts):  # Python takes 1_0 for 10
+            return values
+    except ValueError:
+        pass
+    return np.array([_number(path, name, row, text.strip(), gaps) for row, text in enumerate(texts)])
+
+
+def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
+    try:
+        value = float(text.replace("_", "?") or "nan")
+    except ValueError:
+        value = math.inf
+    if math.isinf(value) or (math.isnan(value) and not gaps):
+        _no_number(path, name, row, repr(text), math.isnan(value), gaps)
+    return value
+
+
+def _no_number(path: Path, name: str, row: int, found: str, missing: bool, gaps: bool) -> NoReturn:
+    mend = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
+    refuse(path, place(path, name, row), f"found {found}", mend + ("; time and inputs are never empty" * missing))
+
+
+def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+    """Columns of numbers side by side, checked as those of a CSV file are."""
+    rows = np.size(next(iter(columns.values())))
+    if rows < 2:
+        refuse(path, "the file", f"found {rows} rows", "write 2 rows or more")
+    out = []
+    for name, values in columns.items():
+        if values.dtype.kind not in "iuf":
+            refuse(path, f"column {name!r}", f"holds {values.dtype}, no numbers", "store it as 64-bit floating point")
+        if values.shape != (rows,):
+            shape = " x ".join(map(str, values.shape))
+            refuse(
+                path, f"column {name!r}", f"is {shape or 1}, the first has {rows} rows", "give all columns one length"
+            )
+        values = values.astype(np.float64)
+        wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
+        if wrong.size:
+            found = values[wrong[0]]
+            _no_number(path, name, int(wrong[0]), f"{found:g}", bool(np.isnan(found)), name in gaps)
+        out.append(values)
+    return np.stack(out, -1)

@@ -1,0 +1,327 @@
+"""What the owner declares about a rig: `rig.toml` in, `Rig` out, every mistake refused with its mend."""
+
+import difflib
+import json
+import math
+import re
+import tomllib
+import warnings
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from ..storage.files import replace_text
+
+_FRICTION = {"unknown": True, "none": False}
+_UNITS = {  # of parameters and states, by their names
+    r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
+    r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
+}  # fmt: skip
+_CLOCKS = ("sequence", "session")
+_MEND = {  # how the line of a key or table should look
+    "format": "format = 1",
+    "name": 'name = "my_rig"',
+    "model": 'a table [model] with type = "acrobot" and its parameters',
+    "input": 'a table [input] with columns = ["u"] and joints = [2]',
+    "sampling": "a table [sampling] with dt, input_hold and clock",
+    "measurement": 'a table [measurement] with columns = ["theta1", "dtheta1"]',
+    "noise_std": "a table [measurement.noise_std] with one number above 0 per column",
+    "start": "a table [start] with lines such as theta2 = { mean = 0.0, std = 0.1 }",
+    "type": 'type = "acrobot"',
+    "friction": 'friction = "unknown" (to be learned) or friction = "none"',
+    "actuated_joint": "actuated_joint = 2 (or a table [input] with columns and joints)",
+    "columns": 'a list of different names, columns = ["theta1", "dtheta1"]',
+    "joints": "a list of different joints, one per column, joints = [1, 2]",
+    "dt": "a number above 0, dt = 0.01 (s)",
+    "input_hold": 'input_hold = "zero-order"',
+    "mean": "both numbers, { mean = 0.2, std = 0.02 }",
+    "std": "both numbers, { mean = 0.2, std = 0.02 }",
+    "clock": 'clock = "sequence" (time starts at 0 in each file) or clock = "session" (it runs on over all files)',
+}
+
+
+class RigError(ValueError):
+    """A mistake in rig.toml: the message names the file, the table and key, what was found and the mend."""
+
+
+class RigWarning(UserWarning):
+    """Something in rig.toml that is possible but seldom meant."""
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A number as its owner believes it: mean and standard deviation, both in its SI unit; std = 0 is trusted."""
+
+    mean: float
+    std: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.6g}" + (f" +- {self.std:.2g}" if self.std else "")
+
+
+@dataclass(frozen=True)
+class SystemSpec:
+    """What a registered system calls its states and parameters (optional ones: with default), and its joint count."""
+
+    states: tuple[str, ...]
+    parameters: tuple[str, ...]
+    optional: Mapping[str, float]
+    joints: int
+    driven: int = 1
+    """The joint that an input drives whose name does not tell it."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All that the owner declares, in SI units; an optional parameter that the file leaves out is absent here too."""
+
+    name: str
+    system: str
+    parameters: Mapping[str, Declared]
+    friction: bool  # True: a static map velocity -> torque in each joint, to be learned
+    input_columns: tuple[str, ...]  # N m
+    input_joints: tuple[int, ...]  # counted from 1
+    dt: float  # s
+    clock: str
+    measured: tuple[str, ...]
+    noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
+    start: Mapping[str, Declared]
+
+    def __str__(self) -> str:
+        inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
+        noise = {name: f"{std:.2g} {parameter_unit(name)}" for name, std in self.noise_std.items()}
+        reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
+        lines = [
+            f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} s",
+            f"parameters: {quantities(self.parameters)}",
+            f"inputs: {', '.join(inputs) or 'none'}",
+            f"reads: {', '.join(reads)}",
+            f"start: {quantities(self.start) or 'from the readings'}",
+            f"friction: {'to be learned' if self.friction else 'none'}",
+        ]
+        return "\n  ".join(lines)
+
+
+def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
+    """The rig that `rig.toml` declares, in SI units; `systems` are the registered ones.
+
+    Raises RigError at the first mistake.
+    """
+    path = Path(path)
+    root = _Table(path, "", _parse(path))
+    root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start"))
+    if root.number("format") != 1:
+        root.refuse("format")
+    model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
+    system = model.choice("type", systems)
+    spec = systems[system]
+    reserved = ("type", "friction", "actuated_joint")
+    model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
+    sampling.check(("dt", "input_hold", "clock"))
+    sampling.choice("input_hold", ("zero-order",))
+    start.check((), spec.states)
+    input_columns, input_joints = _input(root, model, spec)
+    measured, noise_std = _measurement(root.table("measurement"), spec)
+    return Rig(
+        name=root.text("name"),
+        system=system,
+        parameters={key: _parameter(model, key) for key in model.items if key not in reserved},
+        friction=_FRICTION[model.choice("friction", _FRICTION)],
+        input_columns=input_columns,
+        input_joints=input_joints,
+        dt=sampling.positive("dt"),
+        clock=sampling.choice("clock", _CLOCKS),
+        measured=measured,
+        noise_std=noise_std,
+        start={state: start.declared(state) for state in start.items},
+    )
+
+
+def write_rig(rig: Rig, path: Path) -> None:
+    """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
+    parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
+    lines = ["format = 1", f"name = {toml_text(rig.name)}"]
+    lines += ["", "[model]", f"type = {toml_text(rig.system)}", *_lines(parameters)]
+    lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
+    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
+    lines += [f"joints = {list(rig.input_joints)}"]
+    lines += [
+        "",
+        "[sampling]",
+        f"dt = {rig.dt!r}    # s",
+        'input_hold = "zero-order"',
+        f"clock = {toml_text(rig.clock)}",
+    ]
+    lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
+    lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
+    lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
+    replace_text(path, "\n".join(lines) + "\n")
+
+
+def toml_text(text: str) -> str:
+    """A text as TOML writes it."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL
+
+
+def nearest(word: str, known: Collection[str]) -> str:
+    """The mend for a misspelt name: the known name nearest to it, then all that are possible."""
+    same = [name for name in known if name.casefold() == word.strip().casefold()]
+    close = same or difflib.get_close_matches(word, known, n=1)
+    question = f"did you mean {close[0]!r}? " if close else ""
+    return f"{question}possible here: {', '.join(known) or 'none'}"
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One table of the file; its readers refuse a wrong value by file, table and key."""
+
+    path: Path
+    name: str
+    items: Mapping[str, object]
+
+    def refuse(self, key: str, found: str | None = None, mend: str | None = None) -> NoReturn:
+        place = f"[{self.name}] {key}" if self.name else key
+        found = found or f"found {self.items[key]!r}"
+        raise RigError(f"{self.path}: {place}: {found}; {mend or f'write {_MEND[key]}'}")
+
+    def check(self, required: Collection[str], optional: Collection[str] = ()) -> None:
+        """Refuse unknown keys first: a misspelt key is also a missing one, and its name is the better hint."""
+        known = (*required, *optional)
+        for key in self.items:
+            if key not in known:
+                self.refuse(
+                    key, "unknown table or key", nearest(key, [name for name in known if name not in self.items])
+                )
+        for key in required:
+            self.value(key)
+
+    def value(self, key: str) -> object:
+        if key not in self.items:
+            mend = _MEND.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
+            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {mend}")
+        return self.items[key]
+
+    def table(self, key: str, absent: Mapping[str, object] | None = None) -> "_Table":
+        value = self.value(key) if absent is None else self.items.get(key, absent)
+        if not isinstance(value, dict):
+            self.refuse(key, mend=None if key in _MEND else f"write {key} = {{ mean = 0.2, std = 0.02 }}")
+        return _Table(self.path, f"{self.name}.{key}" if self.name else key, value)
+
+    def text(self, key: str) -> str:
+        value = self.value(key)
+        if not isinstance(value, str) or not value:
+            self.refuse(key)
+        return value
+
+    def choice(self, key: str, known: Collection[str]) -> str:
+        value = self.text(key)
+        if value not in known:
+            self.refuse(key, mend=nearest(value, known))
+        return value
+
+    def number(self, key: str) -> float:
+        value = self.value(key)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            self.refuse(key, mend=f"write a finite number, {key} = 0.2")
+        return float(value)
+
+    def positive(self, key: str) -> float:
+        value = self.number(key)
+        if value <= 0:
+            self.refuse(key, mend=f"write a number above 0, {key} = 0.01")
+        return value
+
+    def declared(self, key: str) -> Declared:
+        pair = self.table(key)
+        pair.check(("mean", "std"))
+        if pair.number("std") < 0:
+            pair.refuse("std", mend="write a standard deviation of 0 (trusted) or more")
+        return Declared(pair.number("mean"), pair.number("std"))
+
+    def distinct(self, key: str, kind: type) -> tuple:
+        value = self.value(key)
+        if not isinstance(value, list) or not all(type(x) is kind for x in value) or len(set(value)) < len(value):
+            self.refuse(key)
+        return tuple(value)
+
+
+def _parse(path: Path) -> dict[str, object]:
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise RigError(f"{path}: cannot be read ({error.strerror}); a data set is a folder with a rig.toml") from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise RigError(f"{path}: line {line}: not UTF-8; save the file as plain UTF-8 text") from None
+    except tomllib.TOMLDecodeError as error:
+        raise RigError(
+            f"{path}: not TOML: {error}; write key = value, texts in quotation marks, no key twice"
+        ) from None
+
+
+def _parameter(model: _Table, key: str) -> Declared:
+    """A number (trusted) or { mean, std }. Inertias may be negative: fits about the joint, moved to the centre, are."""
+    value = model.declared(key) if isinstance(model.items[key], dict) else Declared(model.number(key), 0.0)
+    unit = parameter_unit(key)
+    if unit == "kg" and value.mean <= 0:
+        model.refuse(key, mend="write a mass above 0 [kg]")
+    if unit in ("m", "m/s^2") and value.mean < 0:
+        model.refuse(key, mend=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
+    if value.mean > {"m/s^2": 100.0, "m": 50.0}.get(unit, math.inf):
+        found = f"{model.path}: [model] {key}: found {value.mean:g}"
+        warnings.warn(f"{found}; is it in m{unit}? write it in {unit}", RigWarning, 2)
+    return value
+
+
+def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """The torque columns and the joint that each drives."""
+    if "input" in root.items:
+        table, key = root.table("input"), "joints"
+        table.check(("columns", "joints"))
+        columns, joints = table.distinct("columns", str), table.distinct("joints", int)
+        if len(columns) != len(joints):
+            table.refuse(key, f"found {len(joints)} joints for {len(columns)} columns")
+        for column in columns:
+            if column in ("time", *spec.states):
+                table.refuse("columns", f"{column!r} is no torque", "name the torque columns only")
+    else:
+        table, key, columns = model, "actuated_joint", ("u",)
+        joint = model.value(key)
+        joints = (joint,) if type(joint) is int else model.refuse(key)
+    if not all(1 <= joint <= spec.joints for joint in joints):
+        table.refuse(key, mend=f"joints count from 1 to {spec.joints}")
+    return columns, joints
+
+
+def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict[str, float]]:
+    """The measured columns and the noise declared for them."""
+    table.check(("columns",), ("noise_std",))
+    columns = table.distinct("columns", str)
+    if not columns:
+        table.refuse("columns")
+    for column in columns:
+        if column not in spec.states:
+            table.refuse("columns", f"{column!r} is no state of this system", nearest(column, spec.states))
+    noise = table.table("noise_std", absent={})
+    noise.check((), columns)
+    return columns, {column: noise.positive(column) for column in noise.items}
+
+
+def parameter_unit(name: str) -> str:
+    """The SI unit of a parameter or state that is called as in the machines here; "SI" where it is not."""
+    return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
+
+
+def quantities(values: Mapping[str, object]) -> str:
+    """Parameters or states as text, with their units."""
+    numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
+    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
+
+
+def _lines(values: Mapping[str, str]) -> list[str]:
+    return [f"{name} = {value}    # {parameter_unit(name)}" for name, value in values.items()]
+
+
+def _pair(value: Declared) -> str:
+    return f"{{ mean = {value.mean!r}, std = {value.std!r} }}"

@@ -1,0 +1,205 @@
+"""What is believed: the only place where numbers decide whether an effect is in the model.
+
+The search measures and asks, a rule answers.  Another rule is one more class.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+
+from ..effects import Candidate
+from .evidence import Evidence, Question, Screen, Screened, Worth, price
+from .screen import score_test
+from .shares import share_test
+
+SHORT = 150
+"""Rows to which short horizons are cut, so that they share their programs."""
+
+
+class Verdict(NamedTuple):
+    """What a rule says."""
+
+    believed: bool
+    reason: str
+    """One clause, for the log of the search."""
+
+
+class AbstractRule(eqx.Module):
+    """When an effect is worth a refit, when it is believed, and when it stays."""
+
+    certain: float = eqx.field(static=True, default=5.0)
+    """Standard deviations from none that the strengths must be: 12 nat by another road."""
+    near: float = eqx.field(static=True, default=0.6)
+    """Share of the best from which on another is nearly as good: a named law is preferred to a free one, a rival is
+    followed further, a law stands beside its rest.  A quick refit, or one fold, errs by less than the rest."""
+
+    promises: ClassVar[str] = "expected gain in log-likelihood [nat]"
+    """What `promise` and `worth` are, as a figure labels them."""
+    multistep: ClassVar[bool] = False
+    """Whether refits are finished on multi-step errors, as what is believed is judged by them."""
+
+    @abstractmethod
+    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
+        """Rows at which to look, of those at which the model was fitted."""
+
+    @abstractmethod
+    def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
+        """All candidates before any refit, by what this rule believes in."""
+
+    @abstractmethod
+    def promise(self, screened: Screened, readings: int) -> float:
+        """What a candidate promises; the larger the better."""
+
+    @abstractmethod
+    def worth_a_refit(self, promise: float, readings: int) -> bool:
+        """Whether that is enough to look closer."""
+
+    @abstractmethod
+    def worth(self, evidence: Evidence) -> float:
+        """What an effect is worth after its refit; the larger the better."""
+
+    @abstractmethod
+    def sound(self, evidence: Evidence) -> Verdict:
+        """Whether a refitted effect may compete."""
+
+    @abstractmethod
+    def believes(self, evidence: Evidence) -> Verdict:
+        """Whether the winner is believed."""
+
+    @abstractmethod
+    def even(self, winner: Evidence, rival: Evidence) -> bool:
+        """Whether the data cannot tell the winner from a rival."""
+
+    @abstractmethod
+    def keeps(self, worth: Worth) -> Verdict:
+        """Whether an effect, or all of them together, stay."""
+
+
+class LikelihoodRule(AbstractRule):
+    """One-step likelihood, on the data and on sequences left out: right where innovations are what the model says."""
+
+    margin: float = eqx.field(static=True, default=12.0)
+    """Log-likelihood [nat] that must be left of a gain after its price: 400 candidates gain 6 by chance."""
+    matters: float = eqx.field(static=True, default=0.002)
+    """The same for every reading: many readings make certain of what nobody would notice."""
+    repeats: float = eqx.field(static=True, default=0.3)
+    """Share of the gain that must be seen on sequences left out: halves fit half as well."""
+
+    level: float = eqx.field(static=True, default=5.0)
+    """Log-likelihood [nat] within which a rival is as likely: 1 in 150."""
+
+    def bar(self, readings: int) -> float:
+        """Log-likelihood that an effect must be worth [nat]."""
+        return max(self.margin, self.matters * readings)
+
+    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
+        """The first two, one in the middle, the whole: a strong effect loses tracks early, a weak one needs all."""
+        short = [h for h in sorted(fitted) if h < longest]
+        chosen = [h for h in short if h <= SHORT][:2] + [h for h in short if longest / 3 < h < 0.7 * longest][:1]
+        return list(dict.fromkeys([*chosen, longest]))
+
+    def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
+        """By the score test."""
+        return score_test(question, candidates)
+
+    def promise(self, screened: Screened, readings: int) -> float:
+        """Expected gain beyond its price [nat]."""
+        return screened.gain - price(screened.directions, readings)
+
+    def worth_a_refit(self, promise: float, readings: int) -> bool:
+        """Whether that is half of the bar."""
+        return promise > 0.5 * self.bar(readings)  # the score test says too little of what is not linear
+
+    def worth(self, evidence: Evidence) -> float:
+        """Gain beyond its price [nat]."""
+        return evidence.gain - price(evidence.directions, evidence.readings)
+
+    def sound(self, evidence: Evidence) -> Verdict:
+        """Whether it is worth more than the bar, and far from none."""
+        net = self.worth(evidence)
+        if net <= self.bar(evidence.readings):
+            return Verdict(False, f"gains {net:.0f} nat net only")
+        certain = evidence.certainty > self.certain
+        return Verdict(certain, f"is {evidence.certainty:.1f} standard deviations from none")
+
+    def believes(self, evidence: Evidence) -> Verdict:
+        """Whether enough of its worth is there on sequences left out."""
+        needed = max(0.5 * self.bar(evidence.readings), self.repeats * self.worth(evidence))
+        return Verdict(evidence.held_out >= needed, f"gains {evidence.held_out:.0f} nat on sequences left out")
+
+    def even(self, winner: Evidence, rival: Evidence) -> bool:
+        """Within some nats."""
+        return winner.gain - rival.gain < self.level
+
+    def keeps(self, worth: Worth) -> Verdict:
+        """Whether less would lose more than the bar."""
+        return Verdict(worth.gain > self.bar(worth.readings), f"gains {worth.gain:.0f} nat")
+
+
+class ShareRule(AbstractRule):
+    """Multi-step prediction, on all recordings and on those left out: right where innovations are not what the model
+    says, because what a machine lacks adds up over many steps and what spoils its readings does not.
+    """
+
+    promises: ClassVar[str] = "share of the squared multi-step error"
+    multistep: ClassVar[bool] = True
+    least: float = eqx.field(static=True, default=0.15)
+    """Share of the squared error that must go, inside and on what is left out: chance removes up to a tenth."""
+    agree: float = eqx.field(static=True, default=0.75)
+    """Share of the parts left out on which the error must fall."""
+    harm: float = eqx.field(static=True, default=0.1)
+    """Share by which it may rise on any."""
+    level: float = eqx.field(static=True, default=0.9)
+    """Share of the winner's worth from which on a rival explains the same as well: folds differ by more."""
+
+    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
+        """The whole: over a second a fifth of the error goes by chance."""
+        return [longest]
+
+    def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
+        """By shares of the multi-step error."""
+        return share_test(question, candidates)
+
+    def promise(self, screened: Screened, readings: int) -> float:
+        """The smaller share; none where the recordings disagree, or for a multiple of a law that is not linear."""
+        share = screened.share
+        assert share is not None
+        same = screened.candidate.start.linear or 0.3 < screened.coefficients[0] < 3.0
+        agreed = sum(f > 0 for f in share.folds) >= self.agree * len(share.folds) and min(share.folds) > -self.harm
+        return share.least if same and agreed else 0.0
+
+    def worth_a_refit(self, promise: float, readings: int) -> bool:
+        """Whether that is the least share."""
+        return promise >= self.least
+
+    def worth(self, evidence: Evidence) -> float:
+        """What the refit removes, as far as it was seen on what was left out of a fit."""
+        share = evidence.screened.share
+        assert share is not None
+        return (1.0 - evidence.error) * min(1.0, share.left_out / max(share.inside, 1e-9))
+
+    def sound(self, evidence: Evidence) -> Verdict:
+        """Whether it gains at all, is far from none, and the error falls."""
+        if evidence.gain <= 0:
+            return Verdict(False, f"loses {-evidence.gain:.0f} nat")
+        if evidence.certainty <= self.certain:
+            return Verdict(False, f"is {evidence.certainty:.1f} standard deviations from none only")
+        return self._falls(evidence.error)
+
+    def believes(self, evidence: Evidence) -> Verdict:
+        """Whether the error falls."""
+        return self._falls(evidence.error)
+
+    def even(self, winner: Evidence, rival: Evidence) -> bool:
+        """Nearly the same share."""
+        return self.worth(rival) > self.level * self.worth(winner)
+
+    def keeps(self, worth: Worth) -> Verdict:
+        """Whether the error falls."""
+        return self._falls(worth.error)
+
+    def _falls(self, error: float) -> Verdict:
+        """Of the refitted model, which is not linear and has to say it all, most of the share."""
+        return Verdict(1.0 - error >= self.near * self.least, f"removes {1.0 - error:.0%} of the open-loop error")

@@ -1,0 +1,234 @@
+"""The outcome of the loop in words and numbers: what was found, how sure, and what it is worth."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import AbstractEffect, catalogue, fields, flat
+from ..effects.function import UnknownFunction
+from ..em.identify import Identified, friction_table
+from ..systems import AbstractSystem
+from .hypothesis import blocks
+from .keys import Key, key_of, rest_of, words
+from .loop import Closed
+
+
+class Estimate(NamedTuple):
+    """A reported parameter."""
+
+    value: float
+    std: float
+    unit: str
+
+
+def covariance(fitted: Identified) -> Float[np.ndarray, "param param"]:
+    """Of all estimated parameters, friction integrated out (Laplace)."""
+    prior = fitted.m_step.prior
+    cov = np.linalg.inv(np.asarray(fitted.state.hessian))
+    cut = cov.shape[0] - prior.size
+    std = np.asarray(prior.std)
+    return cov[cut:, cut:] * np.outer(std, std)
+
+
+def estimates(
+    effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: AbstractSystem
+) -> dict[str, Estimate]:
+    """The reported parameters of an effect; standard deviations by the delta method from those of its own numbers."""
+
+    def reported(numbers: Float[Array, " param"]) -> dict[str, Float[Array, ""]]:
+        return _filled(effect, numbers).values()
+
+    now = flat(effect)
+    values, slopes, unit = reported(now), jax.jacfwd(reported)(now), effect.units_on(system)
+    variance = {name: float(np.asarray(slope) @ cov @ np.asarray(slope)) for name, slope in slopes.items()}
+    return {n: Estimate(float(value), math.sqrt(max(0.0, variance[n])), unit[n]) for n, value in values.items()}
+
+
+def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> AbstractEffect:
+    """The effect with other parameters."""
+    old = [getattr(effect, name) for name in fields(effect)]
+    parts = jnp.split(numbers, np.cumsum([np.size(part) for part in old])[:-1])
+    new = [part.reshape(jnp.shape(was)) for part, was in zip(parts, old, strict=True)]
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(effect)], effect, new)
+
+
+class Curve(NamedTuple):
+    """A learned function along one signal, its mean taken away."""
+
+    signal: str
+    signal_unit: str
+    joint: int
+    """Where it acts, counted from 1."""
+    unit: str
+    """Of the force."""
+    turns: bool
+    """True where the signal is an angle that goes round."""
+    x: Float[np.ndarray, " node"]
+    mean: Float[np.ndarray, " node"]
+    std: Float[np.ndarray, " node"]
+
+
+def curve(
+    effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: AbstractSystem, nodes: int = 121
+) -> Curve | None:
+    """The learned function of one signal, its parameters of covariance `cov`; None for any other effect."""
+    if not isinstance(effect, UnknownFunction) or len(effect.axes) != 1 or effect.joint is None:
+        return None
+    (axis,) = effect.axes
+    x = np.linspace(float(axis.low), float(axis.high), nodes)
+    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+    basis = basis - basis.mean(axis=0)
+    std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
+    units = axis.unit(system), system.force_unit(effect.joint)
+    mean = basis @ np.asarray(effect.weights)
+    return Curve(" + ".join(axis.names), units[0], effect.joint, units[1], axis.turns, x, mean, std)
+
+
+def shape(found: Curve) -> str:
+    """A learned function in words: a period, a bump, or a slope."""
+    x, y, name, across = found.x, found.mean, found.signal, found.signal_unit
+    size = f"{np.ptp(y):.2g} {found.unit} from trough to peak"
+    if found.turns:
+        power = np.abs(np.fft.rfft(y[:-1])) ** 2
+        n = int(np.argmax(power[1:])) + 1
+        if power[n] > 0.8 * power[1:].sum():
+            return f"period {n} in {name}, {size}"
+    line = np.polyfit(x, y, 1)
+    if np.var(y - np.polyval(line, x)) < 0.15 * np.var(y):
+        return f"nearly a straight line in {name}, slope {line[0]:.2g} {found.unit}/{across}"
+    level = np.median(y)
+    peak = int(np.argmax(np.abs(y - level)))
+    width = np.mean(np.abs(y - level) > 0.5 * abs(y[peak] - level)) * np.ptp(x)
+    if width < 0.4 * np.ptp(x):
+        kind, height = "bump" if y[peak] > level else "dip", f"{y[peak] - level:.2g} {found.unit} high"
+        return f"a {kind} at {name} = {x[peak]:.2f} {across}, about {width:.2f} wide, {height}"
+    return f"a smooth function of {name}, largest at {x[int(np.argmax(y))]:.2f} {across}, {size}"
+
+
+class Finding(NamedTuple):
+    """One effect as it is reported."""
+
+    effect: AbstractEffect
+    parameters: dict[str, Estimate]
+    evidence: dict[str, float]
+    equivalent: tuple[Key, ...]
+    sentence: str
+    curve: Curve | None = None
+    """What was learned of its form: the function itself, or what is left beside a law."""
+
+
+def findings(closed: Closed) -> list[Finding]:
+    """All that was found, with what cannot be told from it."""
+    fitted, model = closed.after, closed.after.model
+    cov = covariance(fitted)
+    own = [cov[block, block] for block in blocks(model, fitted.m_step)]
+    laws = [None if (place := rest_of(e, model)) is None else model.effects[place] for e in model.effects]
+    entries = list(zip(model.effects, closed.found, own, laws, strict=True))
+    out = []
+    for effect, found, numbers, law in entries:
+        if law is not None:
+            continue  # told with the law that it completes
+        drawn = curve(effect, numbers, model.system)
+        parameters = estimates(effect, numbers, model.system)
+        numbers_told = ", ".join(
+            f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
+        )
+        sentence = ": ".join(filter(None, (words(key_of(effect)), shape(drawn) if drawn else numbers_told)))
+        rest = next((curve(e, c, model.system) for e, _, c, of in entries if of is effect), None)
+        if rest is not None:
+            left = f"{np.ptp(rest.mean):.2g} {rest.unit}"
+            sentence += f"; the law is not quite of this form, what is left has {left}"
+        evidence = {
+            "log_likelihood_gain": found.gain,
+            "p_value": max(found.p_value, 1e-300),
+            "held_out_gain": found.held_out,
+            "share_of_error": found.share,
+        }
+        out.append(Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest))
+    return out
+
+
+def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: int = 0) -> str:
+    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly."""
+    if not found and failed:
+        return (
+            "No single effect of the catalogue is certain to be missing, but the declared model does not explain "
+            f"everything: {failed} tests of its one-step errors fail."
+        )
+    if not found:
+        return "Nothing is missing that these data could show: the declared model explains them."
+    names = listed([words(key_of(f.effect)) for f in found])
+    it = "it" if len(found) == 1 else "them"
+    text = f"The model lacks {names}"
+    if not error:
+        return text + "."
+    at = error["horizons_s"].index(1.0)
+    ratios = [
+        (c, error["before"][c][at], error["after"][c][at])
+        for c in error["before"]
+        if error["after"][c][at] and math.isfinite(error["before"][c][at])
+    ]
+    if not ratios:
+        return text + "."
+    column, before, after = ratios[0]
+    if after >= before:
+        return (
+            f"The training data ask for {names}, but on test data the 1 s prediction error of {column} does not fall "
+            f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
+        )
+    rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
+    falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
+    return f"{text}; with {it} {listed([falls, *rising])} on test data."
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a sentence lists them."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:
+    """How far the missing effect had bent the learned friction."""
+    if not (closed.found and closed.before.rig.friction):
+        return None
+    first, second = (np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (closed.before, closed.after))
+    size = np.sqrt(np.mean(second**2, axis=1))
+    share = np.sqrt(np.mean((first - second) ** 2, axis=1)) / np.maximum(size, 1e-12)
+    parts = [f"joint {j + 1} by {100 * s:.0f} %" for j, s in enumerate(share)]
+    return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
+
+
+def advice(found: Sequence[Finding]) -> list[str]:
+    """What to look at next."""
+    out = []
+    for finding in found:
+        if finding.effect.confirm:
+            out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
+        for key in finding.equivalent:
+            out.append(f"To tell it from {words(key)}: {catalogue[key[0]].confirm}")
+    if not found:
+        out.append(
+            "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
+        )
+    return out
+
+
+def entry(finding: Finding) -> dict[str, Any]:
+    """A finding as the report has it."""
+    _, joint, channel, inputs = key_of(finding.effect)
+    return {
+        "name": finding.effect.key(),
+        "joint": joint,
+        "channel": channel,
+        "inputs": list(inputs),
+        "parameters": {n: p._asdict() for n, p in finding.parameters.items()},
+        "evidence": finding.evidence,
+        "equivalent": [{"name": catalogue[k[0]].key(), "joint": k[1], "channel": k[2]} for k in finding.equivalent],
+        "description": finding.sentence,
+        "confirm": finding.effect.confirm,
+    }

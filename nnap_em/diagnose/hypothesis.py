@@ -1,0 +1,102 @@
+"""A model with what was added to it: every addition is one record of law, prior and evidence."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import AbstractEffect, Candidate, fields, flat
+from ..em.mstep import ScoringMStep
+from ..em.prior import ParameterPrior
+from ..model.state_space import StateSpaceModel, with_effects
+from .keys import Key
+
+
+class Found(NamedTuple):
+    """Why an effect was added."""
+
+    candidate: Candidate
+    gain: float
+    """Log-likelihood over the model without it, where it was found [nat]."""
+    held_out: float
+    """Gain on sequences that had no part in the fit [nat]; NaN where the rule did not ask for it."""
+    p_value: float
+    """Of the likelihood ratio, times the number of candidates tried."""
+    horizon: int
+    """Rows of each sequence on which it was found."""
+    equivalent: tuple[Key, ...] = ()
+    """Effects that the data cannot tell from it."""
+    share: float = float("nan")
+    """Share of the multi-step error that it removes on recordings left out of its fit."""
+
+
+class Addition(NamedTuple):
+    """An effect in the model."""
+
+    effect: AbstractEffect
+    """The law as it stands."""
+    mean: Float[Array, " param"]
+    """Prior of its parameters."""
+    std: Float[Array, " param"]
+    found: Found | None = None
+
+
+class Hypothesis(NamedTuple):
+    """A model, the rule that fits it, and why its effects are in it."""
+
+    model: StateSpaceModel
+    m_step: ScoringMStep
+    found: tuple[Found | None, ...] = ()
+
+    @property
+    def additions(self) -> tuple[Addition, ...]:
+        """The effects of the model, each with all that belongs to it."""
+        prior = self.m_step.prior
+        return tuple(
+            Addition(effect, prior.mean[here], prior.std[here], found)
+            for effect, here, found in zip(self.model.effects, blocks(self.model, self.m_step), self.found, strict=True)
+        )
+
+    def having(self, additions: tuple[Addition, ...]) -> "Hypothesis":
+        """The same declared model with other additions."""
+        prior = self.m_step.prior
+        declared = prior.size - sum(a.mean.shape[0] for a in self.additions)
+        own = [f"{i}.{name}" for i, a in enumerate(additions) for name in fields(a.effect)]
+        joined = ParameterPrior(
+            tuple(name for name in prior.names if "." not in name) + tuple(own),
+            jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
+            jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
+        )
+        model = with_effects(self.model, tuple(a.effect for a in additions))
+        rule = eqx.tree_at(
+            lambda m: (m.prior, m.shape), self.m_step, (joined, model.log_q), is_leaf=lambda leaf: leaf is None
+        )
+        return Hypothesis(model, rule, tuple(a.found for a in additions))
+
+    def plus(self, effect: AbstractEffect, candidate: Candidate, found: Found | None = None) -> "Hypothesis":
+        """With one effect more, behind the others."""
+        centre = candidate.start if effect.linear else effect
+        return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.spread), found)))
+
+    def without(self, place: int) -> "Hypothesis":
+        """Without the effect at `place`."""
+        return self.having(tuple(a for i, a in enumerate(self.additions) if i != place))
+
+    def refitted(self, model: StateSpaceModel) -> "Hypothesis":
+        """The same with other numbers in the model."""
+        return self._replace(model=model)
+
+    def because(self, place: int, found: Found) -> "Hypothesis":
+        """The same with the evidence of the effect at `place`."""
+        told = list(self.found)
+        told[place] = found
+        return self._replace(found=tuple(told))
+
+
+def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:
+    """Where the parameters of every effect stand among all that are estimated."""
+    sizes = [flat(effect).size for effect in model.effects]
+    ends = np.cumsum(sizes) + m_step.prior.size - sum(sizes)
+    return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -1,0 +1,46 @@
+"""What tells two effects apart, and which law completes or replaces which."""
+
+import jax
+
+from ..effects import AbstractEffect
+from ..model.state_space import StateSpaceModel
+
+Key = tuple[str, int | None, str | None, tuple[str, ...]]
+"""Name, joint, channel and inputs of an effect."""
+
+
+def key_of(effect: AbstractEffect) -> Key:
+    """What tells two effects apart."""
+    return effect.name, effect.joint, effect.channel, effect.inputs_named()
+
+
+def words(key: Key) -> str:
+    """An effect as a reader would call it."""
+    name, joint, channel, inputs = key
+    text = name.replace("_", " ")
+    if inputs:
+        text += f" of {' and '.join(inputs)}"
+    return text + (f" at joint {joint}" if joint else "") + (f" on {channel}" if channel else "")
+
+
+def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+    """Place of the named law whose rest an unnamed one is: a function of the same position at the same joint."""
+    if effect.named or effect.joint is None:
+        return None
+    if effect.inputs_named() != (model.system.coordinates[effect.joint - 1],):
+        return None
+    return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
+
+
+def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+    """Place of the law whose place `effect` takes: of the same key in another form, as one that repeats each turn."""
+    alike = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
+    return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
+
+
+def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
+    """Whether an unnamed law in the model is a function of the same position at the same joint."""
+    if not effect.place or effect.joint is None:
+        return False
+    own = (model.system.coordinates[effect.joint - 1],)
+    return any(e.joint == effect.joint and e.inputs_named() == own for e in model.effects)

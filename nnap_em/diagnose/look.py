@@ -1,0 +1,271 @@
+"""One look at one horizon: everything screened, the best few refitted, and what the rule says of them."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..data.dataset import Dataset
+from ..effects import AbstractEffect, Candidate, fields, flat
+from ..em.multistep import JUDGED, errors, finish, ratio
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from .accept import AbstractRule
+from .evidence import Evidence, Question, Screen, Screened, lazy
+from .hypothesis import Hypothesis, blocks
+from .keys import Key, covered, key_of, replaced, rest_of, words
+from .propose import extended, proposals, seeded, surroundings
+from .refit import Trial, refit
+from .screen import unlike
+
+Say = Callable[[str], None]
+
+
+class Effort(NamedTuple):
+    """How long is looked, whatever is believed."""
+
+    shortlist: int = 5
+    """Candidates that are refitted."""
+    close: float = 0.4
+    """Share of the best promise below which a candidate is not refitted."""
+    starts: int = 3
+    """Places from which a law that is not linear is refitted."""
+    passes: int = 8
+    """Passes of a refit."""
+    most: int = 4
+    """Effects at most."""
+    loud: float = 5.0
+    """Standard deviations of a kick with which a track begins to be lost."""
+    later: tuple[int, ...] = (8, 3, 1)
+    """Rows after that which still count; the fewer where the many are too much."""
+
+
+EFFORT = Effort()
+
+
+class Step(NamedTuple):
+    """What was seen at one look, for the report."""
+
+    horizon: int
+    screened: tuple[tuple[Key, float], ...]
+    """Best of every kind with its promise: nat, or a share."""
+    refitted: tuple[tuple[Key, float], ...]
+    accepted: Key | None
+    tried: int
+    """Candidates screened."""
+    measure: str = "expected gain in log-likelihood [nat]"
+    """What the numbers are."""
+
+
+def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:
+    """Squared open-loop error of one model over that of another, each along its own smoothed paths."""
+    before, after = (errors(one.model, one.m_step.prior, one.path, data, JUDGED) for one in (null, full))
+    return ratio(before, after, used)
+
+
+class Case(Evidence):
+    """A candidate after its refit, and all that a rule may ask of it."""
+
+    def __init__(self, screened: Screened, trial: Trial, null: Trial, after: Hypothesis, question: Question):
+        self.screened, self.trial, self.null, self.question = screened, trial, null, question
+        self.after = after.refitted(trial.model)
+        """The model with it."""
+        self.readings = question.readings
+        used = question.used
+        self.gain = float(np.sum((np.nan_to_num(trial.loglik, nan=-1e9) - null.loglik)[used]))
+        named = screened.candidate.start.named
+        self.directions = len(fields(screened.candidate.start)) if named else screened.directions
+
+    @property
+    def effect(self) -> AbstractEffect:
+        """The effect with its fitted parameters."""
+        return self.trial.model.effects[-1]
+
+    @lazy
+    def certainty(self) -> float:
+        """Standard deviations from none."""
+        return significance(self.screened.candidate, self.after, self.trial.hessian)
+
+    @lazy
+    def held_out(self) -> float:
+        """Gain on sequences left out [nat]."""
+        return held_out_gain(self.null, self.trial, self.question.data, self.question.used)
+
+    @lazy
+    def error(self) -> float:
+        """Squared open-loop error over that without it."""
+        return open_loop_error(self.null, self.trial, self.question.data, self.question.used)
+
+
+class Look(NamedTuple):
+    """The outcome."""
+
+    step: Step
+    screen: Screen
+    sound: list[Case]
+    """What may be believed, best first."""
+    tried: list[Case]
+
+
+def significance(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
+    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
+
+    Half its square is the log-likelihood that would be lost without the effect, to second order.
+    """
+    model, prior = now.model, now.m_step.prior
+    here = blocks(model, now.m_step)[place]
+    none = np.asarray(flat(candidate.start))
+    strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
+    std, cov = np.asarray(prior.std)[here], np.linalg.inv(np.asarray(hessian))
+    cut = cov.shape[0] - prior.size
+    cov = (cov[cut:, cut:][here, here] * np.outer(std, std))[np.ix_(strong, strong)]
+    away = (np.asarray(flat(model.effects[place])) - none)[strong]
+    return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
+
+
+def trimmed(gain) -> float:
+    """Sum of gains with a sixth at either end replaced by the mean of the others."""
+    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
+    cut = gain.size // 6
+    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+
+
+def held_out_gain(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) -> float:
+    """Gain on sequences after a fit to others, halves or quarters in turn; a sixth at either end is trimmed.
+
+    A track that is lost in one of the two fits says nothing of the effect, and would say it loudest.  The noise stays
+    that of the whole fit: a few sequences can be followed more closely than they deserve.  From one sequence nothing
+    can be held out, and the gain is 0.
+    """
+    index = np.flatnonzero(used)
+    if index.size < 2:
+        return 0.0
+    gains = []
+    folds = 2 if index.size >= 16 else min(4, index.size)
+    for fold in range(folds):
+        mask = used.copy()
+        mask[index[fold::folds]] = False
+        logliks = [
+            refit(t.model, t.m_step, t.path, data, mask, passes=passes, noise=False).loglik[used & ~mask]
+            for t in (null, full)
+        ]
+        gains.append(logliks[1] - logliks[0])
+    return trimmed(np.concatenate(gains))
+
+
+def _best_of_kind(screen: Screen, rule: AbstractRule, readings: int) -> list[tuple[float, Screened]]:
+    """The most promising member of every kind, best first."""
+    best: dict[Key, tuple[float, Screened]] = {}
+    for screened in screen.screened:
+        if not seeded(screened.candidate, screened.coefficients).possible():
+            continue
+        promise, key = rule.promise(screened, readings), key_of(screened.candidate.start)
+        if key not in best or best[key][0] < promise:
+            best[key] = (promise, screened)
+    return sorted(best.values(), key=lambda entry: -entry[0])
+
+
+def _shortlist(
+    ranked: Sequence[tuple[float, Screened]], model: StateSpaceModel, worthy: Callable[[float], bool], effort: Effort
+) -> list[Screened]:
+    """The few to be refitted: the best, and a law without a name only where it promises more than any with one."""
+    present = {key_of(effect) for effect in model.effects}
+    law = lambda entry: entry[1].candidate.start  # noqa: E731
+    worth = [entry for entry in ranked if worthy(entry[0])]
+    other = [entry for entry in worth if replaced(law(entry), model) is not None]
+    fresh = other + [entry for entry in worth if key_of(law(entry)) not in present]
+    fresh = [entry for entry in fresh if not covered(law(entry), model)]
+    named = [entry for entry in fresh if law(entry).named]
+    top = named[0][0] if named else 0.0
+    unnamed = [entry for entry in fresh if not law(entry).named and entry[0] > top][:2]
+    beside = other + [e for e in fresh if rest_of(law(e), model) is not None and not any(e is o for o in other)]
+    unnamed = (beside + [entry for entry in unnamed if not any(entry is b for b in beside)])[:2]
+    close = [entry for entry in named if entry[0] > effort.close * top]
+    return [screened for _, screened in unnamed + close[: effort.shortlist - len(unnamed)]]
+
+
+def _more_starts(chosen: Sequence[Screened], screen: Screen, effort: Effort) -> list[Screened]:
+    """The next best places to start from of laws that are not linear: the score test says less of them."""
+    more = []
+    for best in chosen:
+        if best.candidate.start.linear:
+            continue
+        key, seen = key_of(best.candidate.start), {best.gain}
+        own = [s for s in screen.screened if key_of(s.candidate.start) == key]
+        for other in sorted(own, key=lambda s: -s.gain):
+            if len(seen) < effort.starts and other.gain not in seen and other.gain > 0.3 * best.gain:
+                seen.add(other.gain)
+                more.append(other)
+    return more
+
+
+def _try(question: Question, screened: Screened, null: Trial, rule: AbstractRule, effort: Effort) -> Case:
+    """A candidate in the model, refitted."""
+    effect, now = seeded(screened.candidate, screened.coefficients), question.now
+    place = replaced(effect, now.model)
+    full = (now if place is None else now.without(place)).plus(effect, screened.candidate)
+    path = extended(full.model, question.path, question.data)
+    return Case(screened, _refitted(full, path, question, rule, effort), null, full, question)
+
+
+def _refitted(now: Hypothesis, path: Gaussian, question: Question, rule: AbstractRule, effort: Effort) -> Trial:
+    """Some passes from a path; where the rule looks at multi-step errors, these are fitted before and after."""
+    fit = functools.partial(finish, data=question.data, used=question.used)
+    model = fit(now.model, now.m_step, path) if rule.multistep else now.model
+    trial = refit(model, now.m_step.early(), path, question.data, question.used, passes=effort.passes)
+    return trial._replace(model=fit(trial.model, trial.m_step, trial.path)) if rule.multistep else trial
+
+
+def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) -> Look:
+    """One look: everything screened, the best few refitted; those that hold, best first."""
+    now, data, readings = question.now, question.data, question.readings
+    around = surroundings(rig, now.model, data, question.path, question.rows)
+    candidates = proposals(around)
+    screen = rule.screen(question, candidates)
+    ranked = _best_of_kind(screen, rule, readings)
+    worthy = functools.partial(rule.worth_a_refit, readings=readings)
+    entries = _shortlist(ranked, now.model, worthy, effort)
+    length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    seen = tuple((key_of(s.candidate.start), promise) for promise, s in ranked)
+    step = Step(length, seen, (), None, len(candidates), rule.promises)
+    if not entries:
+        return Look(step, screen, [], [])
+    null = _refitted(now, question.path, question, rule, effort)
+    if data.t.shape[1] < question.rows:  # over a long horizon a start that is far off loses every track
+        entries += _more_starts(entries, screen, effort)
+    best: dict[Key, Case] = {}
+    for screened in entries:
+        case = _try(question, screened, null, rule, effort)
+        key = key_of(case.effect)
+        values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
+        promise = rule.promise(screened, readings)
+        say(f"  tried {words(key)} {values}: promises {promise:.3g}, refit {case.gain:.0f} nat")
+        if key not in best or rule.worth(best[key]) < rule.worth(case):
+            best[key] = case
+    tried = sorted(best.values(), key=lambda case: -rule.worth(case))
+    sound = []
+    for case in tried:
+        verdict = rule.sound(case)
+        if case.effect.possible() and verdict.believed:
+            sound.append(case)
+        else:
+            reason = verdict.reason if case.effect.possible() else "has values that make no sense"
+            say(f"  {words(key_of(case.effect))} {reason}")
+    step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in tried))
+    return Look(step, screen, _named_first(sound, rule), tried)
+
+
+def _named_first(sound: list[Case], rule: AbstractRule) -> list[Case]:
+    """Only those with a name where the best of them is nearly as good as the best."""
+    named = [case for case in sound if case.effect.named]
+    near = named and rule.worth(named[0]) > rule.near * rule.worth(sound[0])
+    return named if near else sound
+
+
+def alike(case: Case, screen: Screen) -> list[tuple[Key, float]]:
+    """Named effects of other kinds, and the share of what the data say of `case` that each could not say [0 to 1]."""
+    candidates = [s.candidate for s in screen.screened]
+    own = key_of(case.screened.candidate.start)
+    told = zip(candidates, unlike(screen.projected, candidates, case.screened.candidate), strict=True)
+    return [(key_of(c.start), part) for c, part in told if c.start.named and key_of(c.start) != own]

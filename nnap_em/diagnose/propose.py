@@ -1,0 +1,84 @@
+"""What is tried: every effect of the catalogue that this machine could have, and where its fit starts."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..data.dataset import Dataset
+from ..data.rig import Rig
+from ..effects import AbstractEffect, Around, Candidate, catalogue
+from ..em.build import measure_scales
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.ode import integrate
+
+
+def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int) -> Around:
+    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`."""
+    scales = measure_scales(rig, model.system, data)
+    dof = len(model.system.coordinates)
+    valid = np.asarray(data.valid)
+    mean = np.asarray(path.mean)[valid & np.isfinite(np.asarray(path.mean)).all(-1)]
+    low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
+    y = np.asarray(data.y)
+    clock = np.asarray(data.t)[valid]
+    speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
+    ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
+    fast, slow, back, fast_back = np.asarray(jax.vmap(model.unknown)(ends))
+    # what rises between .4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
+    viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
+    return Around(
+        model.system,
+        scales.torque,
+        speed,
+        viscous,
+        low,
+        high,
+        np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),
+        rig.measured,
+        np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
+        rig.dt,
+        (float(clock.min()), float(clock.max())),
+        float(clock.max()) + rig.dt * (rows - int(valid.sum(axis=1).max())),
+        rig.clock == "session",
+        rig.friction,
+        rig.input_columns,
+    )
+
+
+def proposals(around: Around) -> list[Candidate]:
+    """Everything in the catalogue that this machine could have."""
+    return [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
+
+
+def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> AbstractEffect:
+    """The effect where the score test puts it; where it is not linear, a probe itself."""
+    if not candidate.start.linear:
+        return candidate.probes[0]
+
+    def combine(start, *probes):
+        return start + sum(float(c) * (p - start) for c, p in zip(coefficients, probes, strict=True))
+
+    return jax.tree.map(combine, candidate.start, *candidate.probes)
+
+
+@eqx.filter_jit
+def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
+    """`path` of the model without its last effect, with the memory that this effect would have along it."""
+    size, width = model.effects[-1].memory, path.mean.shape[-1]
+    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
+
+    def one(mean, cov, seq):
+        def step(m, slices):
+            x, u = slices
+            rest = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
+            return integrate(rest, m, model.dt, model.steps), m
+
+        _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
+        wide = jnp.zeros((mean.shape[0], width + size, width + size), cov.dtype)
+        wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
+        return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
+
+    return jax.vmap(one)(path.mean, path.cov, data) if size else path

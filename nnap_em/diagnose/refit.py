@@ -1,0 +1,88 @@
+"""Quick refits of a fitted model with something added, from its smoothed path on.
+
+Each pass linearises the model about the path, smooths, and takes one M-step.  Only the linearisation knows the
+structure of the model; the rest is one compiled program for all of them, so that a new effect costs seconds.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..data.dataset import Dataset
+from ..em.local import locals_along
+from ..em.mstep import Core, ScoringMStep
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.gaussian import linear_posterior
+from ..smoother.kalman import CUBATURE, kalman_filter, rts
+from ..smoother.posterior import Posterior
+from ..storage.journal import HERE, step
+
+
+class Trial(NamedTuple):
+    """A model after some passes."""
+
+    model: StateSpaceModel
+    m_step: ScoringMStep
+    path: Gaussian
+    loglik: Float[np.ndarray, " seq"]
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of network weights and parameters."""
+
+
+def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
+    """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
+    (log_q, log_r, start), (here, path) = common, one
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    posterior = linear_posterior(filtered, rts(filtered))
+    nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
+    read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
+    known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(posterior.state.mean))
+    return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
+
+
+@step(lambda model, m_step, path, *_, **__: Trial(model, m_step, path, HERE, HERE))
+def refit(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    *,
+    passes: int = 5,
+    noise: bool = True,
+) -> Trial:
+    """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
+
+    Without `noise` the process and reading noise stay as they are.
+    """
+    rule = eqx.tree_at(lambda r: r.stride, m_step, m_step.stride if noise else jnp.zeros_like(m_step.stride))
+    core = rule.core(model)
+
+    def program(core: Core, path: Gaussian):
+        here = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
+        posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (here, path))
+        following, hessian, _ = rule.advance(core, here, posterior, read, jnp.asarray(used))
+        return following, steady, posterior.loglik, hessian
+
+    best, stride, here, goal = None, 1.0, core, core
+    for _ in range(passes):
+        proposal, smoothed, loglik, hessian = program(core, path)
+        total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
+        if best is None or total >= best[0] - 0.5:
+            if best is None or total > best[0]:
+                best = (total, core, np.asarray(loglik), hessian, smoothed)
+            goal, here, stride = proposal, core, min(1.0, 2 * stride)
+            path = smoothed
+        else:
+            stride, path = stride / 3, best[4]
+        way = lambda a, b, s=stride: a + s * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
+        core = jax.tree.map(way, here, goal)
+    assert best is not None
+    _, core, loglik, hessian, path = best
+    return Trial(rule.whole(model, core), m_step, path, loglik, hessian)

@@ -1,0 +1,347 @@
+"""What a fitted model leaves unexplained: innovations, the generalised force it lacks, and tests of both.
+
+Innovations of a right model are white, normal, of variance 1, and have nothing to do with inputs, states or time.
+[Sarkka & Svensson 2023, "Bayesian Filtering and Smoothing", 2nd ed.; Bar-Shalom, Li & Kirubarajan 2001, "Estimation
+with Applications to Tracking and Navigation", section 5.4]
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Array, Bool, Float
+
+from ..data.dataset import Dataset
+from ..em.identify import Identified
+from ..em.mstep import kept
+from ..em.predict import smooth
+from ..model import hooks
+from ..model.base import prepare
+from ..model.state_space import with_effects
+from ..numerics.parallel import each
+from ..smoother.kalman import CUBATURE, relinearised
+from ..systems.base import force_unit, state_unit
+
+LAGS = 20
+"""Samples over which innovations are tested for whiteness."""
+LEVEL = 0.05
+"""Corrected p-value below which a test counts as failed."""
+SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
+"""Sizes below which a failed test is called small."""
+WHITE = 0.25
+"""Largest autocorrelation of the innovations of a model whose noise is what it says; .4 to .5 on real machines."""
+_GROUPS, _GROUP = 20, 50
+"""Groups at least, readings in a group at least where these are enough."""
+
+
+class Names(NamedTuple):
+    """What the columns of a `Residual` are called."""
+
+    coordinates: tuple[str, ...]
+    rates: tuple[str, ...]
+    rotary: tuple[bool, ...]
+    """True where a coordinate is an angle [rad]; False: a position [m]."""
+    inputs: tuple[str, ...]
+    joints: tuple[int, ...]
+    """Joint (counted from 1) that each input drives."""
+    measured: tuple[str, ...]
+
+    def unit(self, name: str) -> str:
+        """SI unit of a state, an input or `time`."""
+        if name == "time":
+            return "s"
+        if name in self.inputs:
+            return self.force_unit(self.joints[self.inputs.index(name)] - 1)
+        place = (self.coordinates + self.rates).index(name)
+        dof = len(self.coordinates)
+        return state_unit(self.rotary[place % dof], rate=place >= dof)
+
+    def force_unit(self, joint: int) -> str:
+        """Unit of the generalised force at a joint, counted from 0."""
+        return force_unit(self.rotary[joint])
+
+
+class Residual(NamedTuple):
+    """What is left over of every sequence, in the coordinates that `Names` names."""
+
+    innovation: Float[np.ndarray, "seq time obs"]
+    """Reading minus its one-step prediction, over the standard deviation of that; NaN where not measured."""
+    force: Float[np.ndarray, "seq time dof"]
+    """Generalised force that the model lacks between a row and the next [N m, or N]; NaN behind the last row."""
+    force_std: Float[np.ndarray, "seq time dof"]
+    """Standard deviation of it given all readings."""
+    state: Float[np.ndarray, "seq time state"]
+    """Smoothed coordinates and rates."""
+    predicted: Float[np.ndarray, "seq time state"]
+    """Coordinates and rates predicted from the rows before: what an innovation must not depend on."""
+    u: Float[np.ndarray, "seq time input"]
+    """What reaches the joints of the inputs, with the effects of the model [N m, or N]."""
+    t: Float[np.ndarray, "seq time"]
+    """[s]"""
+    valid: Bool[np.ndarray, "seq time"]
+    used: Bool[np.ndarray, " seq"]
+    """False where the track was lost; such a sequence takes part in no test and no figure."""
+
+
+class Test(NamedTuple):
+    """One test of the innovations of one channel."""
+
+    name: str
+    channel: str
+    statistic: float
+    p_value: float
+    """Corrected for the number of tests [Holm 1979]."""
+    size: float
+    """How far from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
+    deviation minus 1; mean over standard deviation; correlation."""
+    meaning: str
+    """One sentence."""
+    slight: bool
+    """True where it failed by a size too small to matter."""
+
+
+def names_of(fitted: Identified) -> Names:
+    """Names of the columns of `residual(fitted, ...)`."""
+    system, rig = fitted.model.system, fitted.rig
+    return Names(
+        system.coordinates, system.rates, tuple(system.angles), rig.input_columns, tuple(system.joints), rig.measured
+    )
+
+
+def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
+    """The fields of a `Residual` that come from smoothing, of one sequence."""
+    (model, add_back), (seq, posterior) = common, one
+    dof, plain, prepared = len(model.system.coordinates), with_effects(model, ()), prepare(model, seq)
+    filtered = relinearised(model, posterior.state, prepared, CUBATURE)
+
+    def force(x, kick, u, command):
+        system, change = hooks.machine(model.effects, model.system, u.time), kick[:, dof : 2 * dof]
+        if add_back:  # what the effects do to the rates over one sample
+            system = model.system
+            given = model.transition(x, u)[: 2 * dof] - plain.transition(x[: 2 * dof], command)
+            change = change + given[dof:][None]
+        nodes = change @ system.mass(x[:dof]).T / model.dt
+        return jnp.mean(nodes, axis=0), jnp.std(nodes, axis=0)
+
+    steps = jax.tree.map(lambda a: a[:-1], (posterior.state.mean, prepared.inputs, plain.inputs(seq)))
+    mean, std = jax.vmap(force)(steps[0], posterior.kick, *steps[1:])
+    last = jnp.full((1, dof), jnp.nan, mean.dtype)
+    mean, std = (jnp.concatenate([jnp.where(seq.valid[1:, None], a, jnp.nan), last]) for a in (mean, std))
+    innovation = jnp.where(prepared.observed, filtered.innovation, jnp.nan)
+    state, predicted = (g.mean[:, : 2 * dof] for g in (posterior.state, filtered.predicted))
+    return innovation, mean, std, state, predicted, prepared.inputs.u
+
+
+def residual(fitted: Identified, data: Dataset, *, add_back: bool = False) -> Residual:
+    """Innovations, and the generalised force that the model lacks, by the smoother of the fit.
+
+        r_k = M(q_k) (v_{k+1} - v(x_k, u_k)) / dt,  its mean and standard deviation given all readings [N m, or N]
+
+    v(x, u) is the model's own rate one sample later.  The smoother draws r towards 0 as far as the process noise is
+    small: a slow force comes out whole, single kicks do not.  Innovations are those of the Kalman filter of the model
+    linearised about the smoothed distribution by cubature, whichever smoother gave that.
+
+    With `add_back`, v(x, u) is the rate without the effects of the model, on the paths that it finds with them: the
+    force of the effects and what is left beside it, the component-plus-residual of a regression.  Paths of a model
+    that lacks much are wrong themselves; these show what it lacked.  [Larsen & McCleary 1972, Technometrics 14, 781]
+    """
+    data = Dataset(*map(jnp.asarray, data))
+    posterior = smooth(fitted, data)
+    outcome = each(_left, (fitted.model, add_back), (data, posterior))
+    innovation, force, std, state, predicted, u = map(np.asarray, outcome)
+    t, valid = np.asarray(data.t), np.asarray(data.valid)
+    used = np.asarray(kept(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
+    return Residual(innovation, force, std, state, predicted, u, t, valid, used)
+
+
+# --- tests
+
+
+def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
+    """p-values corrected for their number: the chance that any test of all true hypotheses fails [Holm 1979]."""
+    values = np.asarray(p, float)
+    order = np.argsort(values)
+    steps = np.maximum.accumulate((values.size - np.arange(values.size)) * values[order])
+    out = np.empty_like(values)
+    out[order] = np.minimum(steps, 1.0)
+    return out
+
+
+def whiteness(e: Float[np.ndarray, "seq time"], lags: int = LAGS) -> tuple[float, float, float]:
+    """Ljung & Box's portmanteau test over all sequences together: statistic, p-value, largest autocorrelation.
+
+        Q = (N + 2) / N sum_l N_l r_l^2 ~ chi^2_lags,  N_l pairs of readings l samples apart
+
+    NaN is not measured.  [Ljung & Box 1978; Box, Jenkins, Reinsel & Ljung 2015, "Time Series Analysis", section 8.2]
+    """
+    r, pairs = autocorrelation(e, lags)
+    count = int(np.isfinite(e).sum())
+    known = pairs[1:] > 0
+    statistic = float((count + 2) / count * np.sum((pairs[1:] * r[1:] ** 2)[known]))
+    largest = r[1:][known][np.argmax(np.abs(r[1:][known]))] if known.any() else 0.0
+    return statistic, float(scipy.stats.chi2.sf(statistic, max(1, int(known.sum())))), float(largest)
+
+
+def white_innovations(fitted: Identified, data: Dataset) -> bool:
+    """Whether one-step errors of every reading hardly remember each other."""
+    left = residual(fitted, data)
+    e = left.innovation[left.used]
+    sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
+    return bool(sizes) and max(map(abs, sizes)) < WHITE
+
+
+def autocorrelation(
+    e: Float[np.ndarray, "seq time"], lags: int
+) -> tuple[Float[np.ndarray, " lag"], Float[np.ndarray, " lag"]]:
+    """Autocorrelation at lags 0 to `lags` samples over all sequences, and the number of pairs behind each."""
+    centred = e - np.nanmean(e)
+    seen = np.isfinite(centred)
+    filled = np.where(seen, centred, 0.0)
+    rows = e.shape[1]
+    spans = range(min(lags, rows - 1) + 1)
+    pairs = np.asarray([np.sum(seen[:, : rows - k] & seen[:, k:]) for k in spans], float)
+    sums = np.asarray([np.sum(filled[:, : rows - k] * filled[:, k:]) for k in spans])
+    return sums / np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs
+
+
+def normality(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
+    """Jarque & Bera's test: statistic, p-value, excess kurtosis (0 if normal, above 0 with outliers).
+
+    JB = N (skewness^2 / 6 + kurtosis^2 / 24) ~ chi^2_2      [Jarque & Bera 1987]
+    """
+    x = e[np.isfinite(e)]
+    z = (x - x.mean()) / x.std()
+    skewness, kurtosis = np.mean(z**3), np.mean(z**4) - 3.0
+    statistic = float(x.size * (skewness**2 / 6 + kurtosis**2 / 24))
+    return statistic, float(scipy.stats.chi2.sf(statistic, 2)), float(kurtosis)
+
+
+def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
+    """Normalised innovation squared: its mean (1 if the stated uncertainty is right), p-value, std minus 1.
+
+    N times the mean is chi^2_N.  [Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2]
+    """
+    x = e[np.isfinite(e)]
+    mean = float(np.mean(x**2))
+    tails = scipy.stats.chi2.sf(x.size * mean, x.size), scipy.stats.chi2.cdf(x.size * mean, x.size)
+    return mean, min(1.0, 2 * float(min(tails))), math.sqrt(mean) - 1.0
+
+
+def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
+    """Correlation of innovations with a cause known before them: Student's t, p-value, correlation.
+
+    The sums of their product over sequences, cut in parts of some 50 readings, are of mean 0, as good as independent,
+    and of unlike variance; the t-test of them is conservative then, and holds where errors follow each other over
+    some samples.  [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453]
+    """
+    seen = np.isfinite(e) & np.isfinite(cause)
+    x, g = (np.where(seen, a - np.mean(a, where=seen), 0.0) for a in (e, cause))
+    scale = math.sqrt(np.sum(x**2) * np.sum(g**2))
+    if not scale > 1e-9 * math.sqrt(seen.sum()) * max(1e-300, float(np.max(np.abs(cause), where=seen, initial=0))):
+        return 0.0, 1.0, 0.0  # a cause that never changes
+    t, p = _t_test(_group_sums(x * g, seen))
+    return t, p, float(np.sum(x * g) / scale)
+
+
+def bias(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
+    """Mean of innovations: Student's t over groups as in `dependence`, p-value, mean over standard deviation."""
+    seen = np.isfinite(e)
+    t, p = _t_test(_group_sums(np.where(seen, e, 0.0), seen))
+    return t, p, float(np.nanmean(e) / np.nanstd(e))
+
+
+def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "seq time"]):
+    """Sums over groups of about equally many readings: parts of sequences."""
+    active = seen.any(1)
+    values, seen = values[active], seen[active]
+    parts = max(1, -(-_GROUPS // max(len(values), 1)), int(np.median(seen.sum(1)) // _GROUP) if len(seen) else 1)
+    sums = []
+    for row, known in zip(values, seen, strict=True):
+        sums += [piece.sum() for piece in np.array_split(row[known], parts) if piece.size]
+    return np.asarray(sums)
+
+
+def _t_test(sums: Float[np.ndarray, " group"]) -> tuple[float, float]:
+    if sums.size < 3 or not np.std(sums) > 0:
+        return 0.0, 1.0
+    t = float(np.mean(sums) / np.std(sums, ddof=1) * math.sqrt(sums.size))
+    return t, 2 * float(scipy.stats.t.sf(abs(t), sums.size - 1))
+
+
+def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
+    """Name and value of all that an innovation of the same row must not depend on, as known one row before."""
+    for i, name in enumerate(names.inputs):
+        before = np.concatenate([np.full_like(found.u[:, :1, i], np.nan), found.u[:, :-1, i]], axis=1)
+        yield name, before
+    dof = len(names.coordinates)
+    for j, name in enumerate(names.coordinates):
+        q = found.predicted[..., j]
+        if names.rotary[j]:
+            yield f"sin({name})", np.sin(q)
+            yield f"cos({name})", np.cos(q)
+        else:
+            yield name, q
+    for j, name in enumerate(names.rates):
+        v = found.predicted[..., dof + j]
+        yield name, v
+        yield f"|{name}| {name}", np.abs(v) * v
+    yield "time", found.t
+
+
+def tests(found: Residual, names: Names) -> list[Test]:
+    """All tests of the innovations of every measured channel, over the sequences that were followed."""
+    found = found._replace(**{f: getattr(found, f)[found.used] for f in found._fields if f != "used"})
+    rows: list[tuple[str, str, tuple[float, float, float]]] = []
+    for i, channel in enumerate(names.measured):
+        e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))
+        if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
+            continue
+        rows += [("whiteness", channel, whiteness(e)), ("normality", channel, normality(e))]
+        rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
+        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(found, names)]
+    corrected = holm([p for _, _, (_, p, _) in rows])
+    out = []
+    for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
+        slight = bool(p < LEVEL and abs(size) < SLIGHT[name.split()[0]])
+        out.append(
+            Test(
+                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < LEVEL), size, slight), slight
+            )
+        )
+    return out
+
+
+def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> str:
+    kind = name.split()[0]
+    if kind == "correlation":
+        cause = name.removeprefix("correlation with ")
+        passed = f"Errors in {channel} show no link with {cause}."
+        failed = f"Errors in {channel} change with {cause} (correlation {size:.2g})."
+    else:
+        passed, failed = {
+            "whiteness": (
+                f"One error in {channel} says nothing about the next.",
+                f"Errors in {channel} follow each other (correlation up to {size:.2g}): something acts that lasts.",
+            ),
+            "normality": (
+                f"Errors in {channel} are bell-shaped.",
+                f"Errors in {channel} have {'more' if size > 0 else 'fewer'} outliers than a bell curve, or lean to a "
+                f"side (excess kurtosis {size:.2g}).",
+            ),
+            "spread": (
+                f"Errors in {channel} are as large as the model expects.",
+                f"Errors in {channel} are {abs(size):.1%} {'larger' if size > 0 else 'smaller'} than the model "
+                "expects.",
+            ),
+            "mean": (
+                f"Errors in {channel} average to zero.",
+                f"Errors in {channel} lean to one side (by {size:.2g} standard deviations).",
+            ),
+        }[kind]
+    if not bad:
+        return passed
+    return failed[:-1] + "; certain, but small." if slight else failed

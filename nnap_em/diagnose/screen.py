@@ -1,0 +1,267 @@
+"""Score test of everything that the fitted model may lack, all candidates in one pass.
+
+Every candidate is a column: how the whitened readings would move if it were there.  Friction maps, uncertain
+parameters and effects already in the model are projected out, so that only what they cannot explain counts
+[Rao 1948, Proc. Camb. Phil. Soc. 44; the columns by the sensitivity equations of the Kalman filter].
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..data.dataset import Dataset
+from ..effects import AbstractEffect, Candidate, Scene
+from ..em.local import locals_along
+from ..em.multistep import Columns
+from ..em.quadratic import friction_columns, whitened_sensitivities
+from ..em.weights import Weights
+from ..model import hooks
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.ode import integrate
+from ..numerics.parallel import each
+from ..smoother.kalman import CUBATURE, kalman_filter
+from ..storage.journal import HERE, step
+from .evidence import Projected, Question, Screen, Screened
+
+
+class Track(NamedTuple):
+    """What candidates see of a fitted model along the smoothed path of a sequence, whatever its structure."""
+
+    x: Float[Array, "*time state"]
+    """(q, v) in every row."""
+    middle: Float[Array, "*time state"]
+    """State (q, v) in the middle of every step."""
+    acceleration: Float[Array, "*time dof"]
+    """In the middle of every step [rad/s^2]."""
+    rate: Float[Array, "*time state"]
+    """Time derivative of (q, v) in every row."""
+    inputs: Inputs
+    """What acts on the fitted model from outside."""
+
+
+class Sheet(NamedTuple):
+    """Score and information of nuisance and candidate columns, of every sequence."""
+
+    score: Float[np.ndarray, "seq column"]
+    information: Float[np.ndarray, "seq column column"]
+    nuisance: int
+    """Leading columns that are projected out."""
+    prior: Float[np.ndarray, "nuisance nuisance"]
+    """Prior precision of the nuisance."""
+
+
+def tracks(null: StateSpaceModel, path: Gaussian, inputs: Inputs) -> Track:
+    """The smoothed motion of all sequences."""
+    return each(_track, null, (path.mean, inputs))
+
+
+def _track(null: StateSpaceModel, one) -> Track:
+    mean, inputs = one
+    dof = len(null.system.coordinates)
+    still = jnp.zeros(dof, mean.dtype)
+    rate = jax.vmap(lambda x, u: null.rate(x, u, still))
+    now = rate(mean, inputs)
+    middle = mean + 0.5 * null.dt * now
+    acceleration = rate(middle, inputs)[:, dof : 2 * dof]
+    past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
+    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, past, inputs)
+
+
+def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
+    """What `effect` adds, by its own hooks, to the machine `base` along a track."""
+    alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
+    x = track.x
+    drive = jax.vmap(system.drive)(hooks.reaching(alone, system, track.inputs.u, base.dt))
+    driven = scenes._replace(drive=drive)
+
+    def remember(m, scene):
+        return integrate(lambda m: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
+
+    memory = jnp.zeros((x.shape[0], effect.memory), x.dtype)
+    if effect.memory:
+        _, memory = jax.lax.scan(remember, memory[0], driven)
+
+    def one(scene, memory, acceleration):
+        return hooks.added(alone, _scene(base, scene), memory, acceleration)
+
+    force = jax.vmap(one)(driven, memory, track.acceleration) + drive - scenes.drive
+
+    def read(x, rate):
+        read = hooks.read(alone, system.coordinates + system.rates, x, lambda delay: x - delay * rate)
+        return jnp.stack([read[i] - x[i] for i in base.measured])
+
+    return Columns(force, jax.vmap(read)(x, track.rate))
+
+
+def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
+    """A scene whose numbers came through a batch."""
+    return numbers._replace(system=base.system, map=base.unknown)
+
+
+def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractEffect]]:
+    """Probes of one structure stacked, so that each structure is compiled once."""
+    places: dict = {}
+    for i, probe in enumerate(probes):
+        places.setdefault(jax.tree.structure(probe), []).append(i)
+
+    def stack(*leaves):  # by NumPy: a stack of many small arrays would be one program for every number of them
+        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+
+    return [(index, jax.tree.map(stack, *(probes[i] for i in index))) for index in places.values()]
+
+
+def _all_columns(common, track: Track) -> list[Columns]:
+    """Columns of all probes: the same program whatever the model has learned meanwhile."""
+    base, stacks = common
+    dof = len(base.system.coordinates)
+    q, v = track.middle[:, :dof], track.middle[:, dof:]
+    drive, friction = jax.vmap(base.system.drive)(track.inputs.u), jax.vmap(base.unknown)(v)
+    scenes = Scene(None, q, v, drive, track.inputs.time, friction, None)  # type: ignore[arg-type]
+    return [jax.vmap(lambda e: _columns(base, e, track, scenes))(stack) for stack in stacks]
+
+
+def _sheet(common, one) -> tuple[Float[Array, " column"], Float[Array, "column column"]]:
+    """Score and information of one sequence."""
+    (log_q, log_r, start, nodes), (here, middle, found) = common, one
+    dof, y = nodes.shape[0], here.seq.y
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
+    of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
+    states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
+    readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
+    states = jnp.where(here.seq.active[:, None, None], states, 0.0)
+    jac = whitened_sensitivities(filtered, states, readings, here.seq.observed).reshape(-1, states.shape[-1])
+    return jac.T @ filtered.innovation.ravel(), jac.T @ jac
+
+
+def sheet(
+    base: StateSpaceModel,
+    null: StateSpaceModel,
+    weights: Weights,
+    candidates: Sequence[Candidate],
+    path: Gaussian,
+    data: Dataset,
+    rows: int = 0,
+) -> Sheet:
+    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects."""
+    here = locals_along(null, weights.prior, path, data, CUBATURE)
+    track = tracks(null, path, here.seq.inputs)
+    base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
+    every = candidate_columns(base, candidates, track, rows)
+    common = (null.log_q, null.log_r, null.start, weights.nodes)
+    outcome = each(_sheet, common, (here, track.middle, every), together=1)  # a sequence fills the cache
+    score, information = (np.asarray(a) for a in outcome)
+    nuisance = weights.nodes.size + weights.prior.size
+    prior = np.asarray(weights.symmetry()) + _smooth_prior(weights)
+    return Sheet(score, information, nuisance, prior)
+
+
+def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], track: Track, rows: int = 0) -> Columns:
+    """What every probe of every candidate adds to `base` along the tracks of all sequences: seq column time ...
+
+    Tracks are padded to `rows`, so that horizons share the largest program.
+    """
+    groups, length = _groups([probe for candidate in candidates for probe in candidate.probes]), track.x.shape[1]
+    more = [(0, 0), (0, max(0, rows - length))]
+    longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
+    found = each(_all_columns, (base, [g for _, g in groups]), jax.tree.map(longer, track))
+    order = np.argsort([i for index, _ in groups for i in index])
+    return jax.tree.map(lambda *a: jnp.concatenate(a, axis=1)[:, order, :length], *found)
+
+
+def _smooth_prior(weights: Weights) -> np.ndarray:
+    """Prior precision of the nuisance: friction maps of a natural size and smoothness, parameters as declared."""
+    dof, count = weights.nodes.shape
+    size = 10 * np.asarray(weights.asymmetry)
+    bend = np.diff(np.eye(count), 2, axis=0)
+    blocks = [np.eye(count) / s**2 + bend.T @ bend / (0.3 * s) ** 2 for s in size]
+    out = np.eye(dof * count + weights.prior.size)
+    for j, block in enumerate(blocks):
+        out[j * count : (j + 1) * count, j * count : (j + 1) * count] = block
+    return out
+
+
+def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
+    """Sum over sequences with weight `used`, and project; what a lost sequence says does not count, not even as NaN."""
+    known = np.asarray(used) > 0
+    known = known & np.isfinite(sheet.score).all(axis=1) & np.isfinite(sheet.information).all(axis=(1, 2))
+    score = np.einsum("s,sc->c", used[known], sheet.score[known])
+    information = np.zeros(sheet.information.shape[1:])
+    for s in np.flatnonzero(known):  # one by one: the whole is large
+        information += used[s] * sheet.information[s]
+    n = sheet.nuisance
+    factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
+    half = np.linalg.solve(factor, information[:n, n:])
+    left = np.linalg.solve(factor, score[:n])
+    return Projected(score[n:] - half.T @ left, information[n:, n:] - half.T @ half)
+
+
+@step(lambda *_: Projected(HERE, HERE))
+def screen(
+    base: StateSpaceModel,
+    null: StateSpaceModel,
+    weights: Weights,
+    candidates: Sequence[Candidate],
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    rows: int,
+) -> Projected:
+    """The sheet of all candidates, projected: what the sequences `used` say of them."""
+    return project(sheet(base, null, weights, candidates, path, data, rows), np.asarray(used, float))
+
+
+def score_test(question: Question, candidates: Sequence[Candidate]) -> Screen:
+    """The expected gain of every candidate over the model as it stands."""
+    now = question.now
+    weights = now.m_step.weights(now.model)
+    asked = (candidates, question.path, question.data, question.used, question.rows)
+    projected = screen(question.bare.model, now.model, weights, *asked)
+    return Screen(tuple(judge(projected, candidates)), projected)
+
+
+def unlike(projected: Projected, candidates: Sequence[Candidate], chosen: Candidate) -> list[float]:
+    """Share of what the data say of `chosen` that each candidate could not say in its place; 0: the same model."""
+    sizes = np.cumsum([0, *(len(c.probes) for c in candidates)])
+    spans = [np.arange(a, b) for a, b in itertools.pairwise(sizes)]
+    own = spans[next(i for i, c in enumerate(candidates) if c is chosen)]
+    whole = projected.information[np.ix_(own, own)]
+    out = []
+    for span in spans:
+        block = projected.information[np.ix_(span, span)]
+        cross = projected.information[np.ix_(own, span)]
+        left = whole - cross @ np.linalg.pinv(block, rcond=1e-9, hermitian=True) @ cross.T
+        out.append(float(np.clip(np.trace(left) / max(np.trace(whole), 1e-300), 0.0, 1.0)))
+    return out
+
+
+def judge(projected: Projected, candidates: Sequence[Candidate]) -> list[Screened]:
+    """The score test of every candidate.
+
+    Raises FloatingPointError for a gain that is no number.
+    """
+    out, place = [], 0
+    for candidate in candidates:
+        here = slice(place, place + len(candidate.probes))
+        place = here.stop
+        block = projected.information[here, here]
+        if not np.isfinite(block).all() or not np.isfinite(projected.score[here]).all():
+            raise FloatingPointError(
+                f"{candidate.start.name}: its effect on the readings is no number; is a column of the logs constant?"
+            )
+        values, vectors = np.linalg.eigh(block)
+        # a unit of a probe is a typical strength: what a few of them would not show is not seen
+        seen = values > max(1e-6 * values[-1], 1e-3)
+        along = vectors[:, seen].T @ projected.score[here]
+        weight = values[seen] + 0.01
+        gain = float(0.5 * np.sum(along**2 / weight))
+        out.append(Screened(candidate, vectors[:, seen] @ (along / weight), int(seen.sum()), gain, None))
+    return out

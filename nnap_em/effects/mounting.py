@@ -1,0 +1,64 @@
+"""The base that the machine stands on: not level, or shaking."""
+
+import math
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from .base import AbstractEffect, Scalar, a, one, pair
+
+
+class BaseTilt(AbstractEffect):
+    """Gravity acts on theta1 + angle."""
+
+    name: ClassVar[str] = "base_tilt"
+    confirm: ClassVar[str] = "Put a level on the base, and let the machine hang at rest: where does it read zero?"
+    units: ClassVar[dict[str, str]] = {"angle": "rad"}
+    angle: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        still = jnp.zeros(len(around.system.coordinates))
+        weighs = np.any(cls(a(0.1)).turned(around.system, still, still))
+        return [one(cls, 0.0, 0.03, 0.5)] if around.system.angles[0] and weighs else []
+
+    def turned(self, system, q, v):
+        """What the weight loses by the tilt [N m]."""
+        return system.bias(q, v) - system.bias(q.at[0].add(self.angle), v)
+
+    def force(self, scene, memory):
+        return self.turned(scene.system, scene.q, scene.v)
+
+
+GRID = 64
+"""The number of frequencies is a multiple of this, so that few programs serve all durations."""
+
+
+class BaseVibration(AbstractEffect):
+    """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
+
+    name: ClassVar[str] = "base_vibration"
+    confirm: ClassVar[str] = "Put an accelerometer on the base."
+    units: ClassVar[dict[str, str]] = {"amplitude": "m/s^2", "frequency": "Hz", "phase": "rad"}
+    sine: Scalar
+    cosine: Scalar
+    frequency: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        if around.system.shake(jnp.zeros(len(around.system.coordinates))) is None:
+            return []
+        span = around.duration[1] - around.duration[0]
+        count = GRID * math.ceil(min(8.0 * span / 0.4, 400) / GRID)
+        return [pair(cls.of, 0.1, 5.0, (8.0 / count * i, 0.3 / span)) for i in range(1, count + 1)]
+
+    def values(self):
+        amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
+        return {"amplitude": amplitude, "frequency": self.frequency, "phase": jnp.arctan2(self.cosine, self.sine)}
+
+    def force(self, scene, memory):
+        turn = 2 * jnp.pi * self.frequency * scene.time
+        shake = scene.system.shake(scene.q)
+        assert shake is not None
+        return shake * (self.sine * jnp.sin(turn) + self.cosine * jnp.cos(turn))

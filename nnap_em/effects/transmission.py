@@ -1,0 +1,104 @@
+"""What is soft or loose between a motor and its joint."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .base import Candidate, JointEffect, Scalar, contact
+
+
+class Transmission(JointEffect):
+    """A motor of small inertia that drives its joint through something soft or loose; u acts on the motor."""
+
+    memory: ClassVar[int] = 2
+    linear: ClassVar[bool] = False
+    log_inertia: eqx.AbstractVar[Scalar]
+    """Of the motor [log kg m^2]."""
+    log_damping: eqx.AbstractVar[Scalar]
+    """[log N m s/rad]"""
+
+    @abstractmethod
+    def torque(self, twist: Scalar, rate: Scalar) -> Scalar:
+        """On the joint, at a twist of motor minus joint [rad] and its rate [rad/s]."""
+
+    def memory_scale(self):
+        return jnp.asarray([0.05, 1.0])
+
+    def _torque(self, scene, memory):
+        twist, speed = memory
+        return self.torque(twist, speed - self.own(scene.v))
+
+    def force(self, scene, memory):
+        return self.at(scene, self._torque(scene, memory) - self.own(scene.drive))
+
+    def drift(self, scene, memory):
+        push = self.own(scene.drive) - self._torque(scene, memory)
+        return jnp.stack([memory[1] - self.own(scene.v), push * jnp.exp(-self.log_inertia)])
+
+
+MOTOR = 0.05
+"""A motor's inertia to begin with, over that of its joint."""
+
+
+class JointFlexibility(Transmission):
+    """An elastic transmission of stiffness k."""
+
+    name: ClassVar[str] = "joint_flexibility"
+    confirm: ClassVar[str] = "Block the link and twist the motor: the angle per torque."
+    units: ClassVar[dict[str, str]] = {"k": "N m/rad"}
+    substeps: ClassVar[int] = 5
+    log_k: Scalar
+    log_inertia: Scalar
+    log_damping: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j, size in around.driven:
+            inertia = MOTOR * around.inertia(j)
+            for k in (2.0, 6.0, 20.0):
+                stiff, soft = (
+                    cls.of(*np.log([s * size, inertia, 0.2 * np.sqrt(s * size * inertia)]), joint=j) for s in (1e3, k)
+                )
+                out.append(Candidate(stiff, (soft,), cls.of(1.0, 0.7, 1.0, joint=j)))
+        return out
+
+    def values(self):
+        return {"k": jnp.exp(self.log_k)}
+
+    def torque(self, twist, rate):
+        return jnp.exp(self.log_k) * twist + jnp.exp(self.log_damping) * rate
+
+
+class Backlash(Transmission):
+    """Play of width gap, with a stiff contact at either side."""
+
+    name: ClassVar[str] = "backlash"
+    confirm: ClassVar[str] = "Block the motor and wiggle the link."
+    units: ClassVar[dict[str, str]] = {"gap": "rad"}
+    substeps: ClassVar[int] = 10
+    gap: Scalar
+    log_inertia: Scalar
+    log_damping: Scalar
+    log_k: Scalar
+    """Contact stiffness [log N m/rad]."""
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for j, size in around.driven:
+            inertia, k = MOTOR * around.inertia(j), 50 * size
+            rest = np.log([inertia, 0.5 * np.sqrt(k * inertia), k])
+            none, *loose = (cls.of(gap, *rest, joint=j) for gap in (0.0, 0.03, 0.1, 0.25))
+            out += [Candidate(none, (play,), cls.of(0.1, 0.7, 1.0, 0.7, joint=j)) for play in loose]
+        return out
+
+    def possible(self):
+        return float(self.gap) > 0
+
+    def torque(self, twist, rate):
+        half = 0.5 * jnp.maximum(self.gap, 0.0)
+        return contact(twist - jnp.clip(twist, -half, half), rate, jnp.exp(self.log_k), jnp.exp(self.log_damping), 1e-3)

@@ -1,0 +1,179 @@
+"""From what the owner declares and the logs to the model that EM starts from; every scale comes from one of the two."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..data.rig import Rig, RigError
+from ..model.friction import FrictionNetwork, NoFriction
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..smoother.start import StartBank
+from ..systems import AbstractSystem, systems
+from .mstep import ScoringMStep
+from .prior import ParameterPrior
+
+NO_MACHINE = "the declared masses and inertias make no machine"
+
+
+class Scales(NamedTuple):
+    """Sizes of motion and torque, per joint, read off the logs and the declared physics."""
+
+    speed: Float[np.ndarray, " dof"]
+    """Largest velocity [rad/s]."""
+    acceleration: Float[np.ndarray, " dof"]
+    """Typical acceleration [rad/s^2]."""
+    torque: Float[np.ndarray, " dof"]
+    """Typical torque of gravity and drive [N m]."""
+
+
+class Problem(NamedTuple):
+    """What EM needs: the first model, how its parts are estimated, and the hypotheses of its start."""
+
+    model: StateSpaceModel
+    mstep: ScoringMStep
+    bank: StartBank
+
+
+def build_system(rig: Rig, dtype=float) -> AbstractSystem:
+    """The declared physics, at the mean of what is uncertain.
+
+    Raises RigError where its mass matrix is not positive definite.
+    """
+    kind = systems[rig.system]
+    names = [f.name for f in dataclasses.fields(kind) if f.name != "joints"]
+    values = {n: rig.parameters[n].mean if n in rig.parameters else kind.optional[n] for n in names}
+    system = kind(**{n: jnp.asarray(v, dtype) for n, v in values.items()}, joints=rig.input_joints)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(kind.coordinates)))
+    if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, dtype)))).min() <= 0:
+        raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
+    return system
+
+
+def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
+    for _ in range(order):
+        signal = signal[:, lag:] - signal[:, :-lag]
+    return signal[np.isfinite(signal)]
+
+
+def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
+    """Standard deviation of white noise on a smooth signal, from its third differences (var = 20 sigma^2).
+
+    [Gasser, Sroka & Jennen-Steinmetz 1986, Biometrika 73(3), for the idea] The median makes it blind to jumps.
+    """
+    d = _differences(signal, 3, 1)
+    return float(np.median(np.abs(d)) / 0.6745 / np.sqrt(20.0)) if d.size else 0.0
+
+
+def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset, lag: int = 5) -> Scales:
+    """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy."""
+    dof = len(system.coordinates)
+    y, u = np.asarray(data.y), np.asarray(data.u)
+    speed, acceleration = np.full(dof, np.nan), np.full(dof, np.nan)
+    for joint in range(dof):
+        position, rate = system.coordinates[joint], system.rates[joint]
+        if rate in rig.measured:
+            signal = y[..., rig.measured.index(rate)]
+            v, a = signal[np.isfinite(signal)], _differences(signal, 1, lag) / (lag * rig.dt)
+        elif position in rig.measured:
+            signal = y[..., rig.measured.index(position)]
+            v = _differences(signal, 1, lag) / (lag * rig.dt)
+            a = _differences(signal, 2, lag) / (lag * rig.dt) ** 2
+        else:
+            continue
+        speed[joint] = np.max(np.abs(v), initial=0.0)
+        acceleration[joint] = np.sqrt(np.mean(a**2)) if a.size else 0.0
+    mass = np.diag(np.asarray(system.mass(jnp.zeros(dof, system.mass(jnp.zeros(dof)).dtype))))
+    for scale in (speed, acceleration):
+        energy = np.nanmean(scale**2 * mass) if np.any(np.isfinite(scale)) else 1.0
+        scale[np.isnan(scale)] = np.sqrt(energy / mass[np.isnan(scale)])
+    quarter = jnp.full(dof, 0.0).at[0].set(jnp.pi / 2)
+    gravity = np.abs(np.asarray(system.bias(quarter, jnp.zeros(dof))))
+    drive = np.zeros(dof)
+    for i, joint in enumerate(rig.input_joints):
+        drive[joint - 1] = np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
+    speed = np.maximum(speed, 1e-6)
+    return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
+
+
+def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> tuple[Gaussian, tuple[bool, ...]]:
+    """Prior of the first state, and which of its entries nobody declared or measured (EM learns those)."""
+    y = np.asarray(data.y)
+    means, stds, open_ = [], [], []
+    for i, name in enumerate(system.coordinates + system.rates):
+        joint, is_rate = i % len(system.coordinates), i >= len(system.coordinates)
+        if name in rig.start:
+            mean, std, free = rig.start[name].mean, max(rig.start[name].std, 1e-6), False
+        elif name in rig.measured:
+            signal = y[..., rig.measured.index(name)]
+            first = np.array([s[np.isfinite(s)][0] for s in signal if np.any(np.isfinite(s))])
+            width = scales.speed[joint] * (1.0 if is_rate else 10 * rig.dt)
+            mean, std, free = float(np.mean(first)), float(np.hypot(np.std(first), width)), False
+        elif is_rate:
+            mean, std, free = 0.0, float(scales.speed[joint]) / 3, True
+        else:
+            mean, std, free = 0.0, np.pi / 2 if system.angles[joint] else 1.0, True
+        means.append(mean)
+        stds.append(std)
+        open_.append(free)
+    return Gaussian(jnp.asarray(means), jnp.diag(jnp.asarray(stds) ** 2)), tuple(open_)
+
+
+def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: int = 41) -> Problem:
+    """The model that EM starts from: declared physics, a small random friction network, noise as large as motion."""
+    system = build_system(rig)
+    scales = measure_scales(rig, system, data)
+    states = system.coordinates + system.rates
+    start, open_ = start_prior(rig, system, data, scales)
+    kick = scales.acceleration * rig.dt
+    declared = [rig.noise_std.get(n) for n in rig.measured]
+    noise = [
+        d if d is not None else max(2 * reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i, d in enumerate(declared)
+    ]
+    unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
+    if rig.friction:
+        unknown = FrictionNetwork(
+            jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque), key=key, width=width, resolution=300.0
+        )
+        unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_hush)
+    model = StateSpaceModel(
+        system=system,
+        unknown=unknown,
+        start=start,
+        log_q=2 * jnp.log(jnp.concatenate([jnp.asarray(kick * rig.dt), jnp.asarray(kick)])),
+        log_r=2 * jnp.log(jnp.asarray(noise)),
+        measured=tuple(states.index(n) for n in rig.measured),
+        dt=rig.dt,
+    )
+    free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
+    prior = ParameterPrior(
+        free,
+        jnp.asarray([rig.parameters[n].mean for n in free]),
+        jnp.asarray([rig.parameters[n].std for n in free]),
+    )
+    mstep = ScoringMStep(prior, unknown.weights(), open_, tuple(d is None for d in declared), nodes, shape=model.log_q)
+    return Problem(model, mstep, start_bank(model, states, rig, system))
+
+
+def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
+    """The output layer, scaled so that the first friction is nearly none."""
+    return eqx.tree_at(
+        lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, jax.tree.map(jnp.zeros_like, layer.bias))
+    )
+
+
+def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:
+    """Hypotheses for each unmeasured state that the prior leaves wide: angles beyond .1 rad, rates that move as far."""
+    spread = np.sqrt(np.diag(np.asarray(model.start.cov)))
+    dof = len(system.coordinates)
+    counts = []
+    for i, name in enumerate(states):
+        wide = spread[i] * (0.2 if i >= dof else 1.0) > 0.1
+        counts.append((5 if i >= dof else 13) if wide and name not in rig.measured and system.angles[i % dof] else 1)
+    return StartBank(tuple(counts))

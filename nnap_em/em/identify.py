@@ -1,0 +1,178 @@
+"""From a declared rig and its logs to a fitted model: the main job in one call."""
+
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..data.rig import Declared, Rig, quantities
+from ..effects import AbstractEffect
+from ..model.state_space import StateSpaceModel, with_effects
+from ..smoother.gaussian import CubatureSmoother
+from ..smoother.posterior import AbstractSmoother
+from ..smoother.start import StartBank
+from .build import build
+from .loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
+from .mstep import ScoringMStep, kept
+from .multistep import FALLS, errors, finish, ratio, robust_hessian
+from .noise import white_readings
+
+MakeSmoother = Callable[[StartBank], AbstractSmoother]
+Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
+
+
+class Identified(NamedTuple):
+    """A fitted model with what is needed to use it, to judge it and to go on fitting."""
+
+    rig: Rig
+    state: EMState
+    m_step: ScoringMStep
+    bank: StartBank
+    """Hypotheses of the start."""
+    smoother: AbstractSmoother
+    """Of the fit, and of all that uses it: to smooth, predict, tell what is left over, and search for what it lacks."""
+
+    @property
+    def model(self) -> StateSpaceModel:
+        """The likeliest model."""
+        return cast(StateSpaceModel, self.state.best)
+
+    def __str__(self) -> str:
+        estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
+        found = f"\n  estimated: {quantities(estimated)}" if estimated else ""
+        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{found}\n  {self.model}"
+
+
+class FrictionTable(NamedTuple):
+    """The learned map with its uncertainty, over the visited velocities."""
+
+    velocity: Float[Array, "dof node"]
+    """[rad/s]"""
+    torque: Float[Array, "dof node"]
+    """[N m]"""
+    cov: Float[Array, "dof node node"]
+    """Covariance of the torque over the nodes of a joint [N^2 m^2]."""
+
+    @property
+    def std(self) -> Float[Array, "dof node"]:
+        """Standard deviation of the torque [N m]."""
+        return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
+
+    def __str__(self) -> str:
+        lines = [
+            f"joint {j + 1}: {t.min():.3g} to {t.max():.3g} N m over {v.min():.3g} to {v.max():.3g} rad/s, std up to"
+            f" {s.max():.2g} N m"
+            for j, (v, t, s) in enumerate(zip(*map(np.asarray, (self.velocity, self.torque, self.std)), strict=True))
+        ]
+        return "\n  ".join(["FrictionTable (on a slide: N and m/s)", *lines])
+
+
+def begin(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    smoother: MakeSmoother = CubatureSmoother,
+    effects: tuple[AbstractEffect, ...] = (),
+) -> Identified:
+    """The problem before the first epoch; `effects` join the model as they are."""
+    key_build, key_fit = jax.random.split(key)
+    model, rule, bank = build(rig, data, key=key_build)
+    full = with_effects(model, effects)
+    rule = eqx.tree_at(lambda m: m.shape, rule, full.log_q)
+    return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
+
+
+def identify(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    smoother: MakeSmoother | None = None,
+    epochs: int = 20,
+    schedule: Schedule = SCHEDULE,
+    start: Identified | None = None,
+    watch: Watch = lambda state, seen, used: None,
+) -> Identified:
+    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start`.
+
+    Without a `smoother` it is that of `start`, or the cubature smoother.
+    Raises FitError when no sequence can be followed.
+    """
+    now = begin(rig, data, key=key) if start is None else start
+    now = now if smoother is None else now._replace(smoother=smoother(now.bank))
+    state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)
+    return finished(now._replace(state=state), data)
+
+
+PARTS = 2
+"""Parts of the sequences that are left out in turn to see whether multi-step errors should be fitted."""
+
+
+def finished(fitted: Identified, data: Dataset) -> Identified:
+    """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
+
+    Only where the noise of the readings is not what the model says: where it is, one-step likelihood is efficient, and
+    its curvature says how sure it is.
+    """
+    data = Dataset(*map(jnp.asarray, data))
+    if white_readings(data):
+        return fitted
+    posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
+    path, used = posterior.state, np.asarray(kept(posterior, data))
+    if used.sum() < PARTS:
+        return fitted
+    part = np.where(used, np.cumsum(used) % PARTS, -1)
+    before, falls = errors(fitted.model, fitted.m_step.prior, path, data), []
+    for out in range(PARTS):
+        trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out))
+        falls.append(ratio(before, errors(trial, fitted.m_step.prior, path, data), part == out))
+    better = np.mean(falls) < 1 - FALLS
+    model = finish(fitted.model, fitted.m_step, path, data, used) if better else fitted.model
+    hessian = robust_hessian(model, fitted.m_step, path, data, used, fitted.state.hessian)
+    return fitted._replace(state=fitted.state._replace(best=model, hessian=hessian))
+
+
+def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    """Deviations of node torques [N m] and parameters from the mode, drawn from the Laplace posterior.
+
+    Linearised in the network's weights, which are hardly determined one by one while the torque is
+    [Immer, Korzepa & Bauer 2021, AISTATS].
+    """
+    weights = fitted.m_step.weights(fitted.model)
+    jac = weights.jacobian(fitted.model.unknown, weights.read(fitted.model))
+    unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
+    factor = jnp.linalg.cholesky(fitted.state.hessian)
+    return (jac @ jax.scipy.linalg.solve_triangular(factor.T, unit, lower=False)).T
+
+
+def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
+    """The learned map at `velocity` [rad/s], its covariance linearised in the weights (Laplace)."""
+    weights = fitted.m_step.weights(fitted.model)
+    w = weights.read(fitted.model)
+
+    def torque(w):
+        return jax.vmap(weights.write(fitted.model, w).unknown)(velocity.T).T
+
+    jac = jax.jacfwd(torque)(w)
+    half = jax.scipy.linalg.solve_triangular(
+        jnp.linalg.cholesky(fitted.state.hessian), jac.reshape(-1, w.shape[0]).T, lower=True
+    ).T.reshape(jac.shape)
+    return FrictionTable(velocity, torque(w), jnp.einsum("jaw,jbw->jab", half, half))
+
+
+def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
+    """Estimated physical parameters: value and standard deviation in the unit of `rig.toml`."""
+    prior = fitted.m_step.prior
+    if not prior.names:
+        return {}
+    cov = jnp.linalg.inv(fitted.state.hessian)[-prior.size :, -prior.size :]
+    std = prior.std * jnp.sqrt(jnp.diag(cov))
+    value = prior.mean + prior.std * prior.read(fitted.model)
+    declared = [name for name in prior.names if "." not in name]  # they stand first
+    return {n: (float(v), float(s)) for n, v, s in zip(declared, value, std, strict=False)}

@@ -1,0 +1,103 @@
+"""A model along a path: its affine form in every row, and how next state and reading move with what is estimated."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..data.dataset import Dataset
+from ..model.base import AbstractModel, Prepared, prepare
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import TANGENT, Affine, Cubature, Reading, Tangent, linear_reading
+from ..smoother.posterior import Posterior
+from .prior import ParameterPrior
+
+
+class Local(NamedTuple):
+    """A model along a path: all that depends on its structure."""
+
+    seq: Prepared
+    affine: Affine
+    reading: Reading
+    by_force: Float[Array, "*time state dof"]
+    """Sensitivity of the next state to a force held over the step."""
+    by_parameter: Float[Array, "*time state param"]
+    reading_by_parameter: Float[Array, "*time obs param"]
+
+
+def local(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, linearise: Tangent | Cubature = TANGENT
+) -> Local:
+    """The model of one sequence, linearised about the Gaussians of `path`, and its sensitivities at their means."""
+    prepared = prepare(model, seq)
+    affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, prepared.inputs)
+    reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, prepared.inputs)
+    return Local(prepared, affine, reading, *_sensitivities(model, prior, path.mean, seq, prepared.inputs))
+
+
+def _sensitivities(
+    model: StateSpaceModel, prior: ParameterPrior, path: Float[Array, "time state"], seq: Dataset, inputs: Inputs
+) -> tuple[Float[Array, "time state dof"], Float[Array, "time state param"], Float[Array, "time obs param"]]:
+    """Of the next state to a force held over the step, and of next state and reading to the parameters."""
+    value, held = prior.read(model), prior.held(model)
+    free = np.flatnonzero(~held)
+    dof = len(model.system.coordinates)
+    still = jnp.zeros(dof, path.dtype)
+    z = jnp.concatenate([still, value[free]])  # a force, and the parameters that do not act as forces held over a step
+    by_z = jax.jacfwd(lambda z: prior.write(model, value.at[free].set(z[dof:])).inputs(seq))(z)
+
+    def row(x, u, by_z):
+        def both(z, u):
+            now = prior.write(model, value.at[free].set(z[dof:]))
+            return now.transition(x, u, z[:dof]), now.emission(x, u)
+
+        def along(dz, du):
+            return jax.jvp(both, (z, u), (dz, du))[1]
+
+        def pushed(p):
+            now = prior.write(model, value.at[held].set(p))
+            scene = now.scene(middle, u)
+            nothing = jnp.zeros(0, x.dtype)
+            return sum((e.force(scene, nothing) for e in now.effects if e.held), still)
+
+        moved, read = jax.vmap(along, in_axes=(0, -1), out_axes=-1)(jnp.eye(z.shape[0], dtype=z.dtype), by_z)
+        by_force = moved[:, :dof]
+        by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, dof:])
+        if held.any():
+            middle = x + 0.5 * model.dt * model.rate(x, u, still)
+            by_parameter = by_parameter.at[:, held].set(by_force @ jax.jacfwd(pushed)(value[held]))
+        of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, dof:])
+        return by_force, by_parameter, of_reading
+
+    return jax.vmap(row)(path, inputs, by_z)
+
+
+def locals_along(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset, linearise: Tangent | Cubature
+) -> Local:
+    """`local` of every sequence: all of an M-step that is compiled anew for a model of another structure."""
+    return each(_local, (model, prior, linearise), (path, data))
+
+
+def _local(common, one) -> Local:
+    (model, prior, linearise), (path, seq) = common, one
+    return local(model, prior, path, seq, linearise)
+
+
+def readings_at(model: AbstractModel, posterior: Posterior, seq: Prepared) -> Float[Array, "time node obs"]:
+    """The emission at the nodes of a posterior."""
+    nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
+    return jax.vmap(jax.vmap(model.emission, in_axes=(0, None)))(nodes, seq.inputs)
+
+
+def readings_along(model: AbstractModel, posterior: Posterior, seq: Prepared) -> Float[Array, "seq time node obs"]:
+    """`readings_at` of every sequence."""
+    return each(_readings, model, (posterior, seq))
+
+
+def _readings(model, one) -> Float[Array, "time node obs"]:
+    return readings_at(model, *one)

@@ -1,0 +1,172 @@
+"""Expectation-Maximisation: E-step and M-step in turn, over a growing horizon, until nothing changes.
+
+A wrong model loses a hidden chaotic joint within a second or two and a fit to a lost track is worthless; so the first
+epochs see the head of every sequence only, and the horizon grows as the model improves.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset, horizon
+from ..model.base import AbstractModel, prepare
+from ..numerics.parallel import each
+from ..smoother.posterior import AbstractSmoother, Posterior
+from ..storage.journal import HERE, step
+from .mstep import AbstractMStep, MStepInfo
+
+
+class EMState(NamedTuple):
+    """Everything that is needed to go on: resuming from it gives the same numbers."""
+
+    epoch: int
+    model: AbstractModel
+    """The model that the next epoch tries."""
+    best: AbstractModel
+    """The likeliest model so far at the present horizon."""
+    proposal: AbstractModel
+    """Where the M-step would go from `best`."""
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of the M-step's weights at `best`."""
+    top: Float[np.ndarray, " seq"]
+    """Log-likelihood of every sequence under `best`; -inf before there is one, NaN where a sequence is left out."""
+    stride: float
+    """Share of the way to `proposal` that is tried."""
+    key: PRNGKeyArray
+    loglik: Float[np.ndarray, " epoch"]
+    """Mean log-likelihood of the sequences used, of every epoch so far."""
+    ess: float
+    """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
+
+
+class FitError(RuntimeError):
+    """EM cannot go on: every sequence is lost."""
+
+
+class Schedule(eqx.Module):
+    """How many samples of each sequence an epoch sees."""
+
+    first: int = eqx.field(static=True, default=60)
+    growth: float = eqx.field(static=True, default=1.6)
+    hold: int = eqx.field(static=True, default=2)
+    """Epochs at a horizon before it grows; the first horizon lasts one more."""
+
+    def horizon(self, epoch: int, longest: int) -> int:
+        """Samples seen in `epoch`, counted from 0."""
+        return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
+
+
+def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`."""
+    sequences, rows = data.t.shape
+    keys = jax.random.split(key, sequences)
+    together = max(1, smoother.room // (rows * smoother.bytes_per_row))
+    return each(_smooth, (model, smoother), (data, keys), together=together)
+
+
+def _smooth(common, one) -> Posterior:
+    (model, smoother), (seq, key) = common, one
+    return smoother(model, prepare(model, seq), key=key)
+
+
+@step(lambda model, *_: (model, MStepInfo(HERE, HERE), HERE, HERE))
+def em_step(
+    model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
+) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:
+    """One E-step and one M-step: the next model, the log-likelihoods of this one and the effective sample sizes.
+
+    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all.
+    """
+    posterior = e_step(model, data, smoother, key=key)
+    model, info = m_step(model, posterior, data)
+    return model, info, posterior.loglik, posterior.ess
+
+
+def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
+    """The state before the first epoch."""
+    return EMState(
+        0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), math.inf
+    )
+
+
+SCHEDULE = Schedule()
+
+
+def fit(
+    state: EMState,
+    data: Dataset,
+    smoother: AbstractSmoother,
+    m_step: AbstractMStep,
+    *,
+    epochs: int = 20,
+    schedule: Schedule = SCHEDULE,
+    tolerance: float = 0.05,
+    watch: Callable[[EMState, int, Bool[np.ndarray, " seq"]], None] = lambda state, seen, used: None,
+) -> EMState:
+    """EM from `state` until `epochs` are done or the likelihood rests.
+
+    It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
+    nats twice running, or when a model that loses tracks was refused twice running.
+    Raises FitError when no sequence can be followed.
+    """
+    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    if state.epoch == 0:
+        model = _settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key)
+        state = state._replace(model=model, best=model)
+    while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
+        seen = schedule.horizon(state.epoch, longest)
+        key = jax.random.fold_in(state.key, state.epoch)
+        rule = m_step.early() if seen < longest else m_step
+        proposal, info, loglik, ess = em_step(state.model, horizon(data, seen), smoother, rule, key)
+        used = np.asarray(info.used)
+        if not used.any():
+            raise FitError(
+                f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; "
+                "check units, signs and the start prior, or declare a wider one"
+            )
+        if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
+            state = state._replace(top=np.full(used.size, -np.inf), stride=1.0)
+        state = _judge(state, proposal, info.hessian, np.asarray(loglik), used)
+        state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
+        watch(state, seen, used)
+    return state
+
+
+def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EMState:
+    """Accept the model that was tried, or go back to the best one and try a shorter way from there."""
+    loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
+    mean = float(np.mean(loglik[used]))
+    if np.nanmean(loglik - state.top) >= -0.5:
+        top = np.where(used, loglik, np.nan)
+        stride = min(1.0, 2 * state.stride)
+        state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=top, stride=stride)
+    else:
+        state = state._replace(stride=state.stride / 3)
+    way = lambda a, b: a + state.stride * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
+    model = jax.tree.map(way, state.best, state.proposal)
+    return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
+
+
+def _settle_noise(
+    model: AbstractModel, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)
+):
+    """`model` with its process noise scaled by the likeliest of `scales`: nobody knows how far its motion is off."""
+    trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
+    logliks = []
+    for trial in trials:
+        _, info, loglik, _ = em_step(trial, data, smoother, m_step.early(), key)
+        logliks.append(float(np.mean(np.asarray(loglik)[np.asarray(info.used)])) if np.any(info.used) else -math.inf)
+    return trials[int(np.argmax(logliks))]
+
+
+def _rests(state: EMState, schedule: Schedule, longest: int, tolerance: float) -> bool:
+    if state.epoch < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
+        return False
+    if state.stride < 0.2 and math.isinf(state.ess):  # a sampled likelihood may fall by chance
+        return True
+    return bool(np.all(np.abs(np.diff(state.loglik[-3:])) < tolerance))

@@ -1,0 +1,217 @@
+"""M-step of the hybrid model: EM's gradient, scaled by the information that the data really hold.
+
+The smoother gives the score by Fisher's identity, the expectation of the complete-data score.  EM would divide
+it by the complete-data information and crawl where the missing part dominates; here it is divided by the observed
+information of the model linearised about the smoothed path, the sum of J'J of whitened innovations
+[Louis 1982, J. R. Stat. Soc. B 44(2); Lange 1995, J. R. Stat. Soc. B 57(2)].
+
+The friction network is tabulated at velocity nodes: torques at the nodes and the uncertain physical parameters form the
+vector phi in which the likelihood is quadratic; the network is then fitted to that quadratic form by
+Levenberg-Marquardt.
+"""
+
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..data.dataset import Dataset, fill_missing
+from ..model.base import AbstractModel
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import Cubature, Tangent
+from ..smoother.posterior import Posterior
+from .local import Local, locals_along, readings_along
+from .prior import ParameterPrior
+from .quadratic import Quadratic, quadratic
+from .weights import Weights
+
+
+class MStepInfo(NamedTuple):
+    """What an M-step lets one see and reuse."""
+
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of the weights, at those of the model that was given (zero for M-steps that know none)."""
+    used: Bool[Array, " seq"]
+    """Sequences that took part."""
+
+
+class Core(NamedTuple):
+    """What an M-step changes, whatever else the model is made of."""
+
+    unknown: Any
+    """The friction map."""
+    w: Float[Array, " weight"]
+    """Network weights, then parameters in units of their prior."""
+    log_q: Float[Array, " state"]
+    log_r: Float[Array, " obs"]
+    start: Gaussian
+
+
+class AbstractMStep(eqx.Module):
+    """A rule for the next model, given the posterior of every sequence."""
+
+    @abstractmethod
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[AbstractModel, MStepInfo]:
+        """The next model."""
+
+    @abstractmethod
+    def early(self) -> "AbstractMStep":
+        """The rule while the horizon still grows."""
+
+    @abstractmethod
+    def no_hessian(self, model) -> Float[Array, "weight weight"]:
+        """`MStepInfo.hessian` before the first epoch."""
+
+
+@eqx.filter_jit
+def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
+    """Sequences whose track is not lost: log-likelihood per reading not far below the median of all."""
+    _, observed = fill_missing(data.y)
+    count = jnp.sum(observed & data.valid[..., None], axis=(1, 2)).astype(posterior.loglik.dtype)
+    mean = posterior.loglik / jnp.maximum(count, 1.0)
+    finite = jnp.isfinite(mean)
+    middle = jnp.nanmedian(jnp.where(finite, mean, jnp.nan))
+    spread = 1.48 * jnp.nanmedian(jnp.where(finite, jnp.abs(mean - middle), jnp.nan))
+    return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
+
+
+BLOCK = 4
+"""The number of parameters is padded to a multiple of this, for fewer programs."""
+
+
+def _quadratic(common, one) -> Quadratic:
+    (log_q, log_r, start, nodes), (here, posterior, read) = common, one
+    return quadratic(log_q, log_r, start, here, nodes, posterior, read)
+
+
+@eqx.filter_jit
+def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian, loglik, used):
+    weights = rule.weights(core)
+    used = used & jnp.isfinite(loglik) & jnp.all(jnp.isfinite(terms.information), axis=(1, 2))
+    used = used & jnp.all(jnp.isfinite(terms.score), axis=1) & jnp.all(jnp.isfinite(terms.noise_score), axis=1)
+    pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
+    total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
+    first = jax.tree.map(pick, first)
+    w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
+    hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
+    log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
+    return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
+
+
+class ScoringMStep(AbstractMStep):
+    """Fisher scoring of the marginal likelihood for the hybrid model: weights, parameters, noise and start."""
+
+    prior: ParameterPrior
+    centre: Float[Array, " weight"]
+    """Mean of the prior of the network's weights."""
+    learn_start: tuple[bool, ...] = eqx.field(static=True)
+    learn_r: tuple[bool, ...] = eqx.field(static=True)
+    nodes: int = eqx.field(static=True, default=41)
+    ridge: float = 1.0
+    iterations: int = eqx.field(static=True, default=200)
+    stride: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
+    """Largest change of a log variance in one step."""
+    tie: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
+    """Precision with which the ratios of the joints' process noises are held to those of the first model.
+
+    A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.
+    """
+    linearise: Tangent | Cubature = Cubature()
+    shape: Float[Array, " state"] | None = None
+    """Log variances of the process noise of the first model."""
+
+    def weights(self, model) -> Weights:
+        """What is estimated: weights of the network and parameters."""
+        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge, self.centre, 0.1 * model.unknown.scale)
+
+    def early(self) -> "ScoringMStep":
+        """With the ratio of the joints' noise nearly fixed."""
+        return eqx.tree_at(lambda m: m.tie, self, jnp.asarray(1e4))
+
+    def no_hessian(self, model) -> Float[Array, "weight weight"]:
+        """Of the network's weights and the parameters."""
+        w = self.weights(model).read(model)
+        return jnp.zeros((w.shape[0], w.shape[0]), w.dtype)
+
+    def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
+        """One step of Fisher scoring."""
+        here = locals_along(model, self.prior, posterior.state, data, self.linearise)
+        read = readings_along(model, posterior, here.seq)
+        core = self.core(model)
+        core, hessian, used = self.advance(core, here, posterior, read, kept(posterior, data))
+        return self.whole(model, core), MStepInfo(hessian, used)
+
+    def core(self, model) -> Core:
+        """What a step changes of a model."""
+        return Core(model.unknown, self.weights(model).read(model), model.log_q, model.log_r, model.start)
+
+    def whole(self, model, core: Core) -> StateSpaceModel:
+        """`model` with what a step has changed."""
+        fitted = self.weights(model).write(model, core.w)
+        return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
+
+    def advance(
+        self,
+        core: Core,
+        here: Local,
+        posterior: Posterior,
+        read: Float[Array, "seq time node obs"],
+        used: Bool[Array, " seq"],
+    ) -> tuple[Core, Float[Array, "weight weight"], Bool[Array, " seq"]]:
+        """The step itself: one program for models of every structure; parameters are nameless here.
+
+        With it the posterior precision where it began, and which of the sequences `used` could be.
+        """
+        count = self.prior.size
+        pad = -count % BLOCK
+        names = tuple(map(str, range(count + pad)))
+        mean, std = jnp.pad(self.prior.mean, (0, pad)), jnp.pad(self.prior.std, (0, pad), constant_values=1.0)
+        rule = eqx.tree_at(lambda r: r.prior, self, ParameterPrior(names, mean, std))
+        widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
+        here = here._replace(
+            by_parameter=widen(here.by_parameter), reading_by_parameter=widen(here.reading_by_parameter)
+        )
+        common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
+        terms = each(_quadratic, common, (here, posterior, read))
+        first = jax.tree.map(lambda a: a[:, 0], posterior.state)
+        wide_core = core._replace(w=widen(core.w))
+        core, hessian, used = _advance(rule, wide_core, terms, first, posterior.loglik, used)
+        wide = core.w.shape[0] - pad
+        return core._replace(w=core.w[:wide]), hessian[:wide, :wide], used
+
+    def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
+        """Log variances of process and reading noise after the step."""
+        info = total.noise_information
+        learn = jnp.asarray([i < 2 * dof for i in range(model.log_q.shape[0])] + list(self.learn_r))
+        info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
+        info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
+        n = model.log_q.shape[0]
+        hold = jnp.zeros_like(info).at[: 2 * dof, : 2 * dof].set(self._hold(dof))
+        assert self.shape is not None
+        off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
+        step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
+        step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
+        return model.log_q + step[:n], model.log_r + step[n:]
+
+    def _hold(self, dof: int) -> Float[Array, "state state"]:
+        """Prior precision of the log process noises: kicks act on rates, and reach angles over one step."""
+        rate = jnp.eye(dof)
+        angle = jnp.concatenate([rate, -rate], axis=1)
+        ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)
+        return 1e4 * angle.T @ angle + self.tie * ratio.T @ ratio
+
+    def first(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
+        """EM's own update of the entries that nobody declared [paper, eq. 11]."""
+        learn = jnp.asarray(self.learn_start + (False,) * (start.mean.shape[0] - len(self.learn_start)))
+        count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)
+        mean = jnp.where(learn, jnp.sum(first.mean, axis=0) / count, start.mean)
+        square = jnp.where(used[:, None], (first.mean - mean[None]) ** 2, 0.0)
+        variance = (jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)) / (
+            count + 1
+        )
+        return Gaussian(mean, jnp.diag(jnp.where(learn, variance, jnp.diag(start.cov))))

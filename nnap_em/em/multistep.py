@@ -1,0 +1,307 @@
+"""Multi-step prediction errors, how everything that is estimated would move them, and a fit to them.
+
+The filter is forked at regular starts and the model runs on alone from there.  The sensitivities are those of the
+filter up to the start and of the open loop from there on, so that the errors are linear in what is estimated.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..data.dataset import Dataset
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import CUBATURE, kalman_filter
+from .local import Local, locals_along
+from .mstep import ScoringMStep
+from .prior import ParameterPrior
+from .quadratic import friction_columns
+from .weights import Weights
+
+HORIZONS = (0.25, 0.5)
+"""Horizons [s] at which errors are looked at."""
+JUDGED = (*HORIZONS, 1.0)
+"""Horizons [s] at which a model is judged: what only bends the first half second fails later."""
+SPACING = 0.05
+"""Time [s] between starts."""
+WIDE = 0.1
+"""Spread over which slopes are taken, in rms speeds: as wide as predictions err."""
+HUBER = 2.0
+"""Errors of more robust standard deviations weigh less."""
+
+
+class Columns(NamedTuple):
+    """What something adds along a path."""
+
+    force: Float[Array, "*seq column time dof"]
+    """Generalised force held over the step [N m]."""
+    reading: Float[Array, "*seq column time obs"]
+
+
+class Grid(eqx.Module):
+    """Rows between starts, and rows from a start to every horizon."""
+
+    stride: int = eqx.field(static=True)
+    ages: tuple[int, ...] = eqx.field(static=True)
+
+    def starts(self, rows: int) -> Int[np.ndarray, " start"]:
+        """Rows at which a sequence of `rows` samples is forked."""
+        return np.arange(self.stride, rows - self.ages[-1], self.stride)
+
+
+class Forks(NamedTuple):
+    """Errors after every start, at every horizon, and the sensitivity of the predictions."""
+
+    error: Float[np.ndarray, "seq start horizon obs"]
+    """Reading minus open-loop prediction [rad, or m]; NaN where there is none."""
+    columns: Float[np.ndarray, "seq start horizon obs column"]
+    """By friction nodes, by parameters, then by whatever else was asked for."""
+    overlap: Float[np.ndarray, " horizon"]
+    """How many forks cover one moment."""
+
+
+def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+    """Starts and horizons on logs of `rows` samples; where these are short the horizons are too."""
+    stride = max(1, round(SPACING / dt))
+    longest = max(1, rows // 3 // stride)
+    return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
+
+
+def channels(model: StateSpaceModel) -> tuple[int, ...]:
+    """Places in y of what is looked at: measured coordinates, or where there are none whatever is measured."""
+    dof = len(model.system.coordinates)
+    return tuple(i for i, s in enumerate(model.measured) if s < dof) or tuple(range(len(model.measured)))
+
+
+def forks(
+    model: StateSpaceModel, weights: Weights, path: Gaussian, data: Dataset, extra: Columns | None = None
+) -> Forks:
+    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` are more columns."""
+    grid = _grid(model, data)
+    here, exact = _wide(model, weights.prior, path, data)
+    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
+    error = np.array(each(_errors, (model, grid), (state, here.seq)))
+    if extra is None:
+        sequences, rows, dof = *path.mean.shape[:2], len(model.system.coordinates)
+        extra = Columns(jnp.zeros((sequences, 0, rows, dof)), jnp.zeros((sequences, 0, rows, data.y.shape[-1])))
+    middle = 0.5 * (path.mean + exact)
+    sens = each(_sensitivities, (weights.nodes, grid), (here, gain, middle, extra), together=1)
+    see = channels(model)
+    overlap = np.asarray(grid.ages) / grid.stride
+    return Forks(error[..., see], np.asarray(sens)[..., see, :], overlap)
+
+
+def errors(
+    model: StateSpaceModel,
+    prior: ParameterPrior,
+    path: Gaussian,
+    data: Dataset,
+    horizons: tuple[float, ...] = HORIZONS,
+) -> Float[np.ndarray, "seq start horizon obs"]:
+    """The errors alone."""
+    here, _ = _wide(model, prior, path, data)
+    state, _ = each(_filtered, (model.log_q, model.log_r, model.start), here)
+    return np.asarray(each(_errors, (model, _grid(model, data, horizons)), (state, here.seq)))[..., channels(model)]
+
+
+def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+    return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons)
+
+
+def _wide(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset
+) -> tuple[Local, Float[Array, "seq time state"]]:
+    """The model along its paths, with slopes as wide as predictions err, through the exact transition; and that."""
+    dof = len(model.system.coordinates)
+    rms = jnp.sqrt(jnp.nanmean(path.mean[..., dof : 2 * dof] ** 2, axis=(0, 1)))
+    spread = jnp.concatenate([WIDE * HORIZONS[0] * rms, WIDE * rms, jnp.full(path.mean.shape[-1] - 2 * dof, 1e-6)])
+    wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
+    here = locals_along(model, prior, wide, data, CUBATURE)
+    exact = each(_exact, model, (path.mean, here.seq.inputs))
+    offset = exact - jnp.einsum("stij,stj->sti", here.affine.matrix, path.mean)
+    affine = here.affine._replace(offset=offset, noise=jnp.zeros_like(here.affine.noise))
+    return here._replace(affine=affine), exact
+
+
+def _exact(model: StateSpaceModel, one) -> Float[Array, "time state"]:
+    """The transition along a path."""
+    return jax.vmap(model.transition)(*one)
+
+
+def _filtered(common, here: Local):
+    """Filtered means and gains of one sequence about its path."""
+    log_q, log_r, start = common
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    return filtered.state.mean, filtered.gain
+
+
+def _errors(common, one) -> Float[Array, "start horizon obs"]:
+    """Open-loop errors of one sequence."""
+    (model, grid), (state, seq) = common, one
+    starts = grid.starts(state.shape[0])
+    row = lambda k: jax.tree.map(lambda a: a[k], seq.inputs)  # noqa: E731
+
+    def step(x, h):
+        x = jax.vmap(model.transition)(x, row(starts + h))
+        return x, jax.vmap(model.emission)(x, row(starts + h + 1))
+
+    _, read = jax.lax.scan(step, state[starts], jnp.arange(grid.ages[-1]))
+    known = jnp.where(seq.observed, seq.y, jnp.nan)
+    return jnp.stack([known[starts + age] - read[age - 1] for age in grid.ages], axis=1)
+
+
+def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
+    """How every column moves the predictions of one sequence."""
+    (nodes, grid), (here, gain, middle, found) = common, one
+    single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
+    dof = nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], here.by_force)
+    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    push = jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter, moved], axis=-1), 0.0)
+    of_torque = jnp.zeros((*found.reading.shape[1:], torque.shape[-1]), torque.dtype)
+    read = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
+    matrix, rows, gain, push, read = single((here.affine.matrix, here.reading.rows, gain, push, read))
+
+    def absorb(s, slices):
+        matrix, rows, gain, push, read = slices
+        for i in range(rows.shape[0]):  # one reading at a time, as in the filter
+            s = s - gain[i][:, None] * (rows[i] @ s + read[i])[None]
+        return matrix @ s + push, s
+
+    _, known = jax.lax.scan(absorb, jnp.zeros_like(push[0]), (matrix, rows, gain, push, read))
+    starts = grid.starts(push.shape[0])
+
+    def fork(one):
+        s, start = one
+        out = []
+        for first, last in itertools.pairwise((0, *grid.ages)):
+            step = lambda s, h: (matrix[start + h] @ s + push[start + h], None)  # noqa: E731
+            s, _ = jax.lax.scan(step, s, jnp.arange(first, last))
+            out.append(rows[start + last] @ s + read[start + last])
+        return jnp.stack(out)
+
+    return jax.lax.map(fork, (known[starts], jnp.asarray(starts)))
+
+
+# --- how large
+
+
+def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "horizon obs"]:
+    """Standard deviation at every horizon, by the median; 1 where there is no error to tell."""
+    seen = np.isfinite(error).any(axis=(0, 1))
+    filled = np.where(seen, error, 1.0) if error.size else np.ones((1, 1, *error.shape[2:]))
+    return 1.4826 * np.nanmedian(np.abs(filled), axis=(0, 1)) + 1e-12
+
+
+def huber(error, scale):
+    """Squared error in scales, beyond HUBER of them a straight line [Huber 1964]; what runs away counts as 30."""
+    size = np.minimum(np.abs(error) / scale, 30.0)
+    return np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER))
+
+
+def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
+    """Squared error of one model over that of another on the same starts, the mean over the horizons.
+
+    Outliers weigh less.
+    """
+    before, after = before[used], after[used]
+    known, scale = np.isfinite(before), robust_scale(before)
+    if not known.any():
+        return 1.0
+    after = np.where(np.isfinite(after), after, np.inf)
+    first, second = (np.where(known, huber(np.where(known, e, 0.0), scale), 0.0) for e in (before, after))
+    first, second = (np.sum(a, axis=(0, 1, 3)) for a in (first, second))
+    return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
+
+
+def weighed(found: Forks, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
+    """Robust weights: one over the variance of every horizon and channel, less for outliers, none for what is not."""
+    error = np.where(used[:, None, None, None], found.error, np.nan)
+    scale = robust_scale(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.minimum(1.0, HUBER * scale / np.abs(error))
+    sound = np.isfinite(error) & np.isfinite(found.columns).all(axis=-1)
+    return np.where(sound, size / scale**2 / found.overlap[:, None], 0.0)
+
+
+# --- a fit to them
+
+
+STEPS = 3
+"""Gauss-Newton steps at most."""
+FALLS = 0.01
+"""Share by which a step must lower the error to be taken."""
+
+
+def finish(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    *,
+    steps: int = STEPS,
+) -> StateSpaceModel:
+    """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until they fall.
+
+    Friction, parameters and effects move; noise and start stay.  [Bohlin 2006, "Practical Grey-box Process
+    Identification", for prediction-error fits over several horizons]
+    """
+    for _ in range(steps):
+        weights = m_step.weights(model)
+        now = forks(model, weights, path, data)
+        weight = weighed(now, used)
+        keep = weight > 0
+        jac, e, w = now.columns[keep].astype(float), now.error[keep], weight[keep]
+        score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
+        start = weights.read(model)
+        goal = _goal(weights, model.unknown, start, score, information)
+        for share in (1.0, 0.5, 0.25):
+            trial = weights.write(model, start + share * (goal - start))
+            if ratio(now.error, errors(trial, m_step.prior, path, data), used) < 1 - FALLS:
+                model = trial
+                break
+        else:
+            break
+    return model
+
+
+def robust_hessian(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    hessian: Float[Array, "weight weight"],
+) -> Float[Array, "weight weight"]:
+    """Posterior precision that owns up to how much recordings disagree: where noise is not what the model says, a
+    likelihood is too sure of itself.
+
+        C = H^-1 + A^-1 (n / (n - 1) sum_s g_s g_s') A^-1,   g_s the score of recording s, A the information of all
+
+    [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters]
+    """
+    weights = m_step.weights(model)
+    now = forks(model, weights, path, data)
+    weight = weighed(now, used)
+    rows = np.where(weight[..., None] > 0, now.columns, 0.0).astype(float)
+    pulled = weight * np.where(weight > 0, now.error, 0.0)
+    scores = np.einsum("skhoc,skho->sc", rows, pulled)[used]
+    flat = rows.reshape(-1, rows.shape[-1])
+    information = (flat * weight.reshape(-1, 1)).T @ flat
+    own, jac = weights.hessian(model.unknown, weights.read(model), jnp.asarray(information) + weights.symmetry())
+    moved = np.linalg.solve(np.asarray(own), np.asarray(jac).T @ (scores - scores.mean(axis=0)).T)
+    count = scores.shape[0]
+    spread = moved @ moved.T * count / max(count - 1, 1)
+    return jnp.linalg.inv(jnp.linalg.inv(hessian) + jnp.asarray(spread))
+
+
+@eqx.filter_jit
+def _goal(weights: Weights, unknown, start, score, information):
+    return weights.fit(unknown, start, score, information, 30)

@@ -1,0 +1,48 @@
+"""Physical parameters that are estimated, of the machine and of the effects: one vector, with the owner's belief."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+
+class ParameterPrior(eqx.Module):
+    """Physical parameters to be estimated, with the owner's belief; estimated in its standard deviations."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    """Of the system, "m2", or of an effect by its place, "0.k"."""
+    mean: Float[Array, " param"]
+    std: Float[Array, " param"]
+
+    def places(self, model) -> list:
+        """The parameters in the model."""
+        pairs = [name.rpartition(".") for name in self.names]
+        return [getattr(model.effects[int(at)] if at else model.system, name) for at, _, name in pairs]
+
+    def read(self, model) -> Float[Array, " param"]:
+        """The model's values as (value - mean) / std."""
+        if not self.names:
+            return self.mean
+        return (jnp.concatenate([jnp.ravel(a) for a in self.places(model)]) - self.mean) / self.std
+
+    def write(self, model, z: Float[Array, " param"]):
+        """The model with values mean + std z."""
+        if not self.names:
+            return model
+        places = self.places(model)
+        cuts = np.cumsum([a.size for a in places])[:-1]
+        values = jnp.split(self.mean + self.std * z, cuts)
+        shaped = [v.reshape(a.shape) for v, a in zip(values, places, strict=True)]
+        return eqx.tree_at(self.places, model, shaped)
+
+    def held(self, model) -> Bool[np.ndarray, " param"]:
+        """Which of the numbers act as forces held over a step."""
+        pairs = [name.rpartition(".") for name in self.names]
+        kinds = [bool(at) and model.effects[int(at)].held for at, _, _ in pairs]
+        flags = [np.full(np.size(a), k) for a, k in zip(self.places(model), kinds, strict=True)]
+        return np.concatenate([np.zeros(0, bool), *flags])
+
+    @property
+    def size(self) -> int:
+        """How many numbers are estimated."""
+        return self.mean.shape[0]

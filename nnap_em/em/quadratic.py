@@ -1,0 +1,128 @@
+"""The log-likelihood of a sequence to second order: score by Fisher's identity, information of the linearised model."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..numerics.gaussian import Gaussian, spd_solve
+from ..smoother.kalman import Filtered, kalman_filter
+from ..smoother.posterior import Posterior
+from .local import Local
+
+
+class Quadratic(NamedTuple):
+    """Log-likelihood about the present parameters: score and information of phi = (node torques, parameters)."""
+
+    score: Float[Array, "*seq phi"]
+    information: Float[Array, "*seq phi phi"]
+    noise_score: Float[Array, "*seq noise"]
+    """With respect to (log_q, log_r)."""
+    noise_information: Float[Array, "*seq noise noise"]
+
+
+def spread(
+    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], amount: Float[Array, "node dof"]
+) -> Float[Array, "dof count"]:
+    """Sums of `amount`, each shared by the two nodes beside its speed as linear interpolation weighs them.
+
+    Beyond the ends the last node takes all.
+    """
+    count = nodes.shape[1]
+
+    def one(nodes, v, amount):
+        left = jnp.clip(jnp.searchsorted(nodes, v, side="right") - 1, 0, count - 2)
+        share = jnp.clip((v - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0) * amount
+        return jnp.zeros(count, v.dtype).at[left].add(amount - share).at[left + 1].add(share)
+
+    return jax.vmap(one, in_axes=(0, 1, 1))(nodes, speed, amount)
+
+
+def whitened_sensitivities(
+    filtered: Filtered,
+    columns: Float[Array, "time state column"],
+    readings: Float[Array, "time obs column"],
+    observed: Bool[Array, "time obs"],
+) -> Float[Array, "time obs column"]:
+    """Sensitivity of the whitened readings to what moves the next state by `columns` and the reading by `readings`."""
+
+    def step(s, slices):
+        matrix, rows, columns, readings, gain, log_variance, observed = slices
+        out = []
+        for i in range(rows.shape[0]):
+            j = rows[i] @ s + readings[i]
+            out.append(jnp.where(observed[i], j * jnp.exp(-0.5 * log_variance[i]), 0.0))
+            s = s - gain[i][:, None] * j[None, :]
+        return matrix @ s + columns, jnp.stack(out)
+
+    f = filtered
+    slices = (f.affine.matrix, f.reading.rows, columns, readings, f.gain, f.log_variance, observed)
+    return jax.lax.scan(step, jnp.zeros_like(columns[0]), slices)[1]
+
+
+def friction_columns(
+    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], by_force: Float[Array, "state dof"]
+) -> Float[Array, "state phi"]:
+    """Sensitivity of the next state to the torques at the nodes, mean over some speeds."""
+    weights = spread(nodes, speed, jnp.full_like(speed, 1 / speed.shape[0]))
+    return (by_force[:, :, None] * weights[None]).reshape(by_force.shape[0], -1)
+
+
+def quadratic(
+    log_q: Float[Array, " state"],
+    log_r: Float[Array, " obs"],
+    start: Gaussian,
+    here: Local,
+    nodes: Float[Array, "dof count"],
+    posterior: Posterior,
+    read: Float[Array, "time node obs"],
+) -> Quadratic:
+    """The log-likelihood of one sequence to second order, from the local model alone.
+
+    The same program for every structure of the same size.
+    """
+    y, observed, dof = here.seq.y, here.seq.observed, nodes.shape[0]
+    q, r = jnp.exp(log_q), jnp.exp(log_r)
+
+    def columns(prev, following, kick, excess, by_force, by_parameter):
+        """Mean sensitivity of x_{k+1} to phi, and expected score, over the nodes of one step."""
+        speed = 0.5 * (prev + following - kick)[:, dof : 2 * dof]  # half the kick would count as signal
+        sensitivity = friction_columns(nodes, speed, by_force)
+        push = spd_solve(jnp.diag(q) + excess, kick.T).T
+        pull = push @ by_force  # node dof
+        score = spread(nodes, speed, pull / speed.shape[0]).ravel()
+        score = jnp.concatenate([score, jnp.mean(push, axis=0) @ by_parameter])
+        expected = jnp.diag(spd_solve(jnp.diag(q) + excess, jnp.eye(q.shape[0], dtype=q.dtype)))
+        square = 0.5 * q * (jnp.mean(push**2, axis=0) - expected)
+        return jnp.concatenate([sensitivity, by_parameter], axis=1), score, square
+
+    sensitivity, score, square = jax.vmap(columns)(
+        posterior.prev, posterior.next, posterior.kick, posterior.excess, here.by_force[:-1], here.by_parameter[:-1]
+    )
+    inside = here.seq.active[:-1]
+    score = jnp.sum(jnp.where(inside[:, None], score, 0.0), axis=0)
+    score_q = jnp.sum(jnp.where(inside[:, None], square, 0.0), axis=0)
+    miss = y[:, None] - read
+    misfit = jnp.mean(miss**2, axis=1)
+    score_r = 0.5 * jnp.sum(jnp.where(observed, misfit / r[None] - 1.0, 0.0), axis=0)
+    weighed = jnp.where(observed, jnp.mean(miss, axis=1) / r[None], 0.0)
+    params = here.by_parameter.shape[-1]
+    of_readings = jnp.einsum("to,top->p", weighed, here.reading_by_parameter)
+    score = score + jnp.concatenate([jnp.zeros(score.shape[0] - params, score.dtype), of_readings])
+
+    def noise_filter(log_q, log_r):
+        filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+        return (filtered.innovation, filtered.log_variance), filtered
+
+    (jac_e, jac_s), filtered = jax.jacfwd(noise_filter, argnums=(0, 1), has_aux=True)(log_q, log_r)
+    jac_e, jac_s = (jnp.concatenate(j, axis=-1).reshape(-1, q.shape[0] + r.shape[0]) for j in (jac_e, jac_s))
+    jac_e = jac_e + 0.5 * filtered.innovation.reshape(-1, 1) * jac_s
+    noise_information = jac_e.T @ jac_e + 0.5 * jac_s.T @ jac_s
+
+    padded = jnp.concatenate([jnp.where(inside[:, None, None], sensitivity, 0.0), jnp.zeros_like(sensitivity[:1])])
+    of_torque = jnp.zeros((*misfit.shape, sensitivity.shape[-1] - params), misfit.dtype)
+    readings = jnp.concatenate([of_torque, here.reading_by_parameter], axis=-1)
+    jac = whitened_sensitivities(filtered, padded, readings, observed)
+    jac = jac.reshape(-1, jac.shape[-1])
+    return Quadratic(score, jac.T @ jac, jnp.concatenate([score_q, score_r]), noise_information)

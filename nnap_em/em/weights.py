@@ -1,0 +1,103 @@
+"""Network weights and parameters as one vector, fitted to a log-likelihood that is quadratic in torques at nodes."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .prior import ParameterPrior
+
+
+class Weights(eqx.Module):
+    """All that the M-step fits as one vector: network weights, then parameters in units of their prior."""
+
+    prior: ParameterPrior
+    nodes: Float[Array, "dof count"]
+    ridge: float
+    """Precision of the weights' prior; the network's output is scaled so that 1 is natural."""
+    centre: Float[Array, " weight"]
+    """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
+    asymmetry: Float[Array, " dof"]
+    """Prior standard deviation [N m] of the even part of a friction map, its mean over the nodes."""
+
+    def read(self, model) -> Float[Array, " weight"]:
+        """Those of a model, as one vector."""
+        return jnp.concatenate([model.unknown.weights(), self.prior.read(model)])
+
+    def write(self, model, w: Float[Array, " weight"]):
+        """A model with other weights."""
+        cut = w.shape[0] - self.prior.size
+        unknown = model.unknown.with_weights(w[:cut])
+        return self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
+
+    def phi(self, unknown, w: Float[Array, " weight"]) -> Float[Array, " phi"]:
+        """The vector in which the likelihood is quadratic."""
+        cut = w.shape[0] - self.prior.size
+        return jnp.concatenate([jax.vmap(unknown.with_weights(w[:cut]))(self.nodes.T).T.ravel(), w[cut:]])
+
+    def precision(self, w: Float[Array, " weight"]) -> Float[Array, " weight"]:
+        """Prior precision of the weights."""
+        cut = w.shape[0] - self.prior.size
+        return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
+
+    def middle(self) -> Float[Array, " weight"]:
+        """Prior mean of the weights."""
+        return jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
+
+    def symmetry(self) -> Float[Array, "phi phi"]:
+        """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
+        dof, count = self.nodes.shape
+        even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1]) / math.sqrt(count)
+        blocks = [even.T @ even / self.asymmetry[j] ** 2 for j in range(dof)]
+        return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
+
+    def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
+        """Sensitivity of phi to the weights."""
+        return jax.jacfwd(lambda w: self.phi(unknown, w))(w)
+
+    def hessian(self, unknown, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
+        """Posterior precision of the weights, and the sensitivity of phi to them."""
+        jac = self.jacobian(unknown, w)
+        return jac.T @ information @ jac + jnp.diag(self.precision(w)), jac
+
+    def fit(
+        self,
+        unknown,
+        w0: Float[Array, " weight"],
+        score: Float[Array, " phi"],
+        information: Float[Array, "phi phi"],
+        iterations: int,
+    ) -> Float[Array, " weight"]:
+        """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3]."""
+        phi0 = self.phi(unknown, w0)
+        precision = self.precision(w0)
+        middle = self.middle()
+        symmetry = self.symmetry()
+        score = score - symmetry @ phi0
+        information = information + symmetry
+
+        def loss(w):
+            d = self.phi(unknown, w) - phi0
+            return -score @ d + 0.5 * d @ information @ d + 0.5 * jnp.sum(precision * (w - middle) ** 2)
+
+        def going(carry):
+            _, _, damping, count, gain = carry
+            return (count < iterations) & (damping < 1e6) & (gain > 1e-3)
+
+        def body(carry):
+            w, value, damping, count, gain = carry
+            hessian, jac = self.hessian(unknown, w, information)
+            gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
+            factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.diag(jnp.diag(hessian)))
+            trial = w - jax.scipy.linalg.cho_solve(factor, gradient)
+            new = loss(trial)
+            better = new < value
+            gain = jnp.where(better, 0.7 * gain + 0.3 * (value - new), gain)
+            keep = lambda a, b: jnp.where(better, a, b)  # noqa: E731
+            return keep(trial, w), keep(new, value), damping * keep(0.2, 4.0), count + 1, gain
+
+        one = jnp.ones((), w0.dtype)
+        w, *_ = jax.lax.while_loop(going, body, (w0, loss(w0), 1e-3 * one, jnp.zeros((), int), one))
+        return w

@@ -1,0 +1,129 @@
+"""The unknown term: one small network per joint from velocity to torque."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..numerics.elementary import asinh
+
+
+class AbstractJointMap(eqx.Module):
+    """Torques that each depend on their own joint's velocity only; their derivatives then cost one slope, not one pass
+    for every tangent.
+    """
+
+    @abstractmethod
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Torques [N m] at joint velocities [rad/s]."""
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Torque of every joint [N m] at joint velocities."""
+        return _torque(self, v)
+
+
+@eqx.filter_custom_jvp
+def _torque(friction: AbstractJointMap, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    return friction.torque(v)
+
+
+@_torque.def_jvp
+def _torque_jvp(primals, tangents):
+    (friction, v), (by_weights, dv) = primals, tangents
+    torque, slope = jax.jvp(friction.torque, (v,), (jnp.ones_like(v),))
+    moved = jnp.zeros_like(torque) if dv is None else slope * dv
+    if jax.tree.leaves(by_weights):
+        moved = moved + eqx.filter_jvp(lambda f: f.torque(v), (friction,), (by_weights,))[1]
+    return torque, moved
+
+
+class FrictionNetwork(AbstractJointMap):
+    """tau_f(v): joint velocities [rad/s] to joint torques [N m], a network for each joint.
+
+    Each joint has features v / speed and asinh(v / knee), scaled to +-1 at `speed`, so that both the Stribeck
+    region near rest and the viscous region are smooth in them.
+    """
+
+    mlp: eqx.nn.MLP
+    """Leaves carry a leading joint axis."""
+    speed: Float[Array, " dof"]
+    """Largest velocity of interest [rad/s]."""
+    knee: Float[Array, " dof"]
+    """Velocity below which the map is resolved linearly [rad/s]."""
+    scale: Float[Array, " dof"]
+    """Torque of a unit output [N m]."""
+
+    def __init__(
+        self,
+        speed: Float[Array, " dof"],
+        scale: Float[Array, " dof"],
+        *,
+        key: PRNGKeyArray,
+        width: int = 8,
+        depth: int = 2,
+        resolution: float = 100.0,
+    ):
+        def make(key):
+            return eqx.nn.MLP(2, "scalar", width, depth, jax.nn.tanh, dtype=speed.dtype, key=key)
+
+        self.mlp = eqx.filter_vmap(make)(jax.random.split(key, speed.shape[0]))
+        self.speed = speed
+        self.knee = speed / resolution
+        self.scale = scale
+
+    def __str__(self) -> str:
+        speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
+        return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
+
+    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Friction torque at joint velocities [N m]."""
+        top = asinh(self.speed / self.knee)
+        features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)
+        return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
+
+    def nodes(self, count: int) -> Float[Array, "dof count"]:
+        """Velocities [rad/s], dense near rest, at which the map is tabulated in the M-step."""
+        top = jnp.arcsinh(self.speed / self.knee)
+        line = jnp.linspace(-1.0, 1.0, count, dtype=self.speed.dtype)
+        return self.knee[:, None] * jnp.sinh(top[:, None] * line[None, :])
+
+    def weights(self) -> Float[Array, " weight"]:
+        """All network weights as one vector."""
+        return ravel_pytree(eqx.filter(self.mlp, eqx.is_inexact_array))[0]
+
+    def with_weights(self, flat: Float[Array, " weight"]) -> "FrictionNetwork":
+        """This map with the weights replaced."""
+        arrays, static = eqx.partition(self.mlp, eqx.is_inexact_array)
+        return eqx.tree_at(lambda f: f.mlp, self, eqx.combine(ravel_pytree(arrays)[1](flat), static))
+
+
+class FixedFriction(eqx.Module):
+    """A map that is known, with the interface of one that is learned: there is nothing to learn."""
+
+    law: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
+    scale: Float[Array, " dof"]
+
+    def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Torque at joint velocities [N m]."""
+        return self.law(v)
+
+    def nodes(self, count: int) -> Float[Array, "dof 2"]:
+        """Two velocities; any would do."""
+        return jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
+
+    def weights(self) -> Float[Array, " 0"]:
+        """None."""
+        return jnp.zeros(0)
+
+    def with_weights(self, flat: Float[Array, " 0"]) -> "FixedFriction":
+        """This map."""
+        return self
+
+
+def NoFriction(scale: Float[Array, " dof"]) -> FixedFriction:
+    """A machine that is declared free of friction."""
+    return FixedFriction(jnp.zeros_like, scale)

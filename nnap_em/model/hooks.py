@@ -1,0 +1,90 @@
+"""The hooks of effects, run one effect after the other: the one place that the model and the score test share."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects.base import AbstractEffect, Scalar, Scene
+from ..numerics.gaussian import spd_solve
+from ..systems.base import AbstractSystem
+
+Effects = Sequence[AbstractEffect]
+
+
+def reaching(
+    effects: Effects, system: AbstractSystem, u: Float[Array, "time input"], dt: float
+) -> Float[Array, "time input"]:
+    """What reaches the joints of the commanded inputs of a sequence [N m]."""
+    for effect in effects:
+        if effect.joint in system.joints:
+            i = system.joints.index(effect.joint)
+            u = u.at[:, i].set(effect.input(u[:, i], dt))
+    return u
+
+
+def machine(effects: Effects, system: AbstractSystem, time: Scalar) -> AbstractSystem:
+    """The machine as it truly is at some time [s]."""
+    for effect in effects:
+        system = effect.physics(system, time)
+    return system
+
+
+def acceleration(
+    effects: Effects, scene: Scene, memory: Float[Array, " memory"], force: Float[Array, " dof"]
+) -> Float[Array, " dof"]:
+    """Of the joints, under the inputs, all that acts in the scene, and an extra generalised force [N m]."""
+    known = scene.drive + force - scene.system.bias(scene.q, scene.v)
+    return spd_solve(scene.system.mass(scene.q), _total(effects, scene, memory, known))
+
+
+def added(
+    effects: Effects, scene: Scene, memory: Float[Array, " memory"], acceleration: Float[Array, " dof"]
+) -> Float[Array, " dof"]:
+    """Generalised force that the effects add to a scene without them, at a given acceleration [N m]."""
+    extra = _total(effects, scene, memory, jnp.zeros_like(scene.v)) - scene.friction
+    system, true = scene.system, machine(effects, scene.system, scene.time)
+    if true is system:
+        return extra
+    slow = (system.mass(scene.q) - true.mass(scene.q)) @ acceleration
+    return extra + slow + system.bias(scene.q, scene.v) - true.bias(scene.q, scene.v)
+
+
+def _total(
+    effects: Effects, scene: Scene, memory: Float[Array, " memory"], known: Float[Array, " dof"]
+) -> Float[Array, " dof"]:
+    """`known` with the forces of the effects, and friction as it truly is, on top [N m]."""
+    torque = scene.friction
+    for effect, own in _memories(effects, memory):
+        torque = effect.friction(torque, scene)
+        known = known + effect.force(scene, own)
+    return known + torque
+
+
+def drift(effects: Effects, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
+    """Time derivative of the memory of all effects."""
+    return jnp.concatenate([memory[:0], *(effect.drift(scene, own) for effect, own in _memories(effects, memory))])
+
+
+def read(
+    effects: Effects,
+    names: Sequence[str],
+    values: Float[Array, " readable"],
+    past: Callable[[Scalar], Float[Array, " readable"]],
+) -> Float[Array, " readable"]:
+    """What sensors on `values` read; `past(delay)` are the values some seconds ago."""
+    for effect in effects:
+        for i, name in enumerate(names):
+            if effect.channel in (name, "all"):
+                values = values.at[i].set(effect.reading(values[i], lambda delay, i=i: past(delay)[i]))
+    return values
+
+
+def _memories(
+    effects: Effects, memory: Float[Array, " memory"]
+) -> Iterator[tuple[AbstractEffect, Float[Array, " memory"]]]:
+    """Every effect with its own part of the memory."""
+    place = 0
+    for effect in effects:
+        yield effect, memory[place : place + effect.memory]
+        place += effect.memory

@@ -1,0 +1,145 @@
+"""The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k) + v_k."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..data.dataset import Dataset
+from ..effects.base import AbstractEffect, Scene
+from ..numerics.gaussian import Gaussian
+from ..numerics.ode import integrate
+from ..systems.base import AbstractSystem
+from . import hooks
+from .base import AbstractModel
+
+
+class Inputs(NamedTuple):
+    """What acts on a machine from outside, in every row or in one."""
+
+    u: Float[Array, "*time input"]
+    """What reaches the joints [N m, or N]."""
+    before: Float[Array, "*time input"]
+    """What reached the joints one row before; 0 in the first row."""
+    time: Float[Array, "*time"]
+    """The clock in the middle of the step [s]."""
+    age: Float[Array, "*time"]
+    """Since the first row [s]."""
+
+    @classmethod
+    def held(cls, u: Float[Array, " input"]) -> "Inputs":
+        """One row of inputs that begin at time 0 and stay."""
+        return cls(u, u, jnp.zeros((), u.dtype), jnp.zeros((), u.dtype))
+
+
+class StateSpaceModel(AbstractModel):
+    """Known physics with an unknown torque, observed through noise [paper, eqs. 6 to 8 and 16].
+
+    The state is (q, v), then the memory of the effects in their order.
+    """
+
+    system: AbstractSystem
+    unknown: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
+    """Static map of joint velocity to torque, to be learned."""
+    start: Gaussian
+    """Prior of the state in the first row."""
+    log_q: Float[Array, " state"]
+    """Log of the process-noise variance per step [rad^2, (rad/s)^2]."""
+    log_r: Float[Array, " obs"]
+    """Log of the measurement variance."""
+    measured: tuple[int, ...] = eqx.field(static=True)
+    """Which states are read, in the order of y."""
+    dt: float = eqx.field(static=True)
+    """Sample interval [s]."""
+    substeps: int = eqx.field(static=True, default=2)
+    effects: tuple[AbstractEffect, ...] = ()
+    """What the declared physics lacks."""
+
+    def __str__(self) -> str:
+        names = self.system.coordinates + self.system.rates
+        noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)
+        reads = ", ".join(f"{name} (noise {std:.2g} {self.system.unit(name)})" for name, std in noise)
+        found = [self._described(effect) for effect in self.effects]
+        return "\n  ".join([f"{self.system}, a row every {self.dt:g} s", f"reads: {reads}", *found])
+
+    def _described(self, effect: AbstractEffect) -> str:
+        units, joint = effect.units_on(self.system), f" at joint {effect.joint}" if effect.joint else ""
+        values = (f", {name} = {float(value):.4g} {units[name]}" for name, value in effect.values().items())
+        return f"{effect.name}{joint}{''.join(values)}"
+
+    def inputs(self, seq: Dataset) -> Inputs:
+        """What acts from outside in every row, as the effects have it."""
+        u, t = hooks.reaching(self.effects, self.system, jnp.asarray(seq.u), self.dt), jnp.asarray(seq.t)
+        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1])
+
+    def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
+        """What the effects see at one moment."""
+        dof = len(self.system.coordinates)
+        q, v = x[:dof], x[dof : 2 * dof]
+        system = hooks.machine(self.effects, self.system, u.time)
+        return Scene(system, q, v, system.drive(u.u), u.time, self.unknown(v), self.unknown)
+
+    def rate(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> Float[Array, " state"]:
+        """Time derivative of the state under inputs u and an extra generalised force [N m]."""
+        memory, scene = x[2 * force.shape[0] :], self.scene(x, u)
+        acceleration = hooks.acceleration(self.effects, scene, memory, force)
+        return jnp.concatenate([scene.v, acceleration, hooks.drift(self.effects, scene, memory)])
+
+    def transition(
+        self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
+    ) -> Float[Array, " state"]:
+        """Mean of the state one sample later."""
+        extra = jnp.zeros(len(self.system.coordinates), x.dtype) if force is None else force
+        return integrate(lambda x: self.rate(x, u, extra), x, self.dt, self.steps)
+
+    @property
+    def steps(self) -> int:
+        """Integration steps of one sample, as many as the stiffest effect asks for."""
+        return max([self.substeps, *(effect.substeps for effect in self.effects)])
+
+    def readable(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " readable"]:
+        """What sensors on all coordinates and rates would read without noise."""
+        names = self.system.coordinates + self.system.rates
+
+        def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
+            """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
+            before, reach = u._replace(u=u.before), jnp.minimum(delay, u.age)
+            still = jnp.zeros(len(self.system.coordinates), x.dtype)
+            return integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3)[: len(names)]
+
+        return hooks.read(self.effects, names, x[: len(names)], past)
+
+    def shown(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " readable"]:
+        """Coordinates and rates; those that are measured as their sensors read them."""
+        r = self.readable(x, u)
+        return jnp.stack([r[i] if i in self.measured else x[i] for i in range(r.shape[0])])
+
+    def emission(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " obs"]:
+        """Mean of the reading."""
+        r = self.readable(x, u)
+        return jnp.stack([r[i] for i in self.measured])
+
+
+def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) -> StateSpaceModel:
+    """`model` with other effects: memory states are dropped or begin at rest."""
+    dof = len(model.system.coordinates)
+    spread = [effect.memory_scale() for effect in effects if effect.memory]
+    wide = jnp.concatenate([jnp.ones(0, model.log_q.dtype), *spread])
+    mean = jnp.concatenate([model.start.mean[: 2 * dof], jnp.zeros_like(wide)])
+    cov = jax.scipy.linalg.block_diag(model.start.cov[: 2 * dof, : 2 * dof], jnp.diag((0.1 * wide) ** 2))
+    log_q = jnp.concatenate([model.log_q[: 2 * dof], 2 * jnp.log(1e-3 * wide)])
+    return StateSpaceModel(
+        system=model.system,
+        unknown=model.unknown,
+        start=Gaussian(mean, cov),
+        log_q=log_q,
+        log_r=model.log_r,
+        measured=model.measured,
+        dt=model.dt,
+        substeps=model.substeps,
+        effects=effects,
+    )

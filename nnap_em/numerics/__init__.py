@@ -1,0 +1,1 @@
+"""Small dense algebra, one sample interval of an ODE, elementary functions, and work spread over devices."""

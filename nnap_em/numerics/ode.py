@@ -1,0 +1,73 @@
+"""One sample interval of an ordinary differential equation, through diffrax, differentiable forward and backward."""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class RK4(diffrax.AbstractSolver):
+    """Kutta's classical fourth-order method as a diffrax solver [Hairer, Norsett & Wanner 1993, table II.1.2].
+
+    Each stage looks ahead along the slope of the one before it only, so that one loop over the stages holds the whole
+    step: a compiler that sees them unrolled computes them again and again, and diffrax's own loop keeps all slopes.
+    """
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar[Callable] = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        """Of the error over an interval."""
+        return 4
+
+    def init(self, terms, t0, t1, y0, args):
+        """No state."""
+        return None
+
+    def func(self, terms, t0, y0, args):
+        """The rate itself."""
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """The value after one step; `terms` is a function of time and value."""
+        h = t1 - t0
+        times = t0 + h * jnp.asarray([0.0, 0.5, 0.5, 1.0], y0.dtype)
+        ahead = h * jnp.asarray([0.5, 0.5, 1.0, 0.0], y0.dtype)
+        share = h / 6 * jnp.asarray([1.0, 2.0, 2.0, 1.0], y0.dtype)
+
+        def stage(carry, slices):
+            y, y1 = carry
+            t, ahead, share = slices
+            slope = terms.vf(t, jnp.stack(y), args)
+            now = [a + ahead * slope[i] for i, a in enumerate(start)]
+            return (now, [a + share * slope[i] for i, a in enumerate(y1)]), None
+
+        start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
+        (_, y1), _ = jax.lax.scan(stage, (start, start), (times, ahead, share))
+        y1 = jnp.stack(y1)
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+
+def integrate(
+    rate: Callable[[Float[Array, " state"]], Float[Array, " state"]],
+    x: Float[Array, " state"],
+    dt: float,
+    substeps: int,
+) -> Float[Array, " state"]:
+    """State after `dt` [s] of x' = rate(x), by `substeps` equal steps of `RK4`.
+
+    The input is held over the interval (zero-order hold), so the rate does not depend on time.
+    """
+    solver = RK4()
+    term = diffrax.ODETerm(lambda t, y, args: rate(y))
+    h = dt / substeps
+
+    def body(x, _):
+        x, *_ = solver.step(term, jnp.zeros((), x.dtype), jnp.asarray(h, x.dtype), x, None, None, made_jump=False)
+        return x, None
+
+    x, _ = jax.lax.scan(body, x, None, length=substeps)
+    return x

@@ -1,0 +1,24 @@
+"""Compiled programs hold memory maps, and a process may have 65,530 of them: those no longer needed are let go."""
+
+from pathlib import Path
+
+import jax
+
+MOST = 40_000
+"""Maps beyond which programs are let go; a large one holds some hundred."""
+
+
+def maps() -> int:
+    """Memory maps of this process; 0 where the system does not tell."""
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def let_go(most: int = MOST) -> bool:
+    """Drop all compiled programs where they hold more than `most` maps; what is needed again is compiled again."""
+    if maps() <= most:
+        return False
+    jax.clear_caches()
+    return True

@@ -1,0 +1,1 @@
+"""Numbers, figures and the page that a run leaves behind."""

@@ -1,0 +1,171 @@
+"""Everything that `nnap-em diagnose` leaves behind: report.json, report.html and tables."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..data.dataset import Logs
+from ..diagnose.findings import Finding, advice, entry, friction_change, verdict
+from ..diagnose.keys import Key, key_of, words
+from ..diagnose.look import Step
+from ..diagnose.loop import Closed
+from ..diagnose.residual import Names, Residual, names_of, residual, tests
+from ..em.identify import FrictionTable, friction_table
+from ..em.predict import GIVEN, Prediction
+from ..storage.files import replace_text
+from .document import errors, noise, parameters, predictions, shared
+from .effect_plots import effect_figure, screen_figure
+from .error_plots import error_figure, prediction_figure
+from .friction_plots import friction_figure
+from .page import Picture, page, picture
+from .residual_plots import innovation_figure, residual_figure
+from .tables import visited_nodes, write_friction, write_json
+
+Say = Callable[[str], None]
+
+
+def write_diagnosis(
+    out: Path,
+    closed: Closed,
+    found: list[Finding],
+    train: Logs,
+    test: Logs | None,
+    *,
+    seed: int,
+    began: float,
+    say: Say,
+) -> None:
+    """Write the report of a closed loop into the folder `out`; `began` is `time.perf_counter()` at the start."""
+    names, both = names_of(closed.before), {"before": closed.before, "after": closed.after}
+    sides = both if found else {"before": closed.before}
+    predicted = predictions(sides, test)
+    error = errors(predicted, sides, test) if test else None
+    if error:
+        error.setdefault("after", error["before"])
+    left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
+    lacked = residual(closed.after, train.data, add_back=True) if found else left["before"]
+    told = {name: tests(each, names) for name, each in left.items()}
+    visited = _visited(left["before"], len(names.rates))
+    tables = {n: friction_table(f, jnp.asarray(visited)) for n, f in sides.items() if closed.before.rig.friction}
+    for name, table in tables.items():
+        write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
+    figures = [
+        *_error_pictures(error, predicted, tables, names, test),
+        *_residual_pictures(left, lacked, names),
+        *_found_pictures(found),
+        *_search_pictures(closed.steps),
+    ]
+    document = shared(closed.before, train, test, seed=seed, began=began) | {
+        "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"])),
+        "effects": [entry(f) for f in found],
+        "error": error,
+        "models": {name: f"{name}.npz" for name in both},
+        "friction_change": friction_change(closed, visited),
+        "tests": {name: [t._asdict() for t in each] for name, each in told.items()},
+        "parameters": {name: parameters(fitted) for name, fitted in both.items()},
+        "noise": {name: noise(fitted) for name, fitted in both.items()},
+        "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
+        "next": advice(found),
+    }
+    write_json(out / "report.json", document)
+    replace_text(out / "report.html", page(document, figures))
+    say(document["verdict"])
+    say(f"wrote {out / 'report.html'} and report.json")
+
+
+def _error_pictures(
+    error: dict[str, Any] | None,
+    predicted: Mapping[str, Prediction],
+    tables: Mapping[str, FrictionTable],
+    names: Names,
+    test: Logs | None,
+) -> list[Picture]:
+    """How far predictions are off, one of them, and the friction that was learned."""
+    out = []
+    if error:
+        caption = "On test sequences that no fit and no choice has seen."
+        out.append(picture("error", "Prediction error", caption, error_figure(error, names)))
+    if tables:
+        caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
+        out.append(
+            picture("error", "Learned friction", caption, friction_figure(tables, names, title="Learned friction"))
+        )
+    if test:
+        out.append(_prediction_picture(predicted, names, test))
+    return out
+
+
+def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test: Logs) -> Picture:
+    """The longest test sequence."""
+    number = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1)))
+    rows = np.asarray(test.data.valid[number])
+    sides = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predicted.items()}
+    t, y = (np.asarray(a[number])[rows] for a in (test.data.t, test.data.y))
+    caption = f"Predicted from its first second ({test.files[number]})."
+    return picture("error", "One test sequence", caption, prediction_figure(t, y, names, sides, GIVEN))
+
+
+def _residual_pictures(left: Mapping[str, Residual], lacked: Residual, names: Names) -> list[Picture]:
+    return [
+        picture(
+            "residual",
+            "The force that the declared model lacks",
+            "What the smoothed motion asks for beyond the declared model, against everything that could cause it.",
+            residual_figure(lacked, names, left.get("after")),
+        ),
+        picture(
+            "residual",
+            "One-step errors",
+            "Left: they should not remember each other. Right: they should follow the line.",
+            innovation_figure(left["before"], names, left.get("after")),
+        ),
+    ]
+
+
+def _found_pictures(found: list[Finding]) -> list[Picture]:
+    """Learned functions, and what is left beside a law."""
+    out = []
+    for finding in found:
+        if finding.curve is not None:
+            name = words(key_of(finding.effect))
+            rest = f"What is left of {name}, a function of {finding.curve.signal}"
+            title = rest if finding.effect.named else f"The learned {name}"
+            caption = "With its 90 % band, without its mean."
+            out.append(picture("found", title, caption, effect_figure(finding.curve)))
+    return out
+
+
+def _search_pictures(steps: tuple[Step, ...]) -> list[Picture]:
+    if not steps:
+        return []
+    first = next((step for step in steps if step.accepted), steps[0])
+    chosen = words(first.accepted) if first.accepted else None
+    entries = [(words(key), promise) for key, promise in first.screened[:10]]
+    figure = screen_figure(entries, first.measure, chosen=chosen)
+    caption = f"What each candidate promises, before any refit: {first.measure}."
+    return [picture("details", "The first look", caption, figure)]
+
+
+def _look(step: Step, dt: float) -> dict[str, Any]:
+    return {
+        "horizon_s": step.horizon * dt,
+        "measure": step.measure,
+        "screened": [_told(*each) for each in step.screened[:10]],
+        "refitted": [_told(*each) for each in step.refitted],
+        "accepted": words(step.accepted) if step.accepted else None,
+    }
+
+
+def _told(key: Key, gain: float) -> dict[str, Any]:
+    name, joint, channel, inputs = key
+    return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs), "gain": gain}
+
+
+def _visited(found: Residual, dof: int) -> Float[np.ndarray, "dof node"]:
+    """Velocities of each joint that the paths visit, dense near rest."""
+    inside = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
+    return visited_nodes(found.state[inside][:, dof : 2 * dof])

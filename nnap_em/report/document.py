@@ -1,0 +1,91 @@
+"""What report.json holds of any fit, whichever command made it."""
+
+import platform
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import numpy as np
+
+from .. import __version__
+from ..data.dataset import Logs
+from ..data.rig import parameter_unit
+from ..em.identify import FrictionTable, Identified, parameter_table
+from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
+from ..model.law import PARAMETERS, UNITS, describe, fit_law
+
+NO_TEST = "no test sequences (FOLDER/test/*.csv), so no prediction error"
+
+
+def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, began: float) -> dict[str, Any]:
+    """The keys of every report; `began` is `time.perf_counter()` at the start."""
+    system = fitted.model.system
+    return {
+        "format": 1,
+        "rig": fitted.rig.name,
+        "system": fitted.rig.system,
+        "units": {name: system.unit(name) for name in system.coordinates + system.rates},
+        "error_note": None if test else NO_TEST,
+        "masked": masked(train, test),
+        "seed": seed,
+        "seconds": time.perf_counter() - began,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of this package, of Python, and of what decides the last digits."""
+    names = ("jax", "jaxlib", "equinox", "numpy")
+    return {"nnap_em": __version__, "python": platform.python_version()} | {name: version(name) for name in names}
+
+
+def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
+    """What no fit and no filter saw of the logs."""
+    parts = (("train", train), ("test", test))
+    return [{"part": part, **entry._asdict()} for part, logs in parts if logs for entry in logs.masked]
+
+
+def parameters(fitted: Identified) -> dict[str, Any]:
+    """Estimated physical parameters."""
+    return {n: {"value": v, "std": s, "unit": parameter_unit(n)} for n, (v, s) in parameter_table(fitted).items()}
+
+
+def noise(fitted: Identified) -> dict[str, Any]:
+    """Standard deviations of readings, and of what pushes the states in every step."""
+    system, declared = fitted.model.system, fitted.rig.noise_std
+    reading, kick = (np.exp(0.5 * np.asarray(log)).tolist() for log in (fitted.model.log_r, fitted.model.log_q))
+    return {
+        "measurement": {
+            name: {"std": std, "estimated": name not in declared, "unit": system.unit(name)}
+            for name, std in zip(fitted.rig.measured, reading, strict=True)
+        },
+        "process_per_step": {
+            name: {"std": std, "unit": system.unit(name)}
+            for name, std in zip(system.coordinates + system.rates, kick, strict=False)  # behind these: memory
+        },
+    }
+
+
+def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Prediction]:
+    """Of the test sequences, from their first readings, by every model."""
+    key = jax.random.key(0)
+    return {name: predict(fitted, test.data, GIVEN, key=key) for name, fitted in sides.items()} if test else {}
+
+
+def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Any]:
+    """Of the predictions, for every column and horizon."""
+    found = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items() if test}
+    return {"given_s": GIVEN, "horizons_s": list(HORIZONS), **found}
+
+
+def friction_law(fitted: Identified, table: FrictionTable) -> list[dict[str, Any]]:
+    """The Stribeck law nearest to each learned map."""
+    system, law = fitted.model.system, fit_law(table.velocity, table.torque, table.cov)
+    out = []
+    for j, text in enumerate(describe(law, system.coordinates, system.angles)):
+        numbers = zip(PARAMETERS, law.value[j].tolist(), law.std[j].tolist(), UNITS[system.angles[j]], strict=True)
+        terms = {name: {"value": value, "std": std, "unit": unit} for name, value, std, unit in numbers}
+        out.append({"joint": j + 1, "parameters": terms, "text": text})
+    return out

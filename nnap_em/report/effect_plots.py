@@ -1,0 +1,45 @@
+"""What was found: learned functions, and what the first look suggested."""
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from ..diagnose.findings import Curve
+from .style import AFTER, READING, ZERO, band, head, styled, symbol
+
+
+@styled
+def effect_figure(found: Curve, *, title: str = "What was found") -> Figure:
+    """A learned function with its 90 % band."""
+    figure = Figure(figsize=(5.4, 3.4), layout="constrained")
+    ax = figure.subplots()
+    band(ax, found.x, found.mean, found.std, AFTER, "learned")
+    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+    signal = " + ".join(symbol(name) for name in found.signal.split(" + "))
+    ax.set(xlim=(found.x[0], found.x[-1]), xlabel=f"{signal} [{found.signal_unit}]")
+    ax.set_ylabel(f"force at joint {found.joint} [{found.unit}]")
+    head(figure, title, [ax])
+    return figure
+
+
+@styled
+def screen_figure(
+    entries: Sequence[tuple[str, float]],
+    measure: str = "expected gain in log-likelihood [nat]",
+    *,
+    chosen: str | None = None,
+    best: int = 10,
+    title: str = "What the first look suggested",
+) -> Figure:
+    """What the `best` candidates promise, in the `measure`, as bars; the `chosen` label in colour."""
+    top = sorted(entries, key=lambda e: -e[1])[:best]
+    figure = Figure(figsize=(7.4, 0.28 * max(len(top), 1) + 1.0), layout="constrained")
+    ax = figure.subplots()
+    colours = [AFTER if label == chosen else READING for label, _ in top]
+    ax.barh([label for label, _ in top], [gain for _, gain in top], color=colours, height=0.7)
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    ax.axvline(0, color=ZERO, lw=0.7)
+    ax.set_xlabel(measure)
+    head(figure, title, [ax])
+    return figure

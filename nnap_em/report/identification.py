@@ -1,0 +1,111 @@
+"""Everything that `nnap-em identify` leaves behind beside the model: report.json, report.html, table and figure."""
+
+import io
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..data.dataset import Logs
+from ..diagnose.findings import listed
+from ..diagnose.residual import names_of
+from ..em.identify import FrictionTable, Identified, friction_table
+from ..em.predict import smooth
+from ..storage.files import replace_bytes, replace_text
+from .document import errors, friction_law, noise, parameters, predictions, shared
+from .error_plots import error_figure
+from .friction_plots import friction_figure
+from .page import Picture, page, picture
+from .tables import visited_nodes, write_friction, write_json
+
+Say = Callable[[str], None]
+
+
+def write_identification(
+    out: Path,
+    fitted: Identified,
+    train: Logs,
+    test: Logs | None,
+    epochs: list[dict[str, Any]],
+    *,
+    smoother: str,
+    seed: int,
+    began: float,
+    say: Say,
+) -> None:
+    """Write the report of a fit whose model is model.npz in `out`; `began` is `time.perf_counter()` at the start."""
+    figures: list[Picture] = []
+    names, laws = names_of(fitted), None
+    if fitted.rig.friction:
+        visited = _velocities(fitted, train, epochs)
+        table = friction_table(fitted, jnp.asarray(visited_nodes(visited)))
+        laws = friction_law(fitted, table)
+        write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
+        figures.append(_draw(out / "friction.png", fitted, table, visited))
+    sides = {"fit": fitted}
+    error = errors(predictions(sides, test), sides, test) if test else None
+    if error:
+        caption = "On test sequences that the fit has not seen."
+        figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
+    each = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
+    document = shared(fitted, train, test, seed=seed, began=began) | {
+        "verdict": _verdict(fitted, len(train.files)),
+        "fit": error and {name: value for name, value in error.items() if name != "fit"} | error["fit"],
+        "error": error,
+        "noise": noise(fitted),
+        "parameters": parameters(fitted),
+        "friction_law": laws,
+        "log_likelihood": fitted.state.loglik.tolist(),
+        "epochs": each,
+        "left_out": each[-1]["left_out"],
+        "smoother": smoother,
+        "model": "model.npz",
+    }
+    _tell(document, say)
+    write_json(out / "report.json", document)
+    replace_text(out / "report.html", page(document, figures))
+    say(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
+
+
+def _verdict(fitted: Identified, sequences: int) -> str:
+    dof = len(fitted.model.system.coordinates)
+    friction = [f"the friction of {_counted(dof, 'joint')}"] * fitted.rig.friction
+    wanted = listed([*friction, *parameters(fitted)]) or "the noise"
+    return f"Fitted {wanted} to {_counted(sequences, 'sequence')} in {_counted(fitted.state.epoch, 'epoch')}."
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" + "s" * (count != 1)
+
+
+def _tell(document: dict[str, Any], say: Say) -> None:
+    for law in document["friction_law"] or []:
+        say(law["text"])
+    error = document["error"] or {"fit": {}}
+    for name, values in error["fit"].items():
+        pairs = zip(error["horizons_s"], values, strict=True)
+        say(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
+    for name, entry in document["parameters"].items():
+        say(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
+
+
+def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:
+    """Smoothed velocities of the training sequences that took part."""
+    mean = np.asarray(smooth(fitted, train.data).state.mean)
+    valid = np.array(train.data.valid)
+    valid[epochs[-1]["left_out"]] = False
+    inside = valid & np.isfinite(mean).all(axis=-1)
+    return mean[inside][:, mean.shape[-1] // 2 :]
+
+
+def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[np.ndarray, "sample dof"]) -> Picture:
+    """The learned maps as a file of their own, and for the page."""
+    figure = friction_figure({"learned": table}, names_of(fitted), list(visited.T))
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    replace_bytes(path, image.getvalue())
+    return picture("found", "Learned friction", "With its 90 % band; below: where the data were.", figure)

@@ -1,0 +1,210 @@
+"""The report as one page: a single HTML file without scripts that fetches nothing.
+
+`document` is what report.json holds; any of its keys may be missing or null.  The page itself is page.html.j2.
+"""
+
+import base64
+import io
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jinja2
+from matplotlib.figure import Figure
+
+from . import wording
+from .vocabulary import MEANINGS, WORDS
+from .wording import finite, number, ratio
+
+LEVEL = 0.05
+"""Corrected p-value below which a test counts as failed."""
+PLACES = ("found", "error", "residual", "details")
+"""Sections that figures may stand in."""
+_NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
+_TRUST = {
+    "share_of_error": ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely")),
+    "held_out_gain": _NATS,
+    "log_likelihood_gain": _NATS,
+}
+"""From where on a word is deserved: share of the error on recordings left out, log-likelihood [nat]; the first known
+decides, because nats are worth little where noise is not what the model says."""
+_SVG_UNITS = {b"pt": 96 / 72, b"in": 96.0}
+
+
+class Picture(NamedTuple):
+    """A figure of the page."""
+
+    title: str
+    caption: str
+    image: bytes
+    """PNG or SVG."""
+    place: str = "residual"
+    """Section: "found", "error", "residual" or "details"."""
+
+    @property
+    def source(self) -> str:
+        """The image as an address that holds it."""
+        return f"data:{_media(self)};base64,{base64.b64encode(self.image).decode('ascii')}"
+
+    @property
+    def style(self) -> str:
+        """About its own size; wide ones scroll inside their box on a phone."""
+        width = _width(self.image)
+        least = round(0.72 * width) if width > 560 else 0
+        return f"min-width:{least}px;max-width:{round(1.1 * width)}px" if width else ""
+
+
+def picture(place: str, title: str, caption: str, figure: Figure) -> Picture:
+    """A drawn figure for the page."""
+    image = io.BytesIO()
+    figure.savefig(image, format="svg")
+    return Picture(title, caption, image.getvalue(), place)
+
+
+Figures = Sequence[Picture | tuple[str, str, bytes]]
+
+
+def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
+    """The whole page; raises ValueError where an image is neither PNG nor SVG."""
+    pictures = [figure if isinstance(figure, Picture) else Picture(*figure) for figure in figures]
+    for picture in pictures:
+        if picture.place not in PLACES:
+            raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")
+    error, found = document.get("error") or {}, document.get("effects") or []
+    parameters = document.get("parameters") or {}
+    return (
+        _environment()
+        .get_template("page.html.j2")
+        .render(
+            document=document,
+            fitted="effects" not in document and "model" in document,
+            pictures=pictures,
+            effects=found,
+            errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
+            tiles=_error_tiles(document) + _test_tiles(document),
+            failed=_failures(document.get("tests")),
+            doubted=_doubted(document),
+            parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
+        )
+    )
+
+
+def _environment() -> jinja2.Environment:
+    """Templates that escape all text, with the words of a report as filters."""
+    loader = jinja2.PackageLoader("nnap_em", "report")
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence")
+    made.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "look_first": _look_first}
+    made.tests |= {"finite": finite, "failed": _fails}
+    made.globals |= {"meanings": MEANINGS, "words": WORDS, "level": LEVEL, "at": _at, "ratio": ratio}
+    return made
+
+
+# --- what is worked out of the document
+
+
+def _error_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Title, number and remark of the errors about 1 s ahead of the first two columns."""
+    error, units = document.get("error") or {}, document.get("units") or {}
+    horizons, after = error.get("horizons_s") or [], error.get("after") or {}
+    tiles = []
+    for column, values in list((error.get("before") or error.get("fit") or {}).items())[:2]:
+        if not horizons:
+            break
+        place = min(range(len(horizons)), key=lambda i: abs(horizons[i] - 1.0))
+        first, last, unit = _at(values, place), _at(after.get(column), place), units.get(column) or ""
+        title = f"error of {column}, {horizons[place]:g} s ahead"
+        if document.get("effects"):
+            times = ratio(first, last)
+            change = f"{number(first, 2)} → {number(last, 2)} {unit}"
+            tiles.append((title, change, f"{times} smaller" if times.endswith("×") else times))
+        else:
+            tiles.append((title, f"{number(first, 2)} {unit}", "on test sequences"))
+    return tiles
+
+
+def _test_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    failed = _failures(document.get("tests"))
+    if failed is None:
+        return []
+    text = str(failed.before) if failed.after is None else f"{failed.before} → {failed.after}"
+    return [("failed tests of one-step errors", text, f"of {failed.total}; a right model fails none")]
+
+
+def _at(values: Any, place: int) -> Any:
+    return values[place] if values and place < len(values) else None
+
+
+class _Failed(NamedTuple):
+    """How many tests failed before and after (None: there is no after), and how many of these by little."""
+
+    total: int
+    before: int
+    after: int | None
+    slight_before: int
+    slight_after: int
+
+
+def _failures(tests: Any) -> _Failed | None:
+    if not (tests and tests.get("before")):
+        return None
+    sides = [[t for t in tests.get(side) or [] if _fails(t)] for side in ("before", "after")]
+    slight = [sum(bool(t.get("slight")) for t in side) for side in sides]
+    first, last = (len(side) - little for side, little in zip(sides, slight, strict=True))
+    return _Failed(len(tests["before"]), first, last if tests.get("after") else None, *slight)
+
+
+def _fails(test: Mapping[str, Any]) -> bool:
+    p = test.get("p_value")
+    return finite(p) and p < LEVEL  # type: ignore[operator]
+
+
+def _doubted(document: Mapping[str, Any]) -> bool:
+    """Whether the test sequences speak against what was found."""
+    error = document.get("error") or {}
+    horizons = error.get("horizons_s") or []
+    if 1.0 not in horizons or not document.get("effects"):
+        return False
+    at = horizons.index(1.0)
+    pairs = [(error["before"][c][at], error["after"][c][at]) for c in error["before"] if c in error["after"]]
+    known = [(b, a) for b, a in pairs if finite(b) and finite(a)]
+    return bool(known) and known[0][1] >= known[0][0]
+
+
+def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
+    """How sure the finding is, in words; empty where nothing tells."""
+    told = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
+    decisive = next(((scale, value) for _, scale, value in told if finite(value)), None)
+    if decisive is None:
+        return ""
+    if doubted:
+        return "Doubtful: the test sequences are predicted no better with it"
+    return next((word for least, word in decisive[0] if decisive[1] >= least), "A hint only")
+
+
+def _look_first(entries: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
+    """The most promising of what was looked at."""
+    return sorted(entries or [], key=lambda entry: -(entry.get("gain") or 0.0))[:8]
+
+
+# --- images
+
+
+def _media(picture: Picture) -> str:
+    if picture.image.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    head = picture.image[:4000].lstrip()
+    if head.startswith((b"<svg", b"<?xml", b"<!DOCTYPE svg")) and b"<svg" in head:
+        return "image/svg+xml"
+    raise ValueError(f"figure {picture.title!r}: neither PNG nor SVG")
+
+
+def _width(image: bytes) -> int:
+    """In CSS pixels; 0 where it is unknown.  PNG is taken for 150 dots per inch."""
+    if image.startswith(b"\x89PNG"):
+        return round(struct.unpack(">I", image[16:20])[0] * 96 / 150) if len(image) >= 24 else 0
+    found = re.search(rb"<svg\b[^>]*?\swidth=[\"']([0-9.]+)(pt|in|px)?[\"']", image[:4000])
+    return round(float(found[1]) * _SVG_UNITS.get(found[2], 1.0)) if found else 0

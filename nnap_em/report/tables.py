@@ -1,0 +1,40 @@
+"""Numbers as files: JSON reports and friction tables, written whole or not at all."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.formats import write_csv
+from ..storage.files import replace_text
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all; what is no finite number becomes null."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: clean(item) for name, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [clean(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def visited_nodes(velocity: Float[np.ndarray, "sample dof"], nodes: int = 101) -> Float[np.ndarray, "dof node"]:
+    """Velocities from the 0.5th to the 99.5th percentile of each joint, dense near rest, where friction bends."""
+    low, high = np.percentile(velocity, [0.5, 99.5], axis=0)
+    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
+    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), nodes))).T
+
+
+def write_friction(path: Path, velocity, torque, std) -> None:
+    """A friction table as the interface has it: joint,velocity,torque,torque_std."""
+    joint = np.repeat(1 + np.arange(velocity.shape[0]), velocity.shape[1])
+    columns = {"velocity": velocity, "torque": torque, "torque_std": std}
+    write_csv(path, {"joint": joint} | {name: np.asarray(values).ravel() for name, values in columns.items()})

@@ -1,0 +1,216 @@
+"""Extended Kalman filter and Rauch-Tung-Striebel smoother for one sequence.
+
+Measurement noise is diagonal, so readings are absorbed one at a time; a missing one is skipped by its mask.
+[Sarkka & Svensson 2023, "Bayesian Filtering and Smoothing", 2nd ed., chapters 7 and 13]
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..model.base import Prepared
+from ..numerics.gaussian import Gaussian, cholesky, lower, product, spd_solve, symmetric, upper_solve
+
+
+class Affine(NamedTuple):
+    """x_{k+1} = matrix x_k + offset + noise beyond the process noise, for every step of a sequence."""
+
+    matrix: Float[Array, "*steps state state"]
+    offset: Float[Array, "*steps state"]
+    noise: Float[Array, "*steps state state"]
+    """Covariance of what the affine map leaves out of the transition; 0 for a tangent."""
+
+
+class Reading(NamedTuple):
+    """y_k = rows x_k + offset + noise, for every row of a sequence."""
+
+    rows: Float[Array, "*time obs state"]
+    offset: Float[Array, "*time obs"]
+
+
+class Filtered(NamedTuple):
+    """p(x_k | y_{0:k}), its one-step prediction and the innovations, whitened one reading at a time."""
+
+    state: Gaussian
+    predicted: Gaussian
+    innovation: Float[Array, "*time obs"]
+    """Innovation over its standard deviation; 0 where not measured."""
+    log_variance: Float[Array, "*time obs"]
+    """Log innovation variance; 0 where not measured."""
+    gain: Float[Array, "*time obs state"]
+    affine: Affine
+    reading: Reading
+    loglik: Float[Array, ""]
+
+
+class Smoothed(NamedTuple):
+    """p(x_k | all y), with the backward gains cov(x_k, x_{k+1} | y) = gain_k cov_{k+1}."""
+
+    state: Gaussian
+    gain: Float[Array, "steps state state"]
+
+
+class Tangent(eqx.Module):
+    """The transition linearised at the mean, by `jax.jacfwd` [paper, eq. 14]."""
+
+    def __call__(self, model, about: Gaussian, u: Any) -> Affine:
+        """One step about the mean."""
+
+        def both(x):
+            y = model.transition(x, u)
+            return y, y
+
+        matrix, value = jax.jacfwd(both, has_aux=True)(about.mean)
+        return Affine(matrix, value - product(matrix, about.mean), jnp.zeros_like(matrix))
+
+
+TANGENT = Tangent()
+
+
+class Cubature(eqx.Module):
+    """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square.
+
+    It sees a friction kink as wide as the state is uncertain, and owns up to what an affine map cannot follow.
+    [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017, "Iterated posterior linearization smoother"]
+    """
+
+    def __call__(self, model, about: Gaussian, u: Any) -> Affine:
+        """One step about the whole Gaussian."""
+        rows = cholesky(about.cov)
+        reach = math.sqrt(len(rows))
+        spread = reach * lower(rows).T  # the points of `cubature` are opposite pairs along the columns of the factor
+        x = jnp.concatenate([about.mean[None] + spread, about.mean[None] - spread])
+        y = jax.vmap(lambda x: model.transition(x, u))(x)
+        ahead, behind = jnp.split(y, 2)
+        mean = jnp.mean(y, axis=0)
+        slope = (ahead - behind).T / (2 * reach)  # matrix @ factor
+        matrix = upper_solve(rows, slope.T).T
+        bend = ((ahead + behind) / 2 - mean[None]) / reach
+        noise = product(bend.T, bend)
+        return Affine(matrix, mean - product(matrix, about.mean), noise)
+
+
+CUBATURE = Cubature()
+
+
+def linear_reading(model, x: Float[Array, " state"], u: Any) -> Reading:
+    """The emission linearised at x."""
+
+    def both(x):
+        y = model.emission(x, u)
+        return y, y
+
+    rows, value = jax.jacfwd(both, has_aux=True)(x)
+    return Reading(rows, value - product(rows, x))
+
+
+def _condition(state: Gaussian, reading: Reading, r, y, observed):
+    """Absorb readings one at a time: y_i = rows_i x + offset_i + noise of variance r_i."""
+    mean, cov = state
+    rows = reading.rows
+    whitened, log_variance, gains = [], [], []
+    for i in range(y.shape[0]):
+        pc = product(cov, rows[i])
+        s = jnp.sum(rows[i] * pc) + r[i]
+        gain = jnp.where(observed[i], pc / s, 0.0)
+        e = y[i] - reading.offset[i] - jnp.sum(rows[i] * mean)
+        mean = mean + gain * e
+        cov = cov - gain[:, None] * pc[None, :]
+        whitened.append(jnp.where(observed[i], e / jnp.sqrt(s), 0.0))
+        log_variance.append(jnp.where(observed[i], jnp.log(s), 0.0))
+        gains.append(gain)
+    return Gaussian(mean, symmetric(cov)), jnp.stack(whitened), jnp.stack(log_variance), jnp.stack(gains)
+
+
+def _filter(log_q, log_r, start: Gaussian, seq: Prepared, given, affine_at, reading_at) -> Filtered:
+    """Kalman recursion.
+
+    `affine_at(state, given)` gives the transition that follows a filtered state, `reading_at(mean, given)` the
+    emission at a predicted mean, of what is `given` in the row.
+    """
+    q, r = jnp.diag(jnp.exp(log_q)), jnp.exp(log_r)
+    stay = jnp.eye(start.mean.shape[0], dtype=start.mean.dtype)
+    rest = Affine(stay, jnp.zeros_like(start.mean), jnp.zeros_like(stay))
+
+    def step(predicted, slices):
+        y, observed, active, given = slices
+        reading = reading_at(predicted.mean, given)
+        state, whitened, log_variance, gain = _condition(predicted, reading, r, y, observed)
+        affine = affine_at(state, given)
+        affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
+        following = Gaussian(
+            product(affine.matrix, state.mean) + affine.offset,
+            symmetric(product(product(affine.matrix, state.cov), affine.matrix.T))
+            + affine.noise
+            + jnp.where(active, q, 0.0),
+        )
+        return following, (state, predicted, whitened, log_variance, gain, affine, reading)
+
+    _, (state, predicted, whitened, log_variance, gain, affine, reading) = jax.lax.scan(
+        step, start, (seq.y, seq.observed, seq.active, given)
+    )
+    count = jnp.sum(seq.observed).astype(whitened.dtype)
+    loglik = -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi))
+    return Filtered(state, predicted, whitened, log_variance, gain, affine, reading, loglik)
+
+
+def ekf(model, start: Gaussian, seq: Prepared, linearise: Callable = TANGENT) -> Filtered:
+    """Extended Kalman filter: linearised about its own filtered states, by tangents or by cubature.
+
+    Entries of y that are not `observed` may hold anything finite.  The state rests over steps that are not `active`
+    (padding); the last affine map leads out of the data.
+    """
+    return _filter(
+        model.log_q,
+        model.log_r,
+        start,
+        seq,
+        seq.inputs,
+        lambda state, u: linearise(model, state, u),
+        lambda mean, u: linear_reading(model, mean, u),
+    )
+
+
+def kalman_filter(
+    log_q: Float[Array, " state"],
+    log_r: Float[Array, " obs"],
+    start: Gaussian,
+    affine: Affine,
+    reading: Reading,
+    seq: Prepared,
+) -> Filtered:
+    """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
+    return _filter(
+        log_q, log_r, start, seq, (affine, reading), lambda state, given: given[0], lambda mean, given: given[1]
+    )
+
+
+def relinearised(model, about: Gaussian, seq: Prepared, linearise: Callable) -> Filtered:
+    """Filter of `model` with all steps linearised about a path at once [Bell 1994]."""
+    affine = jax.vmap(lambda state, u: linearise(model, state, u))(about, seq.inputs)
+    reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(about.mean, seq.inputs)
+    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, seq)
+
+
+def rts(filtered: Filtered) -> Smoothed:
+    """Rauch-Tung-Striebel smoother behind either filter."""
+
+    def step(later: Gaussian, slices):
+        state, predicted, gain = slices
+        mean = state.mean + product(gain, later.mean - predicted.mean)
+        cov = symmetric(state.cov + product(product(gain, later.cov - predicted.cov), gain.T))
+        return Gaussian(mean, cov), Gaussian(mean, cov)
+
+    last = jax.tree.map(lambda a: a[-1], filtered.state)
+    earlier = jax.tree.map(lambda a: a[:-1], filtered.state)
+    predicted = jax.tree.map(lambda a: a[1:], filtered.predicted)
+    crossed = jax.vmap(product)(filtered.affine.matrix[:-1], earlier.cov)
+    gain = jnp.swapaxes(jax.vmap(spd_solve)(predicted.cov, crossed), 1, 2)  # all times at once
+    _, states = jax.lax.scan(step, last, (earlier, predicted, gain), reverse=True)
+    mean, cov = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, last)
+    return Smoothed(Gaussian(mean, cov), gain)

@@ -1,0 +1,20 @@
+"""Particle smoother: a filter that looks ahead, and draws of trajectories backward through its particles."""
+
+from .backward import ExactBackward, ffbs
+from .filter import particle_filter
+from .metropolis import MetropolisBackward
+from .potentials import Potentials
+from .proposals import Bootstrap, Guided, Lookahead
+from .smoother import ParticleSmoother
+
+__all__ = [
+    "Bootstrap",
+    "ExactBackward",
+    "Guided",
+    "Lookahead",
+    "MetropolisBackward",
+    "ParticleSmoother",
+    "Potentials",
+    "ffbs",
+    "particle_filter",
+]

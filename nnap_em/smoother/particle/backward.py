@@ -1,0 +1,112 @@
+"""Draws of whole trajectories backward through the particles of a filter; here all are weighed for each."""
+
+import math
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ...numerics.elementary import exp2
+from ...numerics.random import uniforms
+from .filter import ParticleHistory
+from .resampling import systematic, upto
+
+
+class Trajectories(NamedTuple):
+    """Equal-weight draws of p(x_{0:T} | y)."""
+
+    x: Float[Array, "time path state"]
+    kick: Float[Array, "steps path state"]
+    """Process noise x_{k+1} - f(x_k)."""
+
+
+class AbstractBackward(eqx.Module):
+    """Draws the particle that a trajectory passes through at k, given where it is at k + 1."""
+
+    @property
+    @abstractmethod
+    def draws(self) -> int:
+        """Uniform numbers needed for one step of one path."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        x_next: Float[Array, "state path"],
+        f: Float[Array, "state particle"],
+        log_w: Float[Array, " particle"],
+        log_ahead: Float[Array, " particle"],
+        parent: Int[Array, " path"],
+        uniform: Float[Array, "draw path"],
+    ) -> Int[Array, " path"]:
+        """Indices with probability proportional to exp(log_w) N(x_next; f, I); `parent` is the genealogical one."""
+
+
+class ExactBackward(AbstractBackward):
+    """Forward filtering, backward sampling: all particles are weighed for each path [Godsill, Doucet & West 2004]."""
+
+    block: int = eqx.field(static=True, default=32)
+    """Particles per block of the two-level inverse distribution function."""
+
+    @property
+    def draws(self) -> int:
+        """One."""
+        return 1
+
+    def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
+        """Indices, each weighed against all particles."""
+        spare = -log_w.shape[0] % self.block
+        centre = jnp.mean(x_next, axis=1, keepdims=True)  # or the squares below would cancel
+        f = f - centre
+        x_next = (x_next - centre) / math.log(2)  # from here on logarithms are to base 2
+        level = jnp.maximum((log_w - 0.5 * jnp.sum(f**2, axis=0)) / math.log(2), -1e30)
+        level = jnp.pad(level, (0, spare), constant_values=-1e30).reshape(-1, self.block)
+        f = jnp.pad(f, ((0, 0), (0, spare))).reshape(f.shape[0], -1, self.block)
+
+        def weigh(_, particles):
+            f, level = particles
+            for i in range(f.shape[0]):
+                level = level + f[i][:, None] * x_next[i][None]
+            top = jnp.max(level, axis=0)
+            return None, (top, jnp.sum(exp2(level - top[None]), axis=0))
+
+        _, (tops, sums) = jax.lax.scan(weigh, None, (jnp.swapaxes(f, 0, 1), level[:, :, None]))
+        top = jnp.max(tops, axis=0)
+        reach = upto((sums * exp2(tops - top[None])).T, 0).T
+        target = uniform[0] * reach[-1]
+        outer = jnp.minimum(jnp.sum(reach <= target[None], axis=0), reach.shape[0] - 1)
+        before = jnp.take_along_axis(jnp.pad(reach, ((1, 0), (0, 0))), outer[None], axis=0)[0]
+        within = level[outer] - top[:, None]
+        for i in range(f.shape[0]):
+            within = within + f[i][outer] * x_next[i][:, None]
+        within = upto(exp2(within), 0)
+        rest = jnp.minimum(target - before, within[:, -1] * (1 - jnp.finfo(target.dtype).eps))
+        inner = jnp.sum(within <= rest[:, None], axis=1)
+        return (outer * self.block + inner).astype(jnp.int32)
+
+
+def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int, key: PRNGKeyArray) -> Trajectories:
+    """Draw trajectories backward through the particles of a filter."""
+    key_last, key_steps = jax.random.split(key)
+    dtype, exact = history.x.dtype, history.origin.dtype
+    last = systematic(history.log_w[-1], jax.random.uniform(key_last, (), dtype), num_paths)
+
+    def step(carry, slices):
+        index, x_next = carry
+        time, active, x, f, log_w, log_ahead, ancestors = slices
+        uniform = uniforms(key_steps, time, backward.draws, num_paths, dtype)
+        chosen = backward(x_next, f, log_w, log_ahead, ancestors[index], uniform)
+        index = jnp.where(active, chosen, index)  # nothing is resampled on arrival in the padding
+        here = x[:, index]
+        return (index, here), (here, x_next - f[:, index])
+
+    h = history
+    times = jnp.arange(h.x.shape[0] - 1, dtype=jnp.int32)
+    end = h.x[-1][:, last]
+    before = jax.tree.map(lambda a: a[:-1], (h.active, h.x, h.f, h.log_w, h.log_ahead))
+    _, (x, kick) = jax.lax.scan(step, (last, end), (times, *before, h.ancestors[1:]), reverse=True)
+    x = jnp.swapaxes(jnp.concatenate([x, end[None]]), 1, 2).astype(exact)
+    kick = jnp.swapaxes(kick, 1, 2).astype(exact)
+    return Trajectories(h.origin[:, None] + h.scale[None, None] * x, h.scale[None, None] * kick)

@@ -1,0 +1,45 @@
+"""The one form in which every smoother gives p(x_{0:T} | y_{0:T}) of a sequence, and what a smoother is."""
+
+from abc import abstractmethod
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..model.base import AbstractModel, Prepared
+from ..numerics.gaussian import Gaussian
+
+
+class Posterior(NamedTuple):
+    """The smoothing distribution: its marginals, and equal-weight nodes of p(x_k, x_{k+1} | y) for every step."""
+
+    state: Gaussian
+    prev: Float[Array, "*seq steps node state"]
+    next: Float[Array, "*seq steps node state"]
+    kick: Float[Array, "*seq steps node state"]
+    """The process noise x_{k+1} - f(x_k) of a node, as the smoother's own transition has it."""
+    excess: Float[Array, "*seq steps state state"]
+    """Covariance of a kick beyond the process noise, where the smoother's transition is an approximation."""
+    loglik: Float[Array, "*seq"]
+    ess: Float[Array, "*seq"]
+    """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
+
+
+class AbstractSmoother(eqx.Module):
+    """An E-step for one sequence.  `Identified` carries it: all that smooths with the fitted model asks it."""
+
+    room: ClassVar[int] = 2**30
+    """Memory [B] that smoothing may take on a device beside its results."""
+
+    @property
+    @abstractmethod
+    def bytes_per_row(self) -> int:
+        """Memory [B] that a row of a sequence takes while it is smoothed."""
+
+    @abstractmethod
+    def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray) -> Posterior:
+        """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
+
+    def tolerant(self) -> "AbstractSmoother":
+        """The same for a finished model, where no next epoch mends a lost track: slower and more patient, if it can."""
+        return self

@@ -1,0 +1,40 @@
+"""Hypotheses of the start: a hidden angle known to half a radian makes the first second curved or split."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics.gaussian import Gaussian
+
+
+class StartBank(eqx.Module):
+    """The prior of the start cut into narrow Gaussians on a grid of its wide directions.
+
+    An extended filter from each hypothesis finds the branch, and the likelihood picks it.  States that the model has
+    beyond those of the bank, the memory of effects, stay as they are.
+    """
+
+    offsets: Float[Array, "hypothesis state"]
+    """Centres, in standard deviations of the prior."""
+    shrink: Float[Array, " state"]
+    """Standard deviation of a hypothesis over that of the prior."""
+
+    def __init__(self, counts: tuple[int, ...], dtype=float, reach: float = 2.5):
+        """`counts` hypotheses along each state (1: as it is)."""
+        lines = [jnp.linspace(-reach, reach, n, dtype=dtype) if n > 1 else jnp.zeros(1, dtype) for n in counts]
+        self.offsets = jnp.stack([a.ravel() for a in jnp.meshgrid(*lines, indexing="ij")], axis=-1)
+        self.shrink = jnp.asarray([1.2 * reach / (n - 1) if n > 1 else 1.0 for n in counts], dtype)
+
+    def padded(self, states: int) -> "StartBank":
+        """This bank for a state with more entries, which it leaves as they are."""
+        extra = states - self.shrink.shape[0]
+        wide = jnp.pad(self.offsets, ((0, 0), (0, extra)))
+        narrow = jnp.pad(self.shrink, (0, extra), constant_values=1.0)
+        return eqx.tree_at(lambda b: (b.offsets, b.shrink), self, (wide, narrow))
+
+    def hypotheses(self, start: Gaussian) -> tuple[Gaussian, Float[Array, " hypothesis"]]:
+        """The hypotheses and their log weights, unnormalised."""
+        bank, spread = self.padded(start.mean.shape[0]), jnp.sqrt(jnp.diag(start.cov))
+        means = start.mean[None] + bank.offsets * spread[None]
+        cov = start.cov * jnp.outer(bank.shrink, bank.shrink)
+        return Gaussian(means, jnp.tile(cov[None], (means.shape[0], 1, 1))), -0.5 * jnp.sum(self.offsets**2, axis=-1)

@@ -1,0 +1,1 @@
+"""Files that are there whole or not at all, arrays in them, and the journal of a long run."""

@@ -1,0 +1,143 @@
+"""Files that are there whole or not at all: texts, bytes, and arrays under a JSON header with a checksum."""
+
+import hashlib
+import io
+import json
+import os
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from .. import __version__
+
+_HEADER, _CHECKSUM = "header", "sha256"
+
+
+class StoreError(ValueError):
+    """A file that is not what it should be: the message names the file, what is wrong with it and the mend."""
+
+
+class Kind(NamedTuple):
+    """What a file of arrays is, and what to do where it is not that."""
+
+    name: str
+    """Stands in the header."""
+    format: int
+    noun: str
+    give: str
+    """The mend for a file of another program."""
+    whole: str
+    """The mend for a file that is cut short."""
+    again: str
+    """The mend for a file of another format."""
+    copy: str
+    """The mend for a file whose checksum does not hold."""
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all (through a temporary file in its folder, which is made if need be).
+
+    Raises OSError with the name of the file, also where the disk is full.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all (through a temporary file in its folder, which is made if need be)."""
+    replace_bytes(path, text.encode())
+
+
+def sweep(folder: Path) -> None:
+    """Remove from `folder` what killed processes left half written."""
+    for part in folder.glob(".*.part"):
+        number = part.name.split(".")[-2]
+        if number.isdigit() and not _alive(int(number)):
+            part.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    """Whether another process has this number."""
+    if process == os.getpid():  # in a container all first processes have one number
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def write_arrays(path: Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write `arrays` and a header to one npz file, whole or not at all."""
+    full = {"kind": kind.name, "format": kind.format, "version": __version__, **header}
+    text = json.dumps(full).encode()
+    content = io.BytesIO()
+    np.savez(
+        content,
+        allow_pickle=False,
+        **{_HEADER: np.frombuffer(text, np.uint8), _CHECKSUM: _checksum(text, arrays)},
+        **arrays,
+    )
+    replace_bytes(path, content.getvalue())
+
+
+def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file of this kind and format whose checksum holds.
+
+    Raises StoreError for any other.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        refuse(path, f"cannot be read ({error.strerror})", kind.give)
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        text = arrays.pop(_HEADER).tobytes()
+        header = json.loads(text)
+    except Exception:  # what the parsers raise on damaged bytes is open-ended
+        refuse(path, f"no {kind.noun}, or damaged or cut short ({len(content)} bytes)", kind.whole)
+    if not isinstance(header, dict) or header.get("kind") != kind.name:
+        refuse(path, "an npz of another program", kind.give)
+    if header.get("format") != kind.format:
+        by = f"format {header.get('format')} (nnap_em {header.get('version')}), this version reads format {kind.format}"
+        refuse(path, by, kind.again)
+    if not np.array_equal(arrays.pop(_CHECKSUM, np.zeros(0)), _checksum(text, arrays)):
+        refuse(path, "damaged: its checksum does not hold", kind.copy)
+    return header, arrays
+
+
+def refuse(path: Path, found: str, mend: str) -> NoReturn:
+    """Raise StoreError."""
+    raise StoreError(f"{path}: {found}; {mend}")
+
+
+def _checksum(header: bytes, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    digest = hashlib.sha256(header)
+    for name in sorted(arrays):
+        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)

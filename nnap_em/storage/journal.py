@@ -1,0 +1,171 @@
+"""Finished steps of a long computation on disk, so that one that was killed goes on where it was.
+
+    with keeping(Journal(folder, {"seed": 0})):
+        closed = close_the_loop(rig, data, key=key)
+
+A step is a function that gives the same for the same arguments, and a file holds the outcome of one call.  It is found
+again by a digest of all that the function was given: a resumed run computes what is not there, and a step whose
+arguments differ in one bit is computed anew.  Outside `keeping` nothing of this happens.
+"""
+
+import contextlib
+import contextvars
+import dataclasses
+import functools
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from .. import __version__
+from ..numerics.parallel import everywhere
+from .files import Kind, read_arrays, refuse, sweep, write_arrays
+from .leaves import describe, is_key, name_of, plain, restore
+
+_AGAIN = "remove it, and --resume does this step again; or leave --resume out to begin anew"
+KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
+_OWN = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
+HERE: Any = object()
+"""Stands for one array or number in the form of an outcome."""
+
+_journal: contextvars.ContextVar["Journal | None"] = contextvars.ContextVar("nnap_em_journal", default=None)
+_Step = TypeVar("_Step", bound=Callable)
+
+
+class Journal:
+    """A folder of finished steps; `of` says, as JSON, of which computation they are."""
+
+    def __init__(self, folder: Path, of: Mapping[str, Any]):
+        self.folder = folder
+        self.of = json.loads(json.dumps(dict(of)))
+        self.by = {"nnap_em": __version__, "jax": jax.__version__}
+
+    def __len__(self) -> int:
+        """How many steps are finished."""
+        return sum(1 for _ in self.folder.glob("*.npz"))
+
+    def check(self) -> None:
+        """Raises StoreError, with its name, for a file that is no finished step of this computation."""
+        for path in sorted(self.folder.glob("*.npz")):
+            self._read(path)
+
+    def clear(self) -> None:
+        """Remove the finished steps, and the folder if nothing else is in it."""
+        sweep(self.folder)
+        for path in self.folder.glob("*.npz"):
+            if _OWN.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    def find(self, name: str, form: Any) -> Any:
+        """The outcome kept under `name`, of the structure of `form`; None if there is none."""
+        path = self.folder / f"{name}.npz"
+        if not path.exists():
+            return None
+        entries, arrays = self._read(path)
+        blanks, structure = jax.tree.flatten(form)
+        if len(entries) != len(blanks):
+            refuse(path, f"{len(entries)} numbers and arrays, not {len(blanks)}", _AGAIN)
+        told = enumerate(zip(entries, blanks, strict=True))
+        return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in told])
+
+    def keep(self, name: str, outcome: Any) -> None:
+        """Write an outcome."""
+        told = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
+        arrays = {str(i): array for i, (_, array) in enumerate(told) if array is not None}
+        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in told]}
+        write_arrays(self.folder / f"{name}.npz", KIND, header, arrays)
+
+    def _read(self, path: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+        header, arrays = read_arrays(path, KIND)
+        by, of = header.get("by"), header.get("of")
+        if by != self.by:
+            made, this = (" and ".join(f"{k} {v}" for k, v in (d or {}).items()) for d in (by, self.by))
+            refuse(path, f"made by {made}, this is {this}", "leave --resume out to begin anew")
+        for name, value in self.of.items():
+            if (other := (of or {}).get(name)) != value:
+                option = isinstance(value, int) or name.startswith("--")
+                made = f"with {name} {other}, not {value}" if option else f"from another {name}"
+                again = f"resume with {name} {other}" if other is not None else f"resume without {name}"
+                mend = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
+                refuse(path, f"made {made}", f"{mend}, or give another --out")
+        return header["leaves"], arrays
+
+
+@contextlib.contextmanager
+def keeping(journal: Journal) -> Iterator[None]:
+    """Keep the steps of what is called inside in `journal`, and take from there those that it has."""
+    token = _journal.set(journal)
+    try:
+        yield
+    finally:
+        _journal.reset(token)
+
+
+def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
+    """Makes a function a step; `form` gives, from the same arguments, the structure of what it returns."""
+
+    def make(function: _Step) -> _Step:
+        @functools.wraps(function)
+        def remembered(*args, **options):
+            journal = _journal.get()
+            if journal is None:
+                return function(*args, **options)
+            name = f"{name_of(function)}-{digest(name_of(function), args, options)[:32]}"
+            outcome = journal.find(name, form(*args, **options))
+            if everywhere(outcome is not None):
+                return outcome
+            outcome = function(*args, **options)
+            journal.keep(name, outcome)
+            return outcome
+
+        return remembered  # type: ignore[return-value]
+
+    return make
+
+
+def digest(*trees: Any) -> str:
+    """SHA-256 of all that stands in `trees`: numbers to the last bit, types and functions by name.
+
+    Raises TypeError for what cannot be told apart.
+    """
+    found = hashlib.sha256()
+
+    def feed(text: str, content: bytes = b"") -> None:
+        found.update(f"{text}\0".encode() + content)
+
+    def walk(node: Any) -> None:
+        kind = f"{type(node).__module__}.{type(node).__qualname__}"
+        if dataclasses.is_dataclass(node):
+            names = [field.name for field in dataclasses.fields(node)]
+            feed(f"{kind}{names}")
+            for name in names:
+                walk(getattr(node, name))
+        elif isinstance(node, Mapping):
+            feed(f"{kind}{list(node)}")
+            for value in node.values():
+                walk(value)
+        elif isinstance(node, tuple | list):
+            feed(f"{kind}{len(node)}")
+            for value in node:
+                walk(value)
+        elif is_key(node):
+            feed(str(jax.random.key_impl(node)), np.asarray(jax.random.key_data(node)).tobytes())
+        elif isinstance(node, jax.Array | np.ndarray | np.generic):
+            array = np.asarray(node)
+            feed(f"{array.dtype.str}{array.shape}", array.tobytes())
+        elif plain(node):
+            feed(repr(node))
+        elif callable(node) and hasattr(node, "__qualname__"):
+            feed(f"{node.__module__}.{node.__qualname__}")
+        else:
+            raise TypeError(f"{kind} cannot be told from another of its kind")
+
+    walk(trees)
+    return found.hexdigest()

@@ -1,0 +1,92 @@
+"""What several tests make: logs and their text, a declared model, and what a search knows of it."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+import plant
+
+from nnap_em.data.rig import Rig
+from nnap_em.effects.base import Around
+from nnap_em.em.mstep import ScoringMStep
+from nnap_em.em.prior import ParameterPrior
+from nnap_em.model.friction import FixedFriction, NoFriction
+from nnap_em.model.law import StribeckLaw
+from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.systems import systems
+from nnap_em.systems.slide import Slide
+
+
+def swing_rig(**changes) -> Rig:
+    """The declaration of what `swing` writes."""
+    given = {"dt": 0.01, "clock": "sequence", "measured": ("theta1", "dtheta1")} | changes
+    return Rig("bench", "acrobot", {}, True, ("u",), (2,), noise_std={}, start={}, **given)
+
+
+def swing(rows: int = 201, dt: float = 0.01, phase: float = 0.0) -> dict[str, np.ndarray]:
+    """Two rad to and fro, with its exact rate."""
+    t = dt * np.arange(rows)
+    theta, rate = 2.0 * np.sin(3.0 * t + phase), 6.0 * np.cos(3.0 * t + phase)
+    return {"time": t, "u": 0.1 * np.sin(t + phase), "theta1": theta, "dtheta1": rate}
+
+
+def csv_text(columns: dict[str, np.ndarray]) -> str:
+    """A log as the text of its file."""
+    rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
+    return "\n".join([",".join(columns), *rows]) + "\n"
+
+
+def with_field(line: int, column: str, text: str) -> Callable[[str], str]:
+    """A change of one field of the file; `line` as an editor counts."""
+
+    def change(content: str) -> str:
+        lines = [row.split(",") for row in content.splitlines()]
+        lines[line - 1][lines[0].index(column)] = text
+        return "\n".join(map(",".join, lines)) + "\n"
+
+    return change
+
+
+def declared_model(case: plant.Case) -> StateSpaceModel:
+    """The declared model of a case, with its true friction."""
+    kind = systems[case.system]
+    values = {**kind.optional, **plant.SYSTEMS[case.system].parameters}
+    system = kind(
+        **{name: jnp.asarray(value, float) for name, value in values.items()},
+        joints=(plant.SYSTEMS[case.system].driven,),
+    )
+    law = plant.drawn_friction(case)
+    if any(e["name"] in plant.TRANSMISSION for e in case.effects):
+        law[1]["b"] += 3e-4  # the simulator's motor has a drag of its own, which the joint feels
+    column = lambda n: jnp.asarray([f[n] for f in law])  # noqa: E731
+    friction = StribeckLaw(*(column(n) for n in ("Fc", "Fs", "vs", "b", "eps")))
+    n = 2 * len(kind.coordinates)
+    states = kind.coordinates + kind.rates
+    return StateSpaceModel(
+        system,
+        FixedFriction(friction, jnp.ones(n // 2)),
+        Gaussian(jnp.zeros(n), jnp.eye(n)),
+        jnp.zeros(n),
+        jnp.zeros(len(plant.measured(case))),
+        tuple(states.index(c) for c in plant.measured(case)),
+        plant.DT,
+        10,
+    )
+
+
+def around(model: StateSpaceModel) -> Around:
+    """What a search knows of a two-link arm: sizes of torques, rates and angles, all measured."""
+    return Around(
+        model.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
+        ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True, ("u",),
+    )  # fmt: skip
+
+
+def slide() -> tuple[StateSpaceModel, ScoringMStep]:
+    """A slide without friction whose mass, 1.2 kg, is known to .1 kg, and the rule that fits it."""
+    start = Gaussian(jnp.zeros(2), jnp.eye(2))
+    body = Slide(m=jnp.asarray(1.2), joints=(1,))
+    model = StateSpaceModel(body, NoFriction(jnp.ones(1)), start, jnp.zeros(2), jnp.zeros(2), (0, 1), 0.05)
+    prior = ParameterPrior(("m",), jnp.asarray([1.2]), jnp.asarray([0.1]))
+    return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), shape=model.log_q)

@@ -1,0 +1,82 @@
+"""What was found, as it is told: each effect with its own curve, joint and units, whatever stands beside it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plant
+import pytest
+
+from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose.findings import findings
+from nnap_em.diagnose.hypothesis import Found, Hypothesis
+from nnap_em.diagnose.loop import Closed
+from nnap_em.effects import AbstractEffect, Candidate, catalogue
+from nnap_em.effects.function import Axis
+from nnap_em.em.identify import begin
+from nnap_em.report.diagnosis import write_diagnosis
+
+ROWS = 60
+BODY = {name: Declared(value, 0.0) for name, value in plant.SYSTEMS["acrobot"].parameters.items()}
+ARM = Rig("arm", "acrobot", BODY, True, ("u",), (2,), 0.02, "sequence", ("theta1", "theta2"),
+          {"theta1": 0.01, "theta2": 0.01}, {})  # fmt: skip
+SLIDE = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.02, "sequence", ("x",), {"x": 0.01}, {})
+
+
+def _data(rig: Rig) -> Dataset:
+    """Two sequences of a gentle motion."""
+    t = np.tile(rig.dt * np.arange(ROWS), (2, 1))
+    swing = 0.3 * np.sin(3 * t + np.array([[0.0], [1.0]]))[..., None]
+    u, y = (np.repeat(swing, len(names), axis=2) for names in (rig.input_columns, rig.measured))
+    return Dataset(t, u, y, np.ones(t.shape, bool))
+
+
+def _spring(joint: int) -> AbstractEffect:
+    return catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=joint)
+
+
+def _function(signal: str, joint: int, slope: float) -> AbstractEffect:
+    axis = Axis((signal,), -2.0, 2.0, False, 20)
+    return catalogue["unknown_function"](slope * axis.centres(), (axis,), joint=joint)
+
+
+def _closed(rig: Rig, *effects: AbstractEffect) -> Closed:
+    """A search that found these, in this order."""
+    before = begin(rig, _data(rig), key=jax.random.key(0))
+    now = Hypothesis(before.model, before.m_step)
+    for effect in effects:
+        candidate = Candidate(effect, (effect,), effect)
+        now = now.plus(effect, candidate, Found(candidate, 100.0, 50.0, 1e-20, ROWS))
+    model, rule, found = now
+    size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
+    state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))
+    bank = before.bank.padded(model.log_q.shape[0])
+    return Closed(before, before._replace(state=state, m_step=rule, bank=bank), found, ())
+
+
+def test_a_learned_rest_is_told_with_its_law_and_the_next_function_keeps_its_joint():
+    """The rest stands between the law that it completes and another finding."""
+    effects = _spring(2), _function("theta2", 2, 1.0), _function("theta1", 1, -2.0)
+    spring, other = findings(_closed(ARM, *effects))
+    assert (spring.effect.name, other.effect.name) == ("torsional_spring", "unknown_function")
+    assert "not quite of this form" in spring.sentence
+    for found, signal, joint, sign in ((spring, "theta2", 2, 1), (other, "theta1", 1, -1)):
+        assert (found.curve.signal, found.curve.joint) == (signal, joint)
+        assert np.sign(found.curve.mean[-1] - found.curve.mean[0]) == sign
+        assert (found.curve.std > 0).all()
+    assert set(spring.parameters) == {"k", "theta0"} and not other.parameters
+
+
+def test_a_curve_has_the_units_of_its_machine():
+    (found,) = findings(_closed(SLIDE, _function("x", 1, 1.0)))
+    assert (found.curve.signal_unit, found.curve.unit) == ("m", "N")
+    assert "N/m" in found.sentence and "N m" not in found.sentence
+
+
+@pytest.mark.slow
+def test_the_page_draws_what_is_left_beside_a_law(tmp_path):
+    closed = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
+    logs = Logs(("a.csv", "b.csv"), _data(SLIDE), ("time", "u", "x"))
+    write_diagnosis(tmp_path, closed, findings(closed), logs, None, seed=0, began=0.0, say=lambda text: None)
+    html = (tmp_path / "report.html").read_text()
+    assert html.count("<figcaption><b>What is left of torsional spring at joint 1, a function of x.</b>") == 1

@@ -1,0 +1,188 @@
+"""What a fit accepts, refuses and goes back from, by numbers: nothing is smoothed here."""
+
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import slide
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.diagnose import refit as refits
+from nnap_em.em import identify, loop, multistep
+from nnap_em.em.identify import Identified
+from nnap_em.em.loop import EMState, Schedule
+from nnap_em.em.mstep import ScoringMStep
+from nnap_em.em.multistep import Forks
+from nnap_em.numerics.gaussian import Gaussian
+
+MODEL, RULE = slide()
+DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))
+PATH = Gaussian(jnp.zeros((4, 9, 2)), jnp.zeros((4, 9, 2, 2)))
+
+
+def _heavy(mass: float):
+    return eqx.tree_at(lambda m: m.system.m, MODEL, jnp.asarray(mass))
+
+
+def _mass(model) -> float:
+    return float(model.system.m)
+
+
+def _state(top, stride: float = 0.6, **changes) -> EMState:
+    """After an epoch that tried a mass of 1.5, the best being 1 and the M-step's wish 4."""
+    state = EMState(
+        3, _heavy(1.5), _heavy(1.0), _heavy(4.0), jnp.zeros((1, 1)), np.asarray(top), stride, jax.random.key(0),
+        np.zeros(3), np.inf,
+    )  # fmt: skip
+    return state._replace(**changes)
+
+
+def test_a_likelier_model_is_taken_and_the_next_stride_is_longer():
+    for loglik in ([1.0, 3.0], [0.0, 1.1]):  # half a nat is noise
+        after = loop._judge(_state([0.0, 2.0]), _heavy(2.5), jnp.ones((1, 1)), np.array(loglik), np.ones(2, bool))
+        assert (_mass(after.best), _mass(after.proposal), after.stride) == (1.5, 2.5, 1.0)
+        assert _mass(after.model) == 2.5
+        np.testing.assert_array_equal(after.top, loglik)
+        np.testing.assert_array_equal(after.loglik, [0, 0, 0, np.mean(loglik)])
+
+
+def test_a_worse_model_is_refused_and_the_way_from_the_best_is_shorter():
+    after = loop._judge(_state([0.0, 2.0]), _heavy(2.5), jnp.ones((1, 1)), np.array([0.0, 0.9]), np.ones(2, bool))
+    assert (_mass(after.best), _mass(after.proposal)) == (1.0, 4.0)
+    assert after.stride == pytest.approx(0.2)
+    assert _mass(after.model) == pytest.approx(1.0 + 0.2 * 3.0)
+    np.testing.assert_array_equal(after.top, [0.0, 2.0])
+    assert after.epoch == 4
+
+
+def test_a_sequence_that_was_left_out_refuses_nothing():
+    after = loop._judge(
+        _state([0.0, np.nan]), _heavy(2.5), jnp.ones((1, 1)), np.array([1.0, -1e9]), np.array([1, 0]) > 0
+    )
+    assert _mass(after.best) == 1.5
+    assert after.top[0] == 1.0 and np.isnan(after.top[1])
+    assert after.loglik[-1] == 1.0
+
+
+def test_a_horizon_is_held_and_grows():
+    assert [Schedule().horizon(epoch, 200) for epoch in range(9)] == [60, 60, 60, 96, 96, 154, 154, 200, 200]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rests"),
+    [
+        ({"loglik": np.array([5.0, 5.04, 5.0])}, True),
+        ({"loglik": np.array([5.0, 5.06, 5.06])}, False),  # still moved an epoch ago
+        ({"epoch": 2, "loglik": np.array([5.0, 5.0])}, False),
+        ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1}, True),
+        ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1, "ess": 100.0}, False),  # by chance, of a sample
+    ],
+)
+def test_em_rests_where_nothing_moves(changes, rests):
+    assert loop._rests(_state([0.0], **changes), Schedule(first=9), 9, 0.05) == rests
+    assert not loop._rests(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
+
+
+def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
+    tried = []
+
+    def em_step(model, *_):
+        tried.append(float(model.log_q[0]))
+        loglik = np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)])
+        return model, SimpleNamespace(used=np.array([True, False])), loglik, None
+
+    monkeypatch.setattr(loop, "em_step", em_step)
+    settled = loop._settle_noise(MODEL, DATA, None, RULE, jax.random.key(0))
+    np.testing.assert_allclose(tried, 2 * np.log([1.0, 0.3, 0.1, 0.03, 0.01]))
+    np.testing.assert_allclose(settled.log_q, 2 * np.log(0.1))
+
+
+# --- a refit: the same decisions along one path
+
+
+def _refit(monkeypatch, **options):
+    """Steps of 3 in a log variance whose likelihood is best at 1; a sequence without use wants the contrary."""
+    tried, strides = [], []
+
+    def smoothed(_, common, one):
+        x = float(common[0][0])
+        tried.append(x)
+        return SimpleNamespace(loglik=-100 * (x - 1) ** 2 * np.array([1.0, 1.0, -5.0])), None, one[1]
+
+    def advance(rule, core, *_):
+        strides.append(float(rule.stride))
+        return core._replace(log_q=core.log_q + 3.0), jnp.asarray(tried[-1]), None
+
+    monkeypatch.setattr(refits, "locals_along", lambda *_: None)
+    monkeypatch.setattr(refits, "each", smoothed)
+    monkeypatch.setattr(ScoringMStep, "advance", advance)
+    return refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), **options), tried, strides
+
+
+def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
+    trial, tried, _ = _refit(monkeypatch, passes=5)
+    # 3 is worse than 0: a third of it; from 1 on with twice the share, and a third of that
+    np.testing.assert_allclose(tried, [0.0, 3.0, 1.0, 3.0, 1.0 + 2 / 3], atol=1e-12)
+    np.testing.assert_allclose(trial.model.log_q, 1.0)
+    np.testing.assert_allclose(trial.loglik, 0.0, atol=1e-9)
+    assert float(trial.hessian) == pytest.approx(1.0)
+
+
+def test_a_refit_without_noise_gives_the_m_step_no_room_for_it(monkeypatch):
+    assert set(_refit(monkeypatch, passes=2)[2]) == {1.5}
+    assert set(_refit(monkeypatch, passes=2, noise=False)[2]) == {0.0}
+
+
+# --- the finish on multi-step errors
+
+
+def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
+    """Errors |z - 1/2| of a parameter whose step is always 1: half of it is taken, and then nothing more."""
+    size = lambda model: 0.01 + abs(float(RULE.prior.read(model)[0]) - 0.5)  # noqa: E731
+    many = lambda model: np.full((4, 3, 2, 1), size(model))  # noqa: E731
+    one = lambda model: np.ones((4, 3, 2, 1, RULE.weights(model).nodes.size + 1))  # noqa: E731
+    monkeypatch.setattr(multistep, "forks", lambda model, *_: Forks(many(model), one(model), np.ones(2)))
+    monkeypatch.setattr(multistep, "errors", lambda model, *_: many(model))
+    monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
+    begun = RULE.prior.write(MODEL, jnp.zeros(1))
+    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool))
+    assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
+
+
+def _finished(monkeypatch, error):
+    """The outcome, `error` being that of a sequence by whether its model was fitted to it; the last one is lost."""
+    used, masks = np.array([True, True, True, False]), []
+
+    def finish(model, m_step, path, data, mask):
+        masks.append(mask)
+        return _heavy(10.0 + len(masks))
+
+    def errors(model, *_):
+        place = round(_mass(model)) - 11
+        each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
+        return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
+
+    fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
+    fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
+    fakes["robust_hessian"] = lambda model, *_: jnp.full((1, 1), _mass(model))
+    for name, value in fakes.items():
+        monkeypatch.setattr(identify, name, value)
+    smoother = SimpleNamespace(tolerant=lambda: None)
+    fitted = Identified(None, _state([0.0]), RULE, None, smoother)
+    return fitted, identify.finished(fitted, DATA), masks
+
+
+def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch):
+    fitted, after, masks = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2)
+    assert after.model is fitted.model
+    assert float(after.state.hessian[0, 0]) == _mass(fitted.model)
+    np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
+
+
+def test_a_finish_that_helps_what_is_left_out_is_done_on_all(monkeypatch):
+    _, after, masks = _finished(monkeypatch, lambda fitted: 0.5)
+    np.testing.assert_array_equal(masks[-1], [True, True, True, False])
+    assert _mass(after.model) == float(after.state.hessian[0, 0]) == 10.0 + len(masks)

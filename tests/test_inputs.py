@@ -1,0 +1,157 @@
+"""Signals of a law: every input is its own, any number of joints, and the free form of a law is of the same ones."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plant
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose.propose import proposals, surroundings
+from nnap_em.diagnose.screen import judge, project, sheet
+from nnap_em.effects import Around, Scene, catalogue, free_form
+from nnap_em.effects.function import Axis, UnknownFunction
+from nnap_em.em.build import build
+from nnap_em.model.state_space import Inputs, with_effects
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.systems import AbstractSystem
+
+STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
+RIG = Rig(
+    "two", "acrobot", {name: Declared(value, 0.0) for name, value in plant.SYSTEMS["acrobot"].parameters.items()},
+    False, ("tau1", "tau2"), (1, 2), 0.01, "sequence", STATES, dict.fromkeys(STATES, 0.001), {},
+)  # fmt: skip
+ROWS, COUNT = 80, 3
+
+
+def _recorded(model, effects=(), moved=(1.0, 1.0)) -> Dataset:
+    """Noise-free readings of a machine with these effects, each input a sine of its own."""
+    t = 0.01 * np.arange(ROWS)
+    speed = 2 * np.pi * np.array([[1.3, 2.1], [0.8, 1.7], [1.9, 1.1]])
+    u = np.asarray(moved) * [0.5, 0.25] * np.sin(speed[:, None] * t[:, None] + np.arange(COUNT)[:, None, None])
+    blank = Dataset(np.tile(t, (COUNT, 1)), u, np.zeros((COUNT, ROWS, 4)), np.ones((COUNT, ROWS), bool))
+    full = with_effects(model, effects)
+
+    def one(x, seq):
+        return jax.lax.scan(lambda x, u: (full.transition(x, u), x), x, full.inputs(seq))[1]
+
+    start = jnp.asarray(np.random.default_rng(0).normal(size=(COUNT, 4)) * 0.3)
+    return blank._replace(y=np.asarray(jax.vmap(one)(start, jax.tree.map(jnp.asarray, blank))))
+
+
+def _asked(effects=(), moved=(1.0, 1.0)):
+    """The declared model and its rule, the readings, the paths, and what a search knows of them."""
+    bare = build(RIG, _recorded_blank(), key=jax.random.key(0)).model
+    data = _recorded(bare, effects, moved)
+    problem = build(RIG, data, key=jax.random.key(0))
+    model = with_effects(problem.model, ())
+    path = Gaussian(jnp.asarray(data.y), jnp.broadcast_to(1e-8 * jnp.eye(4), (COUNT, ROWS, 4, 4)))
+    return model, problem.mstep, data, path, surroundings(RIG, model, data, path, ROWS)
+
+
+def _recorded_blank() -> Dataset:
+    t = np.tile(0.01 * np.arange(ROWS), (COUNT, 1))
+    return Dataset(t, np.ones((COUNT, ROWS, 2)), np.sin(t)[..., None] * np.ones(4), np.ones(t.shape, bool))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return _asked()
+
+
+def _screened(asked, candidates):
+    model, rule, data, path, _ = asked
+    table = sheet(model, model, rule.weights(model), candidates, path, jax.tree.map(jnp.asarray, data))
+    return judge(project(table, np.ones(COUNT)), candidates)
+
+
+def _functions(around):
+    """Of one signal each."""
+    every = catalogue["unknown_function"].candidates(around)
+    return [c for c in every if isinstance(c.start, UnknownFunction) and len(c.start.axes) == 1]
+
+
+def test_functions_of_every_input_are_tried_at_every_joint_by_their_columns(plain):
+    tried = {(c.start.joint, c.start.inputs_named()) for c in _functions(plain[-1])}
+    assert {(j, (name,)) for j in (1, 2) for name in ("tau1", "tau2")} <= tried
+    assert not any("u" in names for _, names in tried)
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_function_of_the_second_input_is_found_at_its_joint(plain, joint):
+    seed = next(c for c in _functions(plain[-1]) if c.start.joint == joint and c.start.inputs_named() == ("tau2",))
+    bump = jnp.zeros(20).at[13:17].set(0.1)
+    asked = _asked((UnknownFunction(bump, seed.start.axes, joint=joint),))
+    candidates = _functions(asked[-1])
+    found = candidates[int(np.argmax([v.gain for v in _screened(asked, candidates)]))].start
+    assert (found.joint, found.inputs_named()) == (joint, ("tau2",))
+
+
+def test_an_input_that_never_moves_is_no_signal():
+    asked = _asked(moved=(1.0, 0.0))
+    candidates = proposals(asked[-1])
+    assert not any("tau2" in c.start.inputs_named() for c in candidates)
+    assert all(np.isfinite(np.asarray(leaf)).all() for c in candidates for leaf in jax.tree.leaves(c))
+    some = [c for c in candidates if c.start.inputs_named() == ("tau1",) or c.start.name == "torsional_spring"]
+    assert all(np.isfinite(v.gain) for v in _screened(asked, some))
+
+
+def test_models_saved_with_u_read_the_first_driven_joint():
+    model = build(RIG, _recorded_blank(), key=jax.random.key(0)).model
+    old = UnknownFunction(jnp.ones(20), (Axis(("u",), -1.0, 1.0, False, 20),), joint=2)
+    full = with_effects(model, (old,))
+    scene = full.scene(jnp.zeros(4), Inputs.held(jnp.asarray([0.3, 0.7])))
+    assert float(old.axes[0].value(scene)) == 0.3
+
+
+class Chain(AbstractSystem):
+    """Three links in a row, with unit masses that do not move each other."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("theta1", "theta2", "theta3")
+    rates: ClassVar[tuple[str, ...]] = ("dtheta1", "dtheta2", "dtheta3")
+    angles: ClassVar[tuple[bool, ...]] = (True, True, True)
+    joints: tuple[int, ...] = eqx.field(static=True)
+
+    def mass(self, q):
+        return jnp.eye(3)
+
+    def bias(self, q, v):
+        return jnp.sin(jnp.cumsum(q))
+
+
+def test_a_machine_with_three_joints_has_laws_at_each():
+    chain = Chain(joints=(1, 2, 3))
+    every, names = np.ones(3), (*Chain.coordinates, *Chain.rates)
+    around = Around(
+        chain, every, every, every, -3 * every, 3 * every, every, names, np.ones(6), 0.01, (0.0, 5.0), 5.0, False, True,
+        ("tau1", "tau2", "tau3"),
+    )  # fmt: skip
+    q, v, u = (jnp.asarray([0.3, -0.2, 0.5]) * s for s in (1.0, 2.0, -1.0))
+    scene = Scene(chain, q, v, u, jnp.asarray(0.7), -v, jnp.negative)
+    one_each = {(c.start.name, c.start.joint): c.probes[0] for c in proposals(around)}
+    for (_, joint), effect in one_each.items():
+        force = effect.force(scene, jnp.zeros(effect.memory))
+        assert force.shape == (3,)
+        assert joint is None or set(np.flatnonzero(np.asarray(force))) <= {joint - 1}
+    for name in ("unknown_function", "cogging", "backlash", "hard_stop", "load_friction"):
+        assert {j for kind, j in one_each if kind == name} == {1, 2, 3}
+    functions = {c.start.inputs_named() for c in catalogue["unknown_function"].candidates(around)}
+    assert {("theta1", "theta2", "theta3"), ("tau3",), ("theta1", "theta3")} <= functions
+
+
+def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
+    around = plain[-1]._replace(learned=True, session=True)
+    forms = {c.start.name: free_form(c.start, around) for c in proposals(around) if c.start.joint == 2}
+    signals = {name: found[0].start.inputs_named() for name, found in forms.items() if found}
+    place, rate = ("theta2",), ("theta2", "dtheta2")
+    assert signals == {
+        **dict.fromkeys(("torsional_spring", "cogging", "hard_stop"), place),
+        **dict.fromkeys(("position_dependent_friction", "eddy_brake"), rate),
+        **dict.fromkeys(("motor_gain", "dead_zone", "saturation", "one_sided_loss"), ("tau2",)),
+        "load_friction": ("tau2", "dtheta2"),
+        "friction_drift": ("dtheta2", "time"),
+    }

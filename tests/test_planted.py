@@ -1,0 +1,363 @@
+"""Planted effects: a model with the effect makes of the written log the motion that the real torque made."""
+
+import tomllib
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import planted_make
+import pytest
+from planted_cases import CASES, CONTROLS, LAWS, PLANTED, REST, Plant, case_of, split
+from planted_table import score, table
+
+from nnap_em.data.dataset import Dataset, check_split, read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.effects import AbstractEffect
+from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss
+from nnap_em.effects.base import JointEffect, a
+from nnap_em.effects.friction import LoadFriction, PositionDependentFriction
+from nnap_em.effects.mounting import BaseVibration
+from nnap_em.effects.position import Cogging, EddyBrake, TorsionalSpring
+from nnap_em.effects.rate import AirDrag
+from nnap_em.effects.sensor import SensorBias, SensorDelay, SensorScale
+from nnap_em.model.simulate import simulate
+from nnap_em.model.state_space import StateSpaceModel, with_effects
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.systems import specs
+from nnap_em.systems.arm import TwoLinkArm
+
+BODY = {
+    "m1": 0.52, "m2": 0.63, "l1": 0.2, "l2": 0.3, "lc1": 0.2, "lc2": 0.26, "I1": 0.011, "I2": 0.01, "g": 9.81,
+    "Ir": 6e-5, "gr": 6.0,
+}  # fmt: skip
+FRICTION = {"friction1": 0.25, "friction2": 0.19}
+DT, ROWS = 0.01, 101
+
+
+class _Force(JointEffect):
+    """A force of position, velocity and time that the catalogue lacks."""
+
+    name: ClassVar[str] = "test"
+    law: str = eqx.field(static=True)
+    pairs: tuple[tuple[str, float], ...] = eqx.field(static=True)
+
+    def force(self, scene, memory):
+        p, q, v = dict(self.pairs), self.own(scene.q), self.own(scene.v)
+        if self.law == "square":
+            return self.at(scene, p["amplitude"] * jnp.sign(jnp.sin(2 * jnp.pi * p["frequency"] * scene.time)))
+        bump = p["amplitude"] * jnp.exp(-(((q - p["center"]) / p["width"]) ** 2) / 2)
+        return self.at(scene, bump if self.law == "bump" else -bump * jnp.tanh(v / REST))
+
+
+def _model(effects: tuple[AbstractEffect, ...] = ()) -> StateSpaceModel:
+    system = TwoLinkArm(**{n: a(v) for n, v in BODY.items()}, joints=(1, 2))
+    level = jnp.asarray([FRICTION["friction1"], FRICTION["friction2"]])
+    model = StateSpaceModel(
+        system=system,
+        unknown=lambda v: -level * jnp.tanh(v / REST),
+        start=Gaussian(jnp.zeros(4), jnp.eye(4)),
+        log_q=jnp.full(4, -jnp.inf),
+        log_r=jnp.full(4, -jnp.inf),
+        measured=(0, 1, 2, 3),
+        dt=DT,
+    )
+    return with_effects(model, effects) if effects else model
+
+
+def _motion(u: np.ndarray, effects: tuple[AbstractEffect, ...] = ()) -> np.ndarray:
+    """States under torques (time, 2), without noise."""
+    start = jnp.asarray([[0.3, -0.4, 1.0, -2.0]])
+    return np.asarray(simulate(_model(effects), start, jnp.asarray(u)[None], key=jax.random.key(0)).x[0])
+
+
+def _torques() -> np.ndarray:
+    """Torques of two frequencies; 0 in the first rows, as a delay must find them."""
+    t = DT * np.arange(ROWS)
+    u = np.stack([0.9 * np.sin(7 * t) + 0.3 * np.sin(23 * t), 0.5 * np.sin(9 * t + 1)], axis=-1)
+    return np.where(np.arange(ROWS)[:, None] < 5, 0.0, u)
+
+
+def _log(x: np.ndarray, u: np.ndarray) -> dict[str, np.ndarray]:
+    columns = dict(zip((*planted_make.STATES, *planted_make.INPUTS), np.hstack([x, u]).T, strict=True))
+    return {"time": DT * np.arange(len(x)), **columns}
+
+
+def _unknown(tag: str, joint: int, **values: float):
+    return tag, joint, values, _Force(tag, tuple(values.items()), joint=joint)
+
+
+FORCES = [
+    ("spring", 2, {"k": 0.5, "theta0": 0.3}, TorsionalSpring(a(0.5), a(0.15), a(0.0), a(0.0), joint=2)),
+    (
+        "cogging",
+        1,
+        {"k": 4.0, "amplitude": 0.3, "phase": 0.7},
+        Cogging(a(0.3 * np.cos(0.7)), a(0.3 * np.sin(0.7)), a(4.0), joint=1),
+    ),
+    (
+        "ripple",
+        2,
+        {"k": 4.0, "amplitude": 0.2, "phase": 0.0, "overtone": 0.5, "phase2": 0.0},
+        Cogging(a(0.2), a(0.0), a(4.0), 4.0, 0.1, 0.0, joint=2),
+    ),
+    ("drag", None, {"c": 1.0}, AirDrag(a(1.0))),
+    (
+        "friction",
+        2,
+        {"depth": 0.8, "n": 3.0, "phase": 0.6},
+        PositionDependentFriction(a(0.8 * np.cos(0.6)), a(-0.8 * np.sin(0.6)), a(3.0), joint=2),
+    ),
+    ("brake", 1, {"c": 0.2, "center": 0.4}, EddyBrake(a(0.2 * np.cos(0.8)), a(0.2 * np.sin(0.8)), joint=1)),
+    (
+        "shake",
+        None,
+        {"amplitude": 2.0, "frequency": 1.7, "phase": 0.5},
+        BaseVibration(a(2 * np.cos(0.5)), a(2 * np.sin(0.5)), a(1.7)),
+    ),
+    _unknown("bump", 2, amplitude=0.4, center=-0.2, width=0.3),
+    _unknown("patch", 1, amplitude=0.4, center=0.2, width=0.3),
+    _unknown("square", 2, amplitude=0.3, frequency=2.5, phase=0.0),
+    ("load", 2, {"mu": 0.4}, LoadFriction(a(0.4), a(REST), names=("tau2", "dtheta2"), joint=2)),
+]
+DRIVES = [
+    ("gain", 1, {"gain": 0.7}, MotorGain(a(-0.3), joint=1)),
+    ("deadzone", 2, {"width": 0.2}, DeadZone(a(0.2), joint=2)),
+    ("delay", 1, {"delay": 3 * DT}, InputDelay(a(3 * DT), joint=1)),
+    ("onesided", 2, {"loss": 0.4}, OneSidedLoss(a(0.4), -1, "tau2", joint=2)),
+]
+SENSORS = [
+    ("bias", "theta1", {"bias": 0.2}, SensorBias(a(0.2), channel="theta1")),
+    ("scale", "dtheta2", {"scale": 1.2}, SensorScale(a(0.2), channel="dtheta2")),
+    ("late", "theta2", {"delay": DT}, SensorDelay(a(DT), channel="theta2")),
+    ("late", "all", {"delay": DT}, SensorDelay(a(DT), channel="all")),
+]
+
+
+def _tag(value) -> str:
+    return value if isinstance(value, str) else ""
+
+
+@pytest.mark.parametrize(("tag", "joint", "values", "effect"), FORCES, ids=_tag)
+def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effect):
+    """Up to what the torque that is held over a step leaves: a hundredth of what the effect does."""
+    u = _torques()
+    x = _motion(u)
+    written = planted_make.planted(_log(x, u), [(Plant(tag, joint, None), values)], BODY | FRICTION, DT)
+    u = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    lacking, right = _motion(u), _motion(u, (effect,))
+    assert np.abs(lacking - x).max() > 0.05
+    assert np.abs(right - x).max() < 0.01 * np.abs(lacking - x).max()
+
+
+@pytest.mark.parametrize(("tag", "joint", "values", "effect"), DRIVES, ids=_tag)
+def test_a_drive_makes_the_real_torque_of_the_written_input(tag, joint, values, effect):
+    u = _torques()
+    x = _motion(u)
+    written = planted_make.planted(_log(x, u), [(Plant(tag, joint, None), values)], BODY | FRICTION, DT)
+    commanded = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    assert np.abs(commanded - u).max() > 0.05
+    np.testing.assert_allclose(_motion(commanded, (effect,)), x, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("tag", "channel", "values", "effect"), SENSORS, ids=_tag)
+def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
+    u = _torques()
+    x = _motion(u)
+    written = planted_make.planted(_log(x, u), [(Plant(tag, None, channel), values)], BODY | FRICTION, DT)
+    model = _model((effect,))
+    cut = ROWS - len(written["time"])
+    seq = Dataset(DT * jnp.arange(ROWS, dtype=float), jnp.asarray(u), jnp.asarray(x), jnp.ones(ROWS, bool))
+    readings = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), model.inputs(seq)))[cut:]
+    own = np.stack([written[name] for name in planted_make.STATES], axis=-1)
+    assert np.abs(own - x[cut:]).max() > 0.01
+    # the library looks back along the equation of motion
+    atol = 1e-3 * np.abs(own - x[cut:]).max() if tag == "late" else 1e-12
+    np.testing.assert_allclose(own, readings, rtol=0, atol=atol)
+    np.testing.assert_array_equal(written["tau1"], u[cut:, 0])
+    assert written["time"][0] == 0
+
+
+def test_two_effects_together_move_as_the_recording():
+    """The drive makes of the written input the real torque without the force."""
+    u = _torques()
+    x = _motion(u)
+    (_, joint, spring, force), (_, driven, gain, drive) = FORCES[0], DRIVES[0]
+    both = [(Plant("gain", driven, None), gain), (Plant("spring", joint, None), spring)]
+    written = planted_make.planted(_log(x, u), both, BODY | FRICTION, DT)
+    u = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    np.testing.assert_allclose(_motion(u, (force, drive)), x, rtol=0, atol=0.01 * np.abs(_motion(u) - x).max())
+
+
+@pytest.mark.parametrize("tag", LAWS)
+def test_strength_zero_changes_no_bit(tag):
+    law = LAWS[tag]
+    plant = Plant(tag, None, "theta2") if law.reading or law.delay else Plant(tag, 2, None)
+    log = _log(_motion(_torques()), _torques())
+    values = law.draw(np.random.default_rng(0), planted_make.Ranges(-1.0, 1.0)) | law.amount(0.0)
+    same = planted_make.planted(log, [(plant, values)], BODY | FRICTION, DT)
+    assert same.keys() == log.keys()
+    assert all(np.array_equal(same[name], log[name]) for name in log)
+
+
+def test_every_law_is_compared():
+    assert {tag for tag, *_ in (*FORCES, *DRIVES, *SENSORS)} == set(LAWS)
+
+
+def test_the_list_covers_what_it_must():
+    assert len(PLANTED) >= 60 and len(set(CASES)) == len(CASES)
+    used = [plant.tag for name in PLANTED for plant in case_of(name).plants]
+    assert set(used) == set(LAWS)
+    assert {case_of(name).strength for name in PLANTED} == {"strong", "medium", "weak"}
+    assert any(len(case_of(name).plants) == 2 for name in PLANTED)
+    assert {split(name) for name in PLANTED} == {"look", "kept"}
+    assert {case_of(name).rig for name in PLANTED} <= {case_of(name).rig for name in CONTROLS}
+
+
+def test_no_recordings_is_a_clear_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"dfki_c1/rig.toml is not there"):
+        planted_make.make("dfki_c1-spring2-strong", tmp_path / "out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["dfki_c1-spring2", "dfki_c1-glue2-strong", "dfki_c1-spring2-huge", "dfki_c1-spring-weak", "dfki_c1-bias2-weak"],
+)
+def test_a_name_that_is_no_case_is_refused(name):
+    with pytest.raises(ValueError, match=r"is RIG-LAWS-STRENGTH|is no law|stands with its joint"):
+        case_of(name)
+
+
+def test_nobody_s_folder_is_overwritten(shared, tmp_path):
+    (tmp_path / "thesis.txt").write_text("all of it")
+    with pytest.raises(FileExistsError, match="name another folder"):
+        planted_make.make("dfki_c1_pert-recorded", tmp_path, shared / "data" / "measured")
+    assert (tmp_path / "thesis.txt").exists()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_case_is_made(name, shared, tmp_path):
+    truth = planted_make.make(name, tmp_path, shared / "data" / "measured")
+    assert tomllib.loads((tmp_path / "truth.toml").read_text()) == truth
+    assert len(truth["effects"]) == len(case_of(name).plants)
+    folder = shared / "data" / "measured" / truth["rig"]
+    same = [
+        path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes() for path in tmp_path.glob("*/*.csv")
+    ]
+    assert same and all(same) if name in CONTROLS else not all(same)  # an input that is never negative loses nothing
+
+
+@pytest.mark.parametrize("name", [PLANTED[0], PLANTED[-1]])
+def test_a_planted_rig_is_read_under_its_name(name, shared, tmp_path):
+    planted_make.make(name, tmp_path, shared / "data" / "measured")
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert rig.name == name
+    check_split(read_logs(tmp_path / "train", rig), read_logs(tmp_path / "test", rig))
+
+
+def _true(law: str, joint: int | None = None, channel: str | None = None, **values: float) -> dict:
+    inputs = [signal.replace("j", str(joint)) for signal in LAWS[law].of]
+    entry = {"name": LAWS[law].name, "law": law, "joint": joint, "channel": channel, "inputs": inputs}
+    return entry | {"share": 0.3, "parameters": values}
+
+
+def _told(name: str, joint: int | None = None, channel: str | None = None, inputs=(), **values: float) -> dict:
+    numbers = {n: {"value": v, "std": 0.01, "unit": ""} for n, v in values.items()}
+    return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs), "parameters": numbers}
+
+
+def _record(true: list[dict], told: list[dict], after: float = 0.2, **more) -> dict:
+    horizons = [0.1, 0.25, 0.5, 1.0]
+    error = {"horizons_s": horizons, "before": {"theta1": [0.4] * 4}, "after": {"theta1": [after] * 4}}
+    truth = {"rig": "r", "split": "look", "strength": "strong" if true else "none", "effects": true}
+    record = {"case": "r-x-strong" if true else "r-recorded", "truth": truth, "code": "", "log_seconds": 5.0}
+    record |= {"seconds": 1.0, "processor_seconds": 1.0}
+    return record | {"report": {"effects": told, "error": error} | more}
+
+
+RIGHT = [
+    (_true("spring", 2, k=0.3, theta0=0.1), [_told("torsional_spring", 2, k=0.31, theta0=0.2)]),
+    (_true("spring", 2, k=0.3, theta0=0.1), [_told("unknown_function", 2, inputs=["theta2"])]),
+    (_true("bump", 1, amplitude=0.3), [_told("unknown_function", 1, inputs=["theta1"])]),
+    (_true("patch", 1, amplitude=0.3), [_told("unknown_function", 1, inputs=["dtheta1", "theta1"])]),
+    (_true("onesided", 2, loss=0.3), [_told("unknown_function", 2, inputs=["tau2"])]),
+    (_true("onesided", 2, loss=0.3), [_told("unknown_function", 2, inputs=["tau2"], loss=0.31)]),
+    (_true("load", 1, mu=0.3), [_told("unknown_function", 1, inputs=["tau1", "dtheta1"], mu=0.29)]),
+    (_true("bias", None, "theta1", bias=0.1), [_told("base_tilt", angle=-0.1)]),
+    (
+        _true("late", None, "all", delay=0.02),
+        [_told("input_delay", 2, delay=0.02), _told("input_delay", 1, delay=0.02)],
+    ),
+    (_true("gain", 1, gain=0.8), [_told("motor_gain", 2, gain=1.25)]),
+    (
+        _true("ripple", 2, k=4.0, amplitude=0.3, phase=0.1),
+        [_told("cogging", 2, k=k, amplitude=0.3, phase=0.1) for k in (4, 8)],
+    ),
+    (
+        _true("square", 2, amplitude=0.3, frequency=1.0),
+        [_told("base_vibration", frequency=1.0, amplitude=1.0, phase=0.0)],
+    ),
+]
+WRONG = [
+    (_true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 1, k=0.3, theta0=0.1)),
+    (_true("spring", 2, k=0.3, theta0=0.1), _told("unknown_function", 2, inputs=["theta1"])),
+    (_true("onesided", 2, loss=0.3), _told("unknown_function", 2, inputs=["tau1"])),
+    (_true("bias", None, "theta2", bias=0.1), _told("base_tilt", angle=-0.1)),
+    (_true("late", None, "all", delay=0.02), _told("input_delay", 2, delay=0.02)),
+    (_true("gain", 1, gain=0.8), _told("motor_gain", 2, gain=0.8)),
+    (
+        _true("square", 2, amplitude=0.3, frequency=1.0),
+        _told("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0),
+    ),
+]
+
+
+@pytest.mark.parametrize(("true", "told"), RIGHT)
+def test_a_right_name_counts(true, told):
+    judged = score(_record([true], told), {})
+    assert judged.right and not judged.extras
+    assert all(judged.near)
+
+
+@pytest.mark.parametrize(("true", "told"), WRONG)
+def test_another_law_or_place_is_wrong_and_an_extra(true, told):
+    judged = score(_record([true], [told]), {})
+    assert judged.named == 0 and judged.extras == 1
+
+
+def test_parameters_are_held_against_the_truth():
+    true = _true("cogging", 1, amplitude=0.2, k=5.0, phase=3.1)
+    judged = score(_record([true], [_told("cogging", 1, amplitude=0.25, k=5.01, phase=-3.1)]), {})
+    assert judged.near == (False, True, True)  # the phase is .08 rad away, across half a turn
+    assert judged.inside == (False, True, False)
+
+
+def test_the_log_ratio_is_1_where_the_effect_is_gone_and_worse_is_told():
+    true, told = _true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 2, k=0.3, theta0=0.1)
+    control = _record([], [])
+    control["report"]["error"]["before"]["theta1"] = [0.1] * 4
+    assert score(_record([true], [told], after=0.1), {"r": control}).ratio == pytest.approx(1.0)
+    assert score(_record([true], [told], after=0.2), {"r": control}).ratio == pytest.approx(0.5)
+    assert score(_record([true], [told], after=0.41), {"r": control}).raised
+    assert not score(_record([true], [told], after=0.4), {"r": control}).worse
+
+
+def test_touches_are_held_against_the_truth():
+    one = {"file": "a.csv", "joint": 1, "from": 1.0, "to": 1.4, "size": 0.7}
+    shifted = one | {"from": 1.05, "to": 1.45, "size": 0.5}
+    record = _record([], [], interventions=[shifted, one | {"size": -0.7}, one | {"joint": 2}])
+    record["truth"]["touches"] = [one, one | {"file": "b.csv"}]
+    assert score(record, {}).touches == (2, 1, 2)
+
+
+def test_the_table_counts_what_was_and_what_was_not_reported():
+    true, told = _true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 2, k=0.3, theta0=0.1)
+    failed = _record([true], []) | {"case": "r-y-strong", "failed": "not done after 1200 s"}
+    del failed["report"]
+    text = table([_record([true], [told]), failed, _record([], [_told("dead_zone", 1, width=0.1)])])
+    assert (
+        "| strong | 2 | 1 of 2 | 1 of 2 | 0 of 2 | 1 of 1 | 1.00 (1) |" not in text
+    )  # the control's error is the same
+    assert "| strong | 2 | 1 of 2 | 1 of 2 | 0 of 2 | 1 of 1 | - | 2 of 2 | 2 of 2 | 1 of 2 | 1 |" in text
+    assert "not done after 1200 s" in text and "1 rigs, something reported on 1" in text

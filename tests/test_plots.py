@@ -1,0 +1,139 @@
+"""Figures of machines with 1 to 7 joints: everything is drawn, with its unit, in a size that can be read."""
+
+import io
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.diagnose.findings import Curve
+from nnap_em.diagnose.residual import Names, Residual
+from nnap_em.em.identify import FrictionTable
+from nnap_em.report.effect_plots import effect_figure, screen_figure
+from nnap_em.report.error_plots import error_figure, prediction_figure
+from nnap_em.report.friction_plots import friction_figure
+from nnap_em.report.residual_plots import innovation_figure, residual_figure
+
+SEQUENCES, ROWS, DT = 8, 200, 0.01
+
+
+def _names(dof: int) -> Names:
+    """A machine whose last joint slides; all positions and rates are read."""
+    angles = (*(True,) * (dof - 1), False)
+    coordinates = tuple(f"theta{j + 1}" if angle else f"x{j + 1}" for j, angle in enumerate(angles))
+    rates = tuple(f"d{name}" for name in coordinates)
+    return Names(coordinates, rates, angles, ("u",), (dof,), coordinates + rates)
+
+
+def _found(dof: int, seed: int = 0, **changes) -> Residual:
+    """What a right model would leave, of states that move."""
+    rng = np.random.default_rng(seed)
+    shape = (SEQUENCES, ROWS)
+    walk = 0.1 * np.cumsum(rng.normal(size=(*shape, 2 * dof)), axis=1)
+    force = rng.normal(size=(*shape, dof))
+    force[:, -1] = np.nan
+    return Residual(
+        innovation=rng.normal(size=(*shape, 2 * dof)),
+        force=force,
+        force_std=np.ones((*shape, dof)),
+        state=walk,
+        predicted=walk,
+        u=np.sin(0.1 * np.arange(ROWS) + rng.uniform(0, 6, size=(SEQUENCES, 1)))[..., None],
+        t=np.tile(DT * np.arange(ROWS), (SEQUENCES, 1)),
+        valid=np.ones(shape, bool),
+        used=np.ones(SEQUENCES, bool),
+    )._replace(**changes)
+
+
+def _table(dof: int) -> FrictionTable:
+    v = jnp.tile(jnp.linspace(-3, 3, 51)[None], (dof, 1))
+    return FrictionTable(v, -v, jnp.tile(1e-4 * jnp.eye(51)[None], (dof, 1, 1)))
+
+
+@pytest.fixture(scope="module", params=(1, 2, 7))
+def drawn(request):
+    """The number of joints, and all figures that have a panel for each."""
+    dof = request.param
+    names, found, table = _names(dof), _found(dof), _table(dof)
+    pair = found.state[0], np.ones((ROWS, 2 * dof))
+    visited = list(found.state[..., dof:].reshape(-1, dof).T)
+    values = {name: [0.1, 1.0] for name in names.measured}
+    error = {"horizons_s": [0.1, 1.0], "before": values, "after": values}
+    both = {"before": pair, "after": pair}
+    return dof, {
+        "residual": residual_figure(found, names, _found(dof, 1)),
+        "innovation": innovation_figure(found, names, found),
+        "error": error_figure(error, names),
+        "friction": friction_figure({"before": table, "after": table}, names, visited),
+        "prediction": prediction_figure(found.t[0], found.state[0], names, both, 1.0),
+    }
+
+
+def test_every_figure_can_be_read_whatever_the_number_of_joints(drawn):
+    dof, figures = drawn
+    for name, figure in figures.items():
+        width, height = figure.get_size_inches()
+        assert width <= 12 and height <= 18, name
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=30)
+        assert image.getvalue().startswith(b"\x89PNG")
+        filled = [ax for ax in figure.axes if ax.lines]
+        panels = [ax.get_window_extent().size / figure.dpi for ax in filled]
+        assert min(w for w, _ in panels) > 0.9 and min(h for _, h in panels) > 0.5, name
+    assert sum(bool(ax.lines) for ax in figures["prediction"].axes) == 2 * dof
+
+
+def test_axes_name_joints_and_have_the_units_of_the_machine(drawn):
+    dof, figures = drawn
+    said = {name: "\n".join(ax.get_ylabel() + ax.get_xlabel() for ax in f.axes) for name, f in figures.items()}
+    for name in ("residual", "friction"):
+        assert "[N]" in said[name] and ("[N m]" in said[name]) == (dof > 1)
+    assert (f"joint {dof}\n" in said["residual"]) == (dof > 1)
+    assert f"velocity dx{dof} [m/s]" in said["friction"]
+    assert f"x{dof} [m]" in said["prediction"]
+    assert "rms error [m/s]" in said["error"]
+    if dof > 1:
+        assert "θ₁ [rad]" in said["prediction"] and "velocity ω₁ [rad/s]" in said["friction"]
+
+
+def test_the_cause_of_a_force_has_the_largest_share():
+    found = _found(2)
+    force = found.force.copy()
+    force[..., 0] = 0.3 * force[..., 0] + 2 * np.sin(3 * found.state[..., 0])
+    figure = residual_figure(found._replace(force=force), _names(2), _found(2, 1))
+    shares = {ax.get_xlabel(): float(ax.get_title(loc="right").split()[0]) for ax in figure.axes[:6] if ax.get_xlabel()}
+    best = max(shares, key=lambda name: shares[name])
+    assert best.startswith("θ₁") and shares[best] > 80
+    assert all("[" in name for name in shares)
+
+
+def test_of_many_joints_the_likeliest_causes_are_drawn():
+    found = _found(7)
+    force = found.force.copy()
+    force[..., 3] += 4 * np.sin(3 * found.state[..., 5])
+    figure = residual_figure(found._replace(force=force), _names(7))
+    row = [ax for ax in figure.axes[12:16]]
+    assert "joint 4" in row[0].get_ylabel() and row[0].get_xlabel().startswith("θ₆")
+
+
+@pytest.mark.parametrize("used", [0, 1, SEQUENCES])
+def test_few_sequences_can_be_drawn(used):
+    figure = residual_figure(_found(2, used=np.arange(SEQUENCES) < used), _names(2), bins=6)
+    assert any(np.isfinite(line.get_ydata()).any() for line in figure.axes[0].get_lines()[:1])
+
+
+def test_what_was_found_and_what_nobody_knows_can_be_drawn():
+    v = np.linspace(-3, 3, 51)
+    learned = effect_figure(Curve("theta1 + theta2", "rad", 2, "N m", True, v, v**2, 0.1 + 0 * v))
+    assert (learned.axes[0].get_xlabel(), learned.axes[0].get_ylabel()) == ("θ₁ + θ₂ [rad]", "force at joint 2 [N m]")
+    nobody = {"horizons_s": [0.1, 1.0], "fit": {"theta1": [None, None]}}
+    figures = (
+        learned,
+        error_figure(nobody, _names(2)),
+        screen_figure([("a spring", 30.0), ("a delay", -2.0)], chosen="a spring"),
+        screen_figure([]),
+    )
+    for figure in figures:
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=40)
+        assert image.getvalue().startswith(b"\x89PNG")

@@ -1,0 +1,13 @@
+"""Compiled programs are let go only where they hold too many memory maps."""
+
+import jax
+
+from nnap_em.numerics import programs
+
+
+def test_programs_are_let_go_beyond_the_bound(monkeypatch):
+    cleared = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))
+    monkeypatch.setattr(programs, "maps", lambda: 50)
+    assert not programs.let_go(50) and not cleared
+    assert programs.let_go(49) and cleared == [True]

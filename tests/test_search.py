@@ -1,0 +1,272 @@
+"""What the search makes of numbers: which candidates are refitted, what is asked of the rule, what goes again."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import slide
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import loop
+from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
+from nnap_em.diagnose.evidence import Projected, Screen, Screened, Share
+from nnap_em.diagnose.hypothesis import Found, Hypothesis
+from nnap_em.diagnose.keys import covered, key_of, rest_of
+from nnap_em.diagnose.look import (
+    EFFORT,
+    Case,
+    Look,
+    Step,
+    _best_of_kind,
+    _named_first,
+    _shortlist,
+    significance,
+    trimmed,
+)
+from nnap_em.diagnose.loop import Closed, Loop
+from nnap_em.diagnose.propose import seeded
+from nnap_em.diagnose.refit import Trial
+from nnap_em.effects import Candidate, catalogue
+from nnap_em.effects.function import Axis
+from nnap_em.em.identify import Identified
+from nnap_em.em.loop import EMState
+from nnap_em.model.state_space import with_effects
+
+MODEL, RULE = slide()
+BARE = Hypothesis(MODEL, RULE)
+DATA = Dataset(*(np.zeros((6, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((6, 9), bool))
+RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.05, "sequence", ("x", "dx"), {}, {})
+
+
+def _law(name: str, value: float = 0.0):
+    return catalogue[name](jnp.asarray(value), joint=1)
+
+
+def _candidate(name: str, spread: float = 2.0) -> Candidate:
+    return Candidate(_law(name), (_law(name, 1.0),), _law(name, spread))
+
+
+def _found(name: str) -> Found:
+    return Found(_candidate(name), 100.0, 50.0, 1e-20, 9)
+
+
+def _function(name: str = "unknown_function"):
+    axis = Axis(("x",), -2.0, 2.0, False, 20)
+    return catalogue[name](axis.centres(), (axis,), joint=1)
+
+
+def _spring():
+    return catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
+
+
+def _screened(law, gain: float = 100.0, coefficient: float = 1.0) -> Screened:
+    return Screened(Candidate(law, (law,), law), np.array([coefficient]), 1, gain, Share(0.3, 0.3, (0.3, 0.3)))
+
+
+def _with(*names: str) -> Hypothesis:
+    """The slide with these effects."""
+    now = BARE
+    for i, name in enumerate(names):
+        now = now.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(name))
+    return now
+
+
+def _names(now) -> list[str]:
+    return [effect.name for effect in now.effects]
+
+
+# --- numbers
+
+
+def test_certainty_is_the_marginal_of_the_posterior():
+    """Value over standard deviation, whatever is correlated with it: network weights, a mass, another effect."""
+    now = _with("motor_gain", "dead_zone")
+    root = np.random.default_rng(0).normal(size=(5, 5))
+    hessian = root @ root.T + np.eye(5)  # two network weights, the mass, the effects
+    std = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    for place, name in enumerate(("motor_gain", "dead_zone")):
+        value, spread = 1.0 + place, 2.0 + place
+        expected = value / (spread * std[3 + place])
+        assert significance(_candidate(name), now, hessian, place) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_sixth_is_trimmed_at_either_end():
+    gains = np.array([np.nan, 1e9, 1.0, 2.0, 3.0, 4.0])
+    assert trimmed(gains) == pytest.approx(6 * 2.5)
+    assert trimmed(np.array([1.0, 2.0])) == pytest.approx(3.0)
+
+
+def test_one_fit_is_ahead_of_another_by_what_it_is_likelier():
+    one, other = (_emstate(MODEL, top) for top in (5.0, 3.0))
+    assert loop._ahead(one, other) == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize(("length", "further"), [(60, 150), (150, 375), (300, 500)])
+def test_a_playoff_is_two_and_a_half_times_as_far(length, further):
+    assert loop._further(length, 500) == further
+
+
+# --- records
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
+    left, names = [i for i in range(3) if i != place], ("motor_gain", "dead_zone", "air_drag")
+    now = _with(*names).without(place)
+    assert _names(now.model) == [names[i] for i in left]
+    assert [f.candidate.start.name for f in now.found if f] == [names[i] for i in left]
+    np.testing.assert_allclose(now.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
+    assert [name.partition(".")[0] for name in now.m_step.prior.names] == ["m", "0", "1"]
+
+
+def test_a_rest_belongs_to_the_law_of_its_own_joint():
+    model = with_effects(MODEL, (_law("motor_gain"), _spring()))
+    assert rest_of(_function(), model) == 1
+    assert rest_of(_spring(), model) is None
+    assert rest_of(_function(), with_effects(MODEL, (_law("motor_gain"),))) is None
+    free = with_effects(MODEL, (_function(),))
+    assert covered(_spring(), free) and not covered(_spring(), model) and not covered(_law("motor_gain"), free)
+
+
+def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_another():
+    gain = Candidate(_law("motor_gain", 0.5), (_law("motor_gain", 0.75),), _law("motor_gain", 1.0))
+    assert float(jax.tree.leaves(seeded(gain, np.array([-2.0])))[0]) == pytest.approx(0.5 - 2.0 * 0.25)
+    zone = Candidate(_law("dead_zone"), (_law("dead_zone", 0.75),), _law("dead_zone", 1.0))
+    assert float(jax.tree.leaves(seeded(zone, np.array([-2.0])))[0]) == 0.75
+
+
+# --- what is refitted
+
+
+def test_the_best_of_every_kind_stands_for_it():
+    weak, strong, other = (
+        _screened(_law(name, 1.0), gain)
+        for name, gain in (("air_drag", 20.0), ("air_drag", 50.0), ("motor_gain", 30.0))
+    )
+    screen = Screen((strong, other, weak), Projected(np.zeros(3), np.eye(3)))
+    ranked = _best_of_kind(screen, LikelihoodRule(), 100)
+    assert [s.gain for _, s in ranked] == [50.0, 30.0]
+
+
+@pytest.mark.parametrize(
+    ("free", "chosen"), [(90.0, ["air_drag", "motor_gain"]), (101.0, ["unknown_function", "air_drag", "motor_gain"])]
+)
+def test_the_close_ones_are_refitted_and_a_free_law_that_promises_more(free, chosen):
+    ranked = [
+        (100.0, _screened(_law("air_drag"))),
+        (41.0, _screened(_law("motor_gain"))),
+        (39.0, _screened(_law("dead_zone"))),
+    ]
+    ranked.append((free, _screened(_function())))
+    short = _shortlist(ranked, MODEL, lambda promise: promise > 10, EFFORT)
+    assert [s.candidate.start.name for s in short] == chosen
+    present = with_effects(MODEL, (_law("air_drag"),))
+    assert "air_drag" not in [s.candidate.start.name for s in _shortlist(ranked, present, lambda p: p > 10, EFFORT)]
+    assert not _shortlist(ranked, MODEL, lambda promise: False, EFFORT)
+
+
+def _case(law, gain: float, held_out: float = 1e3) -> Case:
+    """A refit of this outcome."""
+    case = Case.__new__(Case)
+    case.screened, case.gain, case.directions, case.readings = _screened(law), gain, 1, 100
+    case.trial = Trial(with_effects(MODEL, (law,)), RULE, None, np.zeros(1), None)
+    case.__dict__["_held_out"] = held_out
+    return case
+
+
+@pytest.mark.parametrize(("gain", "first"), [(70.0, "air_drag"), (50.0, "unknown_function")])
+def test_a_law_with_a_name_is_preferred_where_it_is_nearly_as_good(gain, first):
+    sound = [_case(_function(), 100.0), _case(_law("air_drag"), gain)]
+    assert _named_first(sound, LikelihoodRule())[0].effect.name == first
+
+
+# --- the loop
+
+
+def _emstate(model, top: float) -> EMState:
+    return EMState(5, model, model, model, jnp.eye(1), np.full(6, top), 1.0, jax.random.key(0), np.full(5, top), np.inf)
+
+
+def _loop(said: list[str]) -> Loop:
+    before = Identified(RIG, _emstate(MODEL, 0.0), RULE, None, None)
+    return Loop(before, {9: (before.state, np.ones(6, bool))}, DATA, LikelihoodRule(), EFFORT, said.append)
+
+
+WORTH = {"motor_gain": 50.0, "dead_zone": 1.0}
+"""Log-likelihood per sequence that goes with an effect [nat]."""
+
+
+def _top(model) -> float:
+    return sum(WORTH[name] for name in _names(model))
+
+
+@pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])
+def test_the_least_needed_goes_where_a_fit_without_it_loses_nothing(monkeypatch, names):
+    monkeypatch.setattr(loop, "_loss", lambda now, state, i: WORTH[now.model.effects[i].name])
+    monkeypatch.setattr(loop, "_asked", lambda *_: (SimpleNamespace(path=None, used=np.ones(6, bool)), None))
+    monkeypatch.setattr(loop, "refit", lambda model, *_, **__: Trial(model, RULE, None, np.full(6, _top(model)), None))
+    monkeypatch.setattr(loop, "_grow", lambda asked, now, *_: _emstate(now.model, _top(now.model)))
+    now, state = _with(*names), _emstate(_with(*names).model, 51.0)
+    left, _ = loop._needed(_loop([]), now, state)
+    assert _names(left.model) == ["motor_gain"]
+
+
+def test_what_is_not_worth_it_over_the_whole_length_goes_from_the_last_on(monkeypatch):
+    """Two effects together are no better than none; the first alone is."""
+    tops = {2: 1.0, 1: 5.0}
+    monkeypatch.setattr(loop, "finished", lambda fitted, data: fitted)
+    monkeypatch.setattr(loop, "_grow", lambda asked, now, *_: _emstate(now.model, tops[len(now.found)]))
+    now = _with("motor_gain", "dead_zone")
+    closed = loop._whole(_loop([]), now, _emstate(now.model, tops[2]), [])
+    assert _names(closed.after.model) == ["motor_gain"]
+    assert [f.candidate.start.name for f in closed.found] == ["motor_gain"]
+    tops[1] = 1.0
+    assert not loop._whole(_loop([]), now, _emstate(now.model, tops[2]), []).found
+
+
+@pytest.mark.parametrize(("held_out", "added"), [(50.0, ["motor_gain"]), (20.0, [])])
+def test_only_what_the_rule_believes_is_added(monkeypatch, held_out, added):
+    """A gain of 100 nats, of which a third must be seen on sequences left out."""
+    case = _case(_law("motor_gain", 0.5), 100.0, held_out)
+    case.after = BARE.plus(case.effect, _candidate("motor_gain"))
+    empty = Screen((), Projected(np.zeros(0), np.eye(0)))
+    looks = [Look(Step(9, (), (), None, 1), empty, [case], [case]), Look(Step(9, (), (), None, 1), empty, [], [])]
+    monkeypatch.setattr(loop, "let_go", lambda: None)
+    monkeypatch.setattr(loop, "_asked", lambda *_: (SimpleNamespace(used=np.ones(6, bool)), np.ones(6, bool)))
+    monkeypatch.setattr(loop, "look", lambda *_: looks.pop(0))
+    monkeypatch.setattr(loop, "_found", lambda *_: _found("motor_gain"))
+    monkeypatch.setattr(loop, "_plain", lambda *_: None)
+    steps: list[Step] = []
+    now, _ = loop._search(_loop([]), BARE, DATA, 9, steps)
+    assert _names(now.model) == added
+    assert [step.accepted for step in steps] == ([key_of(case.effect), None] if added else [None])
+
+
+@pytest.mark.parametrize(
+    ("readings", "innovations", "asked"),
+    [
+        (True, True, [LikelihoodRule]),
+        (True, False, [LikelihoodRule, ShareRule]),
+        (False, True, [ShareRule]),
+        (False, False, [ShareRule]),
+    ],
+)
+def test_likelihood_is_believed_where_noise_is_what_the_model_says(monkeypatch, readings, innovations, asked):
+    before, rules = _loop([]).before, []
+
+    def close(running):
+        rules.append(type(running.rule))
+        return Closed(before, before, (), ())
+
+    monkeypatch.setattr(loop, "identify", lambda *_, **__: before)
+    monkeypatch.setattr(loop, "close", close)
+    monkeypatch.setattr(loop, "white_readings", lambda data: readings)
+    monkeypatch.setattr(loop, "white_innovations", lambda fitted, data: innovations)
+    loop.close_the_loop(RIG, DATA, key=jax.random.key(0))
+    assert rules == asked
+    rules.clear()
+    loop.close_the_loop(RIG, DATA, key=jax.random.key(0), rule=ShareRule())
+    assert rules == [ShareRule]

@@ -212,7 +212,7 @@ SUBSTEPS = {"backlash": 20, "joint_flexibility": 20, "presliding_friction": 20, 
 OTHERS = {
     *("base_tilt", "base_vibration", "payload", "payload_step", "link_inertia", "link_length", "center_of_mass"),
     *("input_delay", "actuator_lag", "presliding_friction", "coupling"),
-    *("load_friction", "sensor_bias", "sensor_scale", "sensor_delay", "sensor_quantization"),
+    *("load_friction", "pulses", "sensor_bias", "sensor_scale", "sensor_delay", "sensor_quantization"),
 }
 KNOWN = {*JOINT, *INPUT, *LEVEL, *TRANSMISSION, *OTHERS}
 
@@ -475,6 +475,9 @@ def rates(plant: Plant, x: Array, u: Array, t: Array) -> Array:
     dx = np.zeros_like(x)
     force = _passive(plant, q, v) + _friction(plant, x, t, dx)
     force[:, plant.driven - 1] += _drive(plant, x, u, dx)
+    for e in plant.named("pulses"):  # a square wave, as far as its seventh harmonic
+        turn = 2 * math.pi * e["frequency"] * t
+        force[:, plant.joint(e)] += e["amplitude"] * sum(4 / (math.pi * h) * np.sin(h * turn) for h in (1, 3, 5, 7))
     dx[:, :n] = v
     dx[:, n : 2 * n] = acceleration(plant, q, v, force, t)
     return dx
@@ -851,7 +854,10 @@ WEAK: dict[str, tuple[Effect, ...]] = {name: ({**STRONG[name][0], **less},) for 
 UNNAMED: dict[str, tuple[Effect, ...]] = {
     "one_sided_loss": ({"name": "unknown_function", "form": "one_sided_loss", "joint": 2, "side": -1, "loss": 0.5},),
     "load_friction": ({"name": "unknown_function", "form": "load_friction", "joint": 2, "mu": 0.3, "knee": 0.2},),
+    "periodic_force": (
+        {"name": "unknown_function", "form": "pulses", "joint": 2, "amplitude": 0.05, "frequency": 0.9},
+    ),
 }
-"""Laws that the vocabulary has no name for: unknown functions of u, and of u and dtheta2."""
+"""Laws that the vocabulary has no name for: unknown functions of u, of u and dtheta2, of time."""
 SESSION = frozenset({"friction_drift", "payload_step"})
 """Names whose cases in STRONG and WEAK are meant for clock="session"."""

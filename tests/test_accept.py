@@ -30,8 +30,10 @@ class Numbers(Evidence):
     error: float = 0.6
 
 
-def _screened(inside=0.3, left_out=0.3, folds=(0.3, 0.3, 0.3, 0.3), gain=100.0, candidate=LINEAR, coefficient=1.0):
-    return Screened(candidate, np.array([coefficient]), 1, gain, Share(inside, left_out, folds))
+def _screened(
+    inside=0.3, left_out=0.3, folds=(0.3, 0.3, 0.3, 0.3), gain=100.0, candidate=LINEAR, coefficient=1.0, left=1.0
+):
+    return Screened(candidate, np.array([coefficient]), 1, gain, Share(inside, left_out, folds, left))
 
 
 NET = price(1, READINGS)  # 4.1 nat
@@ -88,6 +90,8 @@ def test_likelihood_is_looked_at_where_tracks_hold_and_shares_over_all():
         ({"candidate": BENT, "coefficient": 0.2}, 0.0),  # a fifth of a dead zone is another one
         ({"candidate": BENT, "coefficient": -1.0}, 0.0),
         ({"coefficient": -1.0}, 0.3),
+        ({"left": 0.34}, 0.3),
+        ({"left": 0.32}, 0.0),  # a tenth of what there was at first goes by chance
     ],
 )
 def test_a_share_is_the_smaller_one_where_recordings_agree(screened, promise):
@@ -107,6 +111,15 @@ def test_a_share_is_the_smaller_one_where_recordings_agree(screened, promise):
 )
 def test_a_refit_keeps_what_the_share_promised(numbers, believed):
     assert ShareRule().sound(Numbers(_screened(), **numbers)).believed == believed
+
+
+def test_recordings_disagree_where_what_would_be_enough_harms_some():
+    rule = ShareRule()
+    assert rule.disputed(_screened(folds=(0.8, 0.8, 0.8, -0.6)))
+    assert not rule.disputed(_screened())
+    assert not rule.disputed(_screened(left_out=0.1, folds=(0.8, 0.8, 0.8, -0.6)))
+    assert not rule.disputed(_screened(folds=(0.8, 0.8, 0.8, -0.6), left=0.2))
+    assert not LikelihoodRule().disputed(_screened(folds=(0.8, 0.8, 0.8, -0.6)))
 
 
 def test_fifteen_per_cent_is_worth_a_refit_whatever_the_readings():

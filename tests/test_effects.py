@@ -71,6 +71,12 @@ def _play(e):
     return catalogue["backlash"](*map(_a, numbers), joint=e["joint"])
 
 
+def _pulses(e):
+    h = np.arange(1, 8)
+    sine = _a(np.where(h % 2, 4 * e["amplitude"] / (np.pi * h), 0.0))
+    return catalogue["periodic_force"](sine, jnp.zeros(7), _a(e["frequency"]), joint=e["joint"])
+
+
 MAKE = {
     "torsional_spring": _spring,
     "base_tilt": lambda e: catalogue["base_tilt"](_a(e["angle"])),
@@ -103,6 +109,7 @@ MAKE = {
         _a(e["mu"]), _a(e["knee"]), names=("u", "dtheta2"), joint=e["joint"]
     ),
     "motor_back_emf": lambda e: catalogue["motor_back_emf"](_a(e["b"]), joint=e["joint"]),
+    "periodic_force": _pulses,
 }
 """The catalogue's effect of a simulator's one."""
 CRUDE = {

@@ -16,7 +16,7 @@ from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.look import open_loop_error
 from nnap_em.diagnose.propose import surroundings
 from nnap_em.diagnose.screen import candidate_columns, tracks
-from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, project, share
+from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, motions, project, share
 from nnap_em.effects import catalogue
 from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, weighed
 from nnap_em.em.noise import third_differences, white_readings
@@ -129,7 +129,7 @@ def test_shares_are_those_of_least_squares():
     rng = np.random.default_rng(0)
     x, fold = rng.normal(size=(400, 3)), np.repeat(np.arange(4), 100)
     e = x @ np.array([1.0, -0.5, 0.0]) + rng.normal(size=400)
-    inside, left_out, folds, directions, c = share(Rows(e, x, fold, 1.0, np.zeros(0)), slice(0, 2), np.zeros(2))
+    inside, left_out, folds, directions, c = share(Rows(e, x, fold, fold, 1.0, np.zeros(0)), slice(0, 2), np.zeros(2))
     fitted, rest, *_ = np.linalg.lstsq(x[:, :2], e, rcond=None)
     np.testing.assert_allclose(c, fitted, rtol=1e-6)
     raw = 1 - rest[0] / np.sum(e**2)
@@ -144,7 +144,7 @@ def test_shares_are_those_of_least_squares():
         gone += before - after
     assert left_out == pytest.approx(gone / np.sum(e**2), rel=1e-6)
     # what is not there removes nothing of what is left out
-    assert share(Rows(e, x, fold, 1.0, np.zeros(0)), slice(2, 3), np.zeros(1))[1] < 0.02
+    assert share(Rows(e, x, fold, fold, 1.0, np.zeros(0)), slice(2, 3), np.zeros(1))[1] < 0.02
 
 
 def test_rows_that_overlap_count_for_less():
@@ -152,7 +152,11 @@ def test_rows_that_overlap_count_for_less():
     rng = np.random.default_rng(1)
     e, x = rng.normal(size=400), rng.normal(size=(400, 2))
     apart, together = (
-        share(Rows(e, x, np.repeat(np.arange(4), 100), overlap, np.zeros(0)), slice(0, 2), np.zeros(2))[0]
+        share(
+            Rows(e, x, np.repeat(np.arange(4), 100), np.tile(np.arange(4), 100), overlap, np.zeros(0)),
+            slice(0, 2),
+            np.zeros(2),
+        )[0]
         for overlap in (1.0, 4.0)
     )
     assert (1 - together) / (1 - apart) == pytest.approx((99 / 97) / (399 / 397), rel=1e-6)
@@ -168,7 +172,7 @@ def test_the_nuisance_is_projected_out_by_ridge_regression(monkeypatch):
     precision = np.diag(rng.uniform(1, 9, size))
     monkeypatch.setattr(shares, "friction_prior", lambda *_: (precision, precision @ value))
     found, used = Forks(error, columns, np.array([1.0, 2.0])), np.array([True, False, True])
-    rows = project(found, model, weights, used)
+    rows = project(found, model, weights, used, fold_of(used, np.arange(3), 20))
     weight = np.sqrt(weighed(found, used))[used]
     wide = lambda a: (weight[..., None] * a[used]).reshape(-1, a.shape[-1])  # noqa: E731
     nuisance, own = np.split(wide(columns), [size], axis=1)
@@ -195,16 +199,33 @@ def test_friction_is_free_in_the_span_of_known_laws(bench):
 
 
 def test_folds_are_neighbours_and_pieces_where_there_are_few():
-    assert fold_of(np.ones(10, bool), 3)[:, 0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert fold_of(np.ones(10, bool), np.arange(10), 3)[:, 0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
     used = np.array([True, False, True, True])
-    assert fold_of(used, 2)[used][:, 0].tolist() == [0, 1, 2]
-    assert fold_of(np.ones(1, bool), 8)[0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert fold_of(used, np.arange(4), 2)[used][:, 0].tolist() == [0, 1, 2]
+    assert fold_of(np.ones(1, bool), np.zeros(1, int), 8)[0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_recordings_of_one_motion_are_left_out_together():
+    """Three motions, the first played three times; two motions only, cut at the same times."""
+    rng = np.random.default_rng(0)
+    one, two, three = np.cumsum(rng.normal(size=(3, 200, 2)), axis=1)
+    again = lambda motion: motion + 0.1 * motion.std() * rng.normal(size=motion.shape)  # noqa: E731
+    late = again(one)
+    late[150:] = np.nan
+    state, used = np.stack([one, two, again(one), three, late, two]), np.array([True] * 5 + [False])
+    motion = motions(state, used)
+    assert motion[:5].tolist() == [0, 1, 0, 3, 0]
+    assert fold_of(used, motion, 1)[used, 0].tolist() == [0, 1, 0, 2, 0]
+    used[3] = False
+    part = fold_of(used, motions(state, used), 8)
+    assert part[0].tolist() == part[2].tolist() == part[4].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
 
 
 def test_logs_too_short_for_a_fork_say_nothing():
     nothing = np.zeros((3, 0, 2, 1))
     assert ratio(nothing, nothing, np.ones(3, bool)) == 1.0
-    empty = Rows(np.zeros(0), np.zeros((0, 2)), np.zeros(0, int), 1.0, np.zeros(0))
+    empty = Rows(np.zeros(0), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), 1.0, np.zeros(0))
     assert share(empty, slice(0, 2), np.zeros(2))[:2] == (0.0, 0.0)
 
 

@@ -10,9 +10,10 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import look as search
 from nnap_em.diagnose import loop
 from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
-from nnap_em.diagnose.evidence import Projected, Screen, Screened, Share
+from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Share
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import covered, key_of, rest_of
 from nnap_em.diagnose.look import (
@@ -21,8 +22,10 @@ from nnap_em.diagnose.look import (
     Look,
     Step,
     _best_of_kind,
+    _disputed,
     _named_first,
     _shortlist,
+    look,
     significance,
     trimmed,
 )
@@ -30,7 +33,7 @@ from nnap_em.diagnose.loop import Closed, Loop
 from nnap_em.diagnose.propose import seeded
 from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.effects.function import Axis
+from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
 from nnap_em.model.state_space import with_effects
@@ -56,6 +59,11 @@ def _found(name: str) -> Found:
 def _function(name: str = "unknown_function"):
     axis = Axis(("x",), -2.0, 2.0, False, 20)
     return catalogue[name](axis.centres(), (axis,), joint=1)
+
+
+def _of_input():
+    axis = InputAxis(("u",), -2.0, 2.0, False, 20, index=0)
+    return catalogue["unknown_function"](axis.centres(), (axis,), joint=1)
 
 
 def _spring():
@@ -122,13 +130,15 @@ def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
     assert [name.partition(".")[0] for name in now.m_step.prior.names] == ["m", "0", "1"]
 
 
-def test_a_rest_belongs_to_the_law_of_its_own_joint():
+def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
     model = with_effects(MODEL, (_law("motor_gain"), _spring()))
     assert rest_of(_function(), model) == 1
+    assert rest_of(_of_input(), model) == 0
     assert rest_of(_spring(), model) is None
-    assert rest_of(_function(), with_effects(MODEL, (_law("motor_gain"),))) is None
+    assert rest_of(_function(), with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
     free = with_effects(MODEL, (_function(),))
     assert covered(_spring(), free) and not covered(_spring(), model) and not covered(_law("motor_gain"), free)
+    assert covered(_law("motor_gain"), with_effects(MODEL, (_of_input(),)))
 
 
 def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_another():
@@ -181,6 +191,57 @@ def _case(law, gain: float, held_out: float = 1e3) -> Case:
 def test_a_law_with_a_name_is_preferred_where_it_is_nearly_as_good(gain, first):
     sound = [_case(_function(), 100.0), _case(_law("air_drag"), gain)]
     assert _named_first(sound, LikelihoodRule())[0].effect.name == first
+
+
+def test_laws_of_other_causes_that_explain_the_same_are_rivals():
+    """A gain and a spring, where multi-step errors decide; two laws of the input are not."""
+    gain, zone, spring = (_case(law, 100.0) for law in (_law("motor_gain"), _law("dead_zone"), _spring()))
+    for case, error in ((gain, 0.40), (zone, 0.41), (spring, 0.42)):
+        case.__dict__["_error"] = error
+    rivals = lambda rule, *cases: [c.effect.name for c in loop._rivals(list(cases), rule, MODEL.system)]  # noqa: E731
+    assert rivals(ShareRule(), gain, zone, spring) == ["motor_gain", "torsional_spring"]
+    assert rivals(ShareRule(), gain, zone) == []
+    assert rivals(LikelihoodRule(), gain, spring) == []
+    spring.__dict__["_error"] = 0.5
+    assert rivals(ShareRule(), gain, spring) == []
+
+
+def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it():
+    law, other = _screened(_law("motor_gain")), _screened(_law("dead_zone"))
+    law = law._replace(share=Share(0.8, 0.5, (0.8, 0.8, -0.6)))
+    members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
+    screen = Screen((law, other), Projected(np.zeros(2), np.eye(2)), members)
+    (told,) = _disputed(screen, ShareRule())
+    assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
+    assert not _disputed(screen, LikelihoodRule())
+
+
+@pytest.mark.parametrize(("rest", "tried"), [(0.4, ["rest"]), (0.2, ["others"])])
+def test_the_rest_of_a_law_comes_before_other_causes(monkeypatch, rest, tried):
+    """Unless it promises far less than they do."""
+    function, drag = (
+        _screened(law)._replace(share=Share(p, p, (p,) * 3))
+        for law, p in ((_function(), rest), (_law("air_drag"), 0.5))
+    )
+    ranked = [(0.5, drag), (rest, function)]
+    monkeypatch.setattr(search, "_best_of_kind", lambda *_: ranked)
+    groups = []
+
+    def refits(question, group, *_):
+        groups.append([s.candidate.start.name for s in group])
+        return [_case(group[0].candidate.start, 100.0)] if group else []
+
+    monkeypatch.setattr(search, "_refits", refits)
+    monkeypatch.setattr(search, "_is_sound", lambda *_: True)
+    monkeypatch.setattr(search, "surroundings", lambda *_: None)
+    monkeypatch.setattr(search, "proposals", lambda *_: [])
+    monkeypatch.setattr(search, "_refitted", lambda *_: None)
+    now = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
+    question = Question(BARE, now, None, DATA, np.ones(6, bool), 9)
+    monkeypatch.setattr(ShareRule, "screen", lambda *_: Screen((), Projected(np.zeros(0), np.eye(0))))
+    monkeypatch.setattr(ShareRule, "worth", lambda *_: 1.0)
+    look(question, RIG, ShareRule(), EFFORT, lambda text: None)
+    assert groups == ([["unknown_function"]] if tried == ["rest"] else [[], ["unknown_function", "air_drag"]])
 
 
 # --- the loop

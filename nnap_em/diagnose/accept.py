@@ -56,6 +56,10 @@ class AbstractRule(eqx.Module):
     def worth_a_refit(self, promise: float, readings: int) -> bool:
         """Whether that is enough to look closer."""
 
+    def disputed(self, screened: Screened) -> bool:
+        """Whether recordings disagree about a candidate that would be worth a refit were it not for some of them."""
+        return False
+
     @abstractmethod
     def worth(self, evidence: Evidence) -> float:
         """What an effect is worth after its refit; the larger the better."""
@@ -151,6 +155,8 @@ class ShareRule(AbstractRule):
     """Share of the parts left out on which the error must fall."""
     harm: float = eqx.field(static=True, default=0.1)
     """Share by which it may rise on any."""
+    matters: float = eqx.field(static=True, default=0.1)
+    """Share of the declared model's error that a later law must remove as well: what chance can of the whole."""
     level: float = eqx.field(static=True, default=0.9)
     """Share of the winner's worth from which on a rival explains the same as well: folds differ by more."""
 
@@ -163,12 +169,35 @@ class ShareRule(AbstractRule):
         return share_test(question, candidates)
 
     def promise(self, screened: Screened, readings: int) -> float:
-        """The smaller share; none where the recordings disagree, or for a multiple of a law that is not linear."""
+        """The smaller share; none where the recordings disagree, for a multiple of a law that is not linear, or where
+        the law removes next to nothing of what there was at first.
+        """
         share = screened.share
         assert share is not None
-        same = screened.candidate.start.linear or 0.3 < screened.coefficients[0] < 3.0
-        agreed = sum(f > 0 for f in share.folds) >= self.agree * len(share.folds) and min(share.folds) > -self.harm
-        return share.least if same and agreed else 0.0
+        fits = self._same(screened) and self._agreed(screened) and share.least * share.left >= self.matters
+        return share.least if fits else 0.0
+
+    def disputed(self, screened: Screened) -> bool:
+        """Whether it would remove enough, but not of all."""
+        share = screened.share
+        assert share is not None
+        enough = share.least >= self.least and share.least * share.left >= self.matters
+        return enough and self._same(screened) and not self._agreed(screened)
+
+    @staticmethod
+    def _same(screened: Screened) -> bool:
+        """Whether it is nearly its probe, where it is not linear."""
+        return screened.candidate.start.linear or 0.3 < float(screened.coefficients[0]) < 3.0
+
+    def _agreed(self, screened: Screened) -> bool:
+        """Whether the error falls on most parts and rises on none; a free function of an input, which answers any
+        disturbance under feedback, has to remove the least share of every one.
+        """
+        assert screened.share is not None
+        folds = screened.share.folds
+        if screened.candidate.start.answers():
+            return min(folds) >= self.least
+        return sum(f > 0 for f in folds) >= self.agree * len(folds) and min(folds) > -self.harm
 
     def worth_a_refit(self, promise: float, readings: int) -> bool:
         """Whether that is the least share."""

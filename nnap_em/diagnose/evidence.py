@@ -40,6 +40,8 @@ class Question(NamedTuple):
     """Sequences that are followed."""
     rows: int
     """Of the whole recording, of which `data` may be a part."""
+    left: float = 1.0
+    """Squared open-loop error of the model over that of the declared one."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -66,6 +68,8 @@ class Share(NamedTuple):
     """Of that on recordings which its strengths were not fitted to."""
     folds: tuple[float, ...]
     """Of that on each part of them."""
+    left: float = 1.0
+    """Squared error of the model that is asked of, over that of the declared one."""
 
     @property
     def least(self) -> float:
@@ -99,6 +103,8 @@ class Screen(NamedTuple):
 
     screened: tuple[Screened, ...]
     projected: Projected
+    members: Bool[np.ndarray, "fold seq"] = np.zeros((0, 0), bool)
+    """Sequences that each part left out holds, or pieces of."""
 
 
 class Worth:

@@ -154,8 +154,17 @@ def findings(closed: Closed) -> list[Finding]:
     return out
 
 
-def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: int = 0) -> str:
-    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly."""
+def verdict(
+    found: Sequence[Finding], error: Mapping[str, Any] | None, failed: int = 0, rivals: Sequence[Key] = ()
+) -> str:
+    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly, and
+    `rivals` explain the same of what is left.
+    """
+    if not found and rivals:
+        return (
+            f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "
+            "same; none is added."
+        )
     if not found and failed:
         return (
             "No single effect of the catalogue is certain to be missing, but the declared model does not explain "
@@ -203,15 +212,52 @@ def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> 
     return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
 
 
-def advice(found: Sequence[Finding]) -> list[str]:
-    """What to look at next."""
+class Dispute(NamedTuple):
+    """A law on which recordings disagree, as it is reported."""
+
+    name: str
+    joint: int | None
+    channel: str | None
+    inputs: list[str]
+    share_of_error: float
+    """That it would remove."""
+    files: list[str]
+    """Recordings that speak against it."""
+    harm: float
+    """Share by which the error would rise on the worst of them."""
+    description: str
+
+
+def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
+    """Laws that the last look would have tried, had some recordings not said the opposite; `files` by sequence."""
     out = []
+    for told in closed.steps[-1].disputed[:most] if closed.steps else ():
+        name, joint, channel, inputs = told.key
+        against = [files[i] for i in told.against]
+        text = (
+            f"{words(told.key)} would remove {told.share:.0%} of the prediction error, but {listed(against)} "
+            f"{'says' if len(against) == 1 else 'say'} the opposite (up to {told.harm:.0%} more error)"
+        )
+        key = catalogue[name].key()
+        out.append(Dispute(key, joint, channel, list(inputs), told.share, against, told.harm, text))
+    return out
+
+
+def undecided(closed: Closed) -> tuple[Key, ...]:
+    """Laws of other causes that explain the same of what is left, so that none of them was added."""
+    return closed.steps[-1].rivals if closed.steps else ()
+
+
+def advice(found: Sequence[Finding], disputed: Sequence[Dispute] = (), rivals: Sequence[Key] = ()) -> list[str]:
+    """What to look at next."""
+    out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
+    out += [f"{told.description}: look at what is different there." for told in disputed]
     for finding in found:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
         for key in finding.equivalent:
             out.append(f"To tell it from {words(key)}: {catalogue[key[0]].confirm}")
-    if not found:
+    if not out:
         out.append(
             "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
         )

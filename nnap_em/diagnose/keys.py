@@ -24,12 +24,9 @@ def words(key: Key) -> str:
 
 
 def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
-    """Place of the named law whose rest an unnamed one is: a function of the same position at the same joint."""
-    if effect.named or effect.joint is None:
-        return None
-    if effect.inputs_named() != (model.system.coordinates[effect.joint - 1],):
-        return None
-    return next((i for i, e in enumerate(model.effects) if e.place and e.joint == effect.joint), None)
+    """Place of the named law whose rest an unnamed one is: a function of the same signals at the same joint."""
+    laws = (i for i, e in enumerate(model.effects) if e.named and _alike(e, effect, model))
+    return None if effect.named else next(laws, None)
 
 
 def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
@@ -39,8 +36,11 @@ def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
 
 
 def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
-    """Whether an unnamed law in the model is a function of the same position at the same joint."""
-    if not effect.place or effect.joint is None:
-        return False
-    own = (model.system.coordinates[effect.joint - 1],)
-    return any(e.joint == effect.joint and e.inputs_named() == own for e in model.effects)
+    """Whether an unnamed law in the model is a function of the same signals at the same joint as a named one."""
+    return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
+
+
+def _alike(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
+    """Whether both are functions of the same signals at the same joint."""
+    own, its = (set(effect.signals(model.system)) for effect in (one, other))
+    return bool(own) and own == its and one.joint == other.joint

@@ -44,6 +44,18 @@ class Effort(NamedTuple):
 EFFORT = Effort()
 
 
+class Disputed(NamedTuple):
+    """A law on which recordings disagree."""
+
+    key: Key
+    share: float
+    """Of the squared error that it would remove."""
+    against: tuple[int, ...]
+    """Sequences that it would harm."""
+    harm: float
+    """Share by which the error of the worst part of them would rise."""
+
+
 class Step(NamedTuple):
     """What was seen at one look, for the report."""
 
@@ -56,6 +68,10 @@ class Step(NamedTuple):
     """Candidates screened."""
     measure: str = "expected gain in log-likelihood [nat]"
     """What the numbers are."""
+    disputed: tuple[Disputed, ...] = ()
+    """Best first."""
+    rivals: tuple[Key, ...] = ()
+    """Laws of other causes that explain the same, so that none of them was added."""
 
 
 def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:
@@ -221,39 +237,69 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     """One look: everything screened, the best few refitted; those that hold, best first."""
     now, data, readings = question.now, question.data, question.readings
     around = surroundings(rig, now.model, data, question.path, question.rows)
-    candidates = proposals(around)
+    candidates = proposals(around, now.model.effects)
     screen = rule.screen(question, candidates)
     ranked = _best_of_kind(screen, rule, readings)
     worthy = functools.partial(rule.worth_a_refit, readings=readings)
     entries = _shortlist(ranked, now.model, worthy, effort)
     length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     seen = tuple((key_of(s.candidate.start), promise) for promise, s in ranked)
-    step = Step(length, seen, (), None, len(candidates), rule.promises)
+    step = Step(length, seen, (), None, len(candidates), rule.promises, _disputed(screen, rule))
     if not entries:
         return Look(step, screen, [], [])
     null = _refitted(now, question.path, question, rule, effort)
     if data.t.shape[1] < question.rows:  # over a long horizon a start that is far off loses every track
         entries += _more_starts(entries, screen, effort)
+    # what is left of a law is not to be explained by another cause: its own rest comes first
+    bar = rule.near * ranked[0][0]
+    first = [
+        s for s in entries if rest_of(s.candidate.start, now.model) is not None and rule.promise(s, readings) > bar
+    ]
+    tried, sound = [], []
+    for group in (first, [s for s in entries if not any(s is f for f in first)]):
+        if not sound:
+            cases = _refits(question, group, null, rule, effort, say)
+            tried, sound = tried + cases, [case for case in cases if _is_sound(case, rule, say)]
+    by_worth = functools.partial(sorted, key=lambda case: -rule.worth(case))
+    step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in by_worth(tried)))
+    return Look(step, screen, _named_first(by_worth(sound), rule), by_worth(tried))
+
+
+def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, effort: Effort, say: Say) -> list[Case]:
+    """Some candidates refitted, the best of every kind."""
     best: dict[Key, Case] = {}
-    for screened in entries:
+    for screened in group:
         case = _try(question, screened, null, rule, effort)
         key = key_of(case.effect)
         values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
-        promise = rule.promise(screened, readings)
+        promise = rule.promise(screened, question.readings)
         say(f"  tried {words(key)} {values}: promises {promise:.3g}, refit {case.gain:.0f} nat")
         if key not in best or rule.worth(best[key]) < rule.worth(case):
             best[key] = case
-    tried = sorted(best.values(), key=lambda case: -rule.worth(case))
-    sound = []
-    for case in tried:
-        verdict = rule.sound(case)
-        if case.effect.possible() and verdict.believed:
-            sound.append(case)
-        else:
-            reason = verdict.reason if case.effect.possible() else "has values that make no sense"
-            say(f"  {words(key_of(case.effect))} {reason}")
-    step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in tried))
-    return Look(step, screen, _named_first(sound, rule), tried)
+    return list(best.values())
+
+
+def _is_sound(case: Case, rule: AbstractRule, say: Say) -> bool:
+    verdict = rule.sound(case)
+    if case.effect.possible() and verdict.believed:
+        return True
+    reason = verdict.reason if case.effect.possible() else "has values that make no sense"
+    say(f"  {words(key_of(case.effect))} {reason}")
+    return False
+
+
+def _disputed(screen: Screen, rule: AbstractRule) -> tuple[Disputed, ...]:
+    """The best of every kind on which recordings disagree."""
+    best: dict[Key, Disputed] = {}
+    for one in filter(rule.disputed, screen.screened):
+        if not seeded(one.candidate, one.coefficients).possible():
+            continue
+        key, folds = key_of(one.candidate.start), np.asarray(one.share.folds if one.share else ())
+        against = screen.members[folds < 0].any(axis=0)
+        told = Disputed(key, one.share.least if one.share else 0.0, tuple(np.flatnonzero(against)), -float(folds.min()))
+        if key not in best or best[key].share < told.share:
+            best[key] = told
+    return tuple(sorted(best.values(), key=lambda told: -told.share))
 
 
 def _named_first(sound: list[Case], rule: AbstractRule) -> list[Case]:

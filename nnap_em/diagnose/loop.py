@@ -24,6 +24,7 @@ from ..em.mstep import kept
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
+from ..systems import AbstractSystem
 from .accept import SHORT, AbstractRule, LikelihoodRule, ShareRule
 from .evidence import Question, Worth, lazy, readings
 from .hypothesis import Found, Hypothesis
@@ -197,9 +198,17 @@ def _search(
         say(f"horizon {length * loop.before.rig.dt:.2f} s: {whole.sum()} of {whole.size} sequences followed")
         if not question.used.any():
             break
+        if rule.multistep and now.found:
+            question = question._replace(left=Difference(loop, loop.bare, now, math.nan).error)
+            say(f"  {question.left:.0%} of the open-loop error of the declared model is left")
         seen = look(question, loop.before.rig, rule, loop.effort, say)
         steps.append(seen.step)
         if not seen.sound:
+            break
+        rivals = _rivals(seen.sound, rule, now.model.system)
+        if rivals:
+            steps[-1] = seen.step._replace(rivals=tuple(key_of(case.effect) for case in rivals))
+            say(f"  cannot tell: {', '.join(map(words, steps[-1].rivals))} explain the same; none is added")
             break
         winner, further, behind = _settle(loop, now, length, seen.sound)
         key, verdict = key_of(winner.effect), rule.believes(winner)
@@ -223,6 +232,15 @@ def _search(
         if further is not None:
             return now, further
     return now, None
+
+
+def _rivals(sound: list[Case], rule: AbstractRule, system: AbstractSystem) -> list[Case]:
+    """The best and those that explain the same by another cause, where there are any: nothing chooses among them."""
+    best, *others = sound
+    own = set(best.effect.signals(system))
+    apart = lambda case: bool(own) and bool(its := set(case.effect.signals(system))) and own.isdisjoint(its)  # noqa: E731
+    rivals = [case for case in others if apart(case) and rule.multistep and rule.even(best, case)]
+    return [best, *rivals] if rivals else []
 
 
 def _names(now: Hypothesis) -> frozenset[Key]:

@@ -1,5 +1,7 @@
 """What is tried: every effect of the catalogue that this machine could have, and where its fit starts."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,11 +10,12 @@ from jaxtyping import Float
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..effects import AbstractEffect, Around, Candidate, catalogue
+from ..effects import AbstractEffect, Around, Candidate, catalogue, free_form
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
+from .keys import key_of
 
 
 def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int) -> Around:
@@ -48,9 +51,13 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
     )
 
 
-def proposals(around: Around) -> list[Candidate]:
-    """Everything in the catalogue that this machine could have."""
-    return [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
+def proposals(around: Around, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:
+    """Everything in the catalogue that this machine could have, and other forms of what is `known` to be there."""
+    every = [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
+    there = {key_of(candidate.start) for candidate in every}
+    free = (form for law in known if law.named for form in free_form(law, around))
+    every += [form for form in free if key_of(form.start) not in there]
+    return every + [form for law in known for form in law.richer(around)]
 
 
 def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> AbstractEffect:

@@ -27,6 +27,11 @@ from .screen import candidate_columns, tracks
 
 FOLDS = 5
 """Parts that are left out in turn, as far as there are recordings."""
+BLOCKS = 5
+"""The same for pieces of time: what happens at one moment of every recording is no law."""
+REPEATS = 0.2
+"""Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
+differ by up to .13, others by .25 and more."""
 SHAPE = 0.1
 """Rms of a friction map beside the span of known laws, over that of the map; .03 to .3 gave the same answers."""
 KNEES = (0.003, 0.01, 0.03, 0.1, 0.3)
@@ -39,6 +44,9 @@ class Rows(NamedTuple):
     error: Float[np.ndarray, " row"]
     columns: Float[np.ndarray, "row column"]
     fold: Int[np.ndarray, " row"]
+    """By motion."""
+    block: Int[np.ndarray, " row"]
+    """By time since the start of a recording."""
     overlap: float
     """Rows that count as one."""
     nuisance: Float[np.ndarray, " nuisance"]
@@ -68,21 +76,48 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
     return precision, pull
 
 
-def fold_of(used: Bool[np.ndarray, " seq"], starts: int) -> Int[np.ndarray, "seq start"]:
-    """The part that every fork belongs to: neighbouring recordings together, or pieces of the only ones."""
-    count = int(used.sum())
-    order = np.where(used, np.cumsum(used) - 1, 0)
+def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"]) -> Int[np.ndarray, " seq"]:
+    """A number for every motion: recordings that repeat it are no evidence of each other, and share it."""
+    size = np.nanmean(state[used] ** 2, axis=(0, 1)) + 1e-12
+    scaled = state / np.sqrt(size)
+    motion = np.arange(len(state))
+    for i, j in itertools.combinations(np.flatnonzero(used), 2):
+        apart, own = np.nanmean((scaled[i] - scaled[j]) ** 2), np.nanmean(scaled[[i, j]] ** 2)
+        if apart < REPEATS * own:
+            motion[motion == motion[j]] = motion[i]
+    return motion
+
+
+def fold_of(
+    used: Bool[np.ndarray, " seq"], motion: Int[np.ndarray, " seq"], starts: int
+) -> Int[np.ndarray, "seq start"]:
+    """The part that every fork belongs to: neighbouring motions together, or pieces of the only ones."""
+    different, first = np.unique(motion[used], return_index=True)
+    order = np.zeros(used.size, int)
+    for rank, i in enumerate(np.argsort(first)):
+        order[motion == different[i]] = rank
+    count = different.size
     if count >= 3:
         return np.repeat((order * min(FOLDS, count) // count)[:, None], starts, axis=1)
     pieces = np.arange(starts) * 4 // starts
     return order[:, None] * 4 + pieces[None, :]
 
 
-def project(found: Forks, model: StateSpaceModel, weights: Weights, used: Bool[np.ndarray, " seq"]) -> Rows:
-    """Errors and candidates without what friction, parameters and the effects in the model can say of them."""
+def project(
+    found: Forks,
+    model: StateSpaceModel,
+    weights: Weights,
+    used: Bool[np.ndarray, " seq"],
+    part: Int[np.ndarray, "seq start"],
+) -> Rows:
+    """Errors and candidates without what friction, parameters and the effects in the model can say of them.
+
+    `part` is that which every fork belongs to.
+    """
     weight = weighed(found, used)
     keep = weight > 0
-    fold = np.broadcast_to(fold_of(used, keep.shape[1])[:, :, None, None], keep.shape)[keep]
+    fold = np.broadcast_to(part[:, :, None, None], keep.shape)[keep]
+    block = np.broadcast_to((np.arange(keep.shape[1]) * BLOCKS // keep.shape[1])[None, :, None, None], keep.shape)[keep]
     root = np.sqrt(weight[keep])
     error, columns = root * found.error[keep], root[:, None] * found.columns[keep]
     count = weights.nodes.size + weights.prior.size
@@ -92,7 +127,7 @@ def project(found: Forks, model: StateSpaceModel, weights: Weights, used: Bool[n
     solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
     taken = solve(nuisance.T @ error - pull)
     rest = own - nuisance @ solve(nuisance.T @ own)
-    return Rows(error - nuisance @ taken, rest, fold, float(np.mean(found.overlap)), taken)
+    return Rows(error - nuisance @ taken, rest, fold, block, float(np.mean(found.overlap)), taken)
 
 
 class Removed(NamedTuple):
@@ -103,6 +138,7 @@ class Removed(NamedTuple):
     folds: Float[np.ndarray, "candidate fold"]
     directions: Float[np.ndarray, " candidate"]
     coefficients: Float[np.ndarray, " probe"]
+    members: Bool[np.ndarray, "fold seq"]
     projected: Projected
 
 
@@ -112,7 +148,7 @@ def spans(candidates: Sequence[Candidate]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
-@step(lambda *_: Removed(HERE, HERE, HERE, HERE, HERE, Projected(HERE, HERE)))
+@step(lambda *_: Removed(HERE, HERE, HERE, HERE, HERE, HERE, Projected(HERE, HERE)))
 def removed(
     base: StateSpaceModel,
     model: StateSpaceModel,
@@ -125,14 +161,21 @@ def removed(
     """What every candidate removes of the multi-step errors of `model`, which is `base` and its effects."""
     track = tracks(model, path, each(_inputs, model, data))
     extra = candidate_columns(eqx.tree_at(lambda m: m.unknown, base, model.unknown), candidates, track)
-    rows = project(forks(model, weights, path, data, extra), model, weights, used)
-    told = [share(rows, here, _ridge(c)) for c, here in zip(candidates, spans(candidates), strict=True)]
+    found = forks(model, weights, path, data, extra)
+    state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
+    part = fold_of(used, motions(state[..., : 2 * len(model.system.coordinates)], used), found.error.shape[1])
+    rows = project(found, model, weights, used, part)
+    timed = ["time" in c.start.signals(model.system) for c in candidates]
+    told = [
+        share(rows, here, _ridge(c), at_any_time=not clock)
+        for c, here, clock in zip(candidates, spans(candidates), timed, strict=True)
+    ]
     inside, left_out, folds, directions, coefficients = zip(*told, strict=True)
     columns = rows.columns / np.sqrt(rows.overlap)
     projected = Projected(columns.T @ (rows.error / np.sqrt(rows.overlap)), columns.T @ columns)
     return Removed(
         np.asarray(inside), np.asarray(left_out), np.stack(folds), np.asarray(directions), np.concatenate(coefficients),
-        projected,
+        np.array([(part == f).any(axis=1) & used for f in np.unique(rows.fold)]).reshape(-1, used.size), projected,
     )  # fmt: skip
 
 
@@ -151,11 +194,11 @@ def share_test(question: Question, candidates: Sequence[Candidate]) -> Screen:
             told.coefficients[here],
             round(float(told.directions[i])),
             math.nan,
-            Share(float(told.inside[i]), float(told.left_out[i]), tuple(told.folds[i].tolist())),
+            Share(float(told.inside[i]), float(told.left_out[i]), tuple(told.folds[i].tolist()), question.left),
         )
         for i, (candidate, here) in enumerate(zip(candidates, spans(candidates), strict=True))
     )
-    return Screen(screened, told.projected)
+    return Screen(screened, told.projected, told.members)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
@@ -165,29 +208,38 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
     return np.array([np.sum(step**2) for step in steps]) if candidate.start.linear else np.zeros(len(steps))
 
 
-def share(rows: Rows, here: slice, ridge: Float[np.ndarray, " probe"]):
-    """Share inside, on what is left out, on every fold, directions and coefficients of some columns together."""
-    e, x, fold = rows.error, rows.columns[:, here].astype(float), rows.fold
-    parts = [fold == f for f in np.unique(fold)]
+def share(rows: Rows, here: slice, ridge: Float[np.ndarray, " probe"], *, at_any_time: bool = True):
+    """Share inside, on what is left out, on every fold, directions and coefficients of some columns together.
+
+    With `at_any_time`, what is left out is every block of time as well, and the smaller share counts.
+    """
+    e, x = rows.error, rows.columns[:, here].astype(float)
+    parts = [rows.fold == f for f in np.unique(rows.fold)]
     if len(parts) < 2:  # too short to leave anything out
         return 0.0, 0.0, np.zeros(1), 0.0, np.zeros(x.shape[1])
-    gram, score = np.stack([x[p].T @ x[p] for p in parts]), np.stack([x[p].T @ e[p] for p in parts])
-    whole = np.array([np.sum(e[p] ** 2) for p in parts])
-    size = x.shape[1]
+    size, total = x.shape[1], np.sum(e**2)
 
-    def fitted(keep):
-        a = gram[keep].sum(0) + np.diag(ridge)
+    def fitted(gram, score):
+        a = gram + np.diag(ridge)
         a = a + (1e-9 * np.trace(a) / size + 1e-30) * np.eye(size)
-        return np.linalg.solve(a, score[keep].sum(0)), a
+        return np.linalg.solve(a, score), a
 
-    def gone(c, f):
-        return 2 * c @ score[f] - c @ gram[f] @ c
+    def gone(c, gram, score):
+        return 2 * c @ score - c @ gram @ c
 
-    every = np.arange(len(parts))
-    c, a = fitted(every)
-    directions = float(np.trace(np.linalg.solve(a, gram.sum(0))))
+    gram, score = x.T @ x, x.T @ e
+    c, a = fitted(gram, score)
+    directions = float(np.trace(np.linalg.solve(a, gram)))
     count = max(len(e) / rows.overlap, directions + 2)
-    raw = sum(gone(c, f) for f in every) / whole.sum()
-    inside = 1 - (1 - raw) * (count - 1) / (count - directions - 1)
-    left_out = np.array([gone(fitted(every[every != f])[0], f) for f in every])
-    return float(inside), float(left_out.sum() / whole.sum()), left_out / whole, directions, c
+    inside = 1 - (1 - gone(c, gram, score) / total) * (count - 1) / (count - directions - 1)
+
+    def without(part):
+        own, its = x[part].T @ x[part], x[part].T @ e[part]
+        return gone(fitted(gram - own, score - its)[0], own, its)
+
+    out = np.array([without(p) for p in parts])
+    sums = [out.sum()]
+    if at_any_time:
+        sums.append(sum(without(rows.block == b) for b in np.unique(rows.block)))
+    folds = out / np.array([np.sum(e[p] ** 2) for p in parts])
+    return float(inside), float(min(sums) / total), folds, directions, c

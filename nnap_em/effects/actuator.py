@@ -7,14 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .base import JointEffect, Scalar, one
+from .base import JointEffect, Scalar, input_of, one
 
 
 class InputEffect(JointEffect):
     """A law of the input that drives its joint."""
 
-    def signals(self, around):
-        return (around.column(self.joint),)
+    def signals(self, system):
+        return (input_of(self.joint),)
 
 
 class MotorGain(InputEffect):

@@ -116,8 +116,6 @@ class AbstractEffect(eqx.Module):
     """States of its own."""
     substeps: ClassVar[int] = 1
     """Integration steps per sample that it needs."""
-    place: ClassVar[bool] = False
-    """True for a force that depends on the position of its own joint alone."""
     linear: ClassVar[bool] = True
     """False where a probe itself, not its multiple, is the place to start a fit from."""
     held: ClassVar[bool] = False
@@ -171,9 +169,17 @@ class AbstractEffect(eqx.Module):
         """Of what it is a function, for laws that the vocabulary has no name for."""
         return ()
 
-    def signals(self, around: Around) -> tuple[str, ...]:
-        """Of what its force at its joint is a function, where its free form is to be tried."""
+    def signals(self, system: AbstractSystem) -> tuple[str, ...]:
+        """Of what its force at its joint is a function: coordinates, rates, "time", `input_of` a joint."""
         return ()
+
+    def richer(self, around: Around) -> list[Candidate]:
+        """The same law with more of a form, to be tried once it is found."""
+        return []
+
+    def answers(self) -> bool:
+        """Whether it is a free function of an input, which under feedback answers whatever disturbs the machine."""
+        return False
 
     def memory_scale(self) -> Float[Array, " memory"]:
         """Typical size of its own states."""
@@ -224,6 +230,11 @@ class SensorEffect(AbstractEffect):
 
     channel: str = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
     """The reading; "all": every one."""
+
+
+def input_of(joint: int | None) -> str:
+    """The input of a joint, as `signals` call it."""
+    return f"input {joint}"
 
 
 def known(**options):

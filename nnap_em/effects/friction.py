@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import Candidate, JointEffect, Scalar, a, known, one, pair
+from .base import Candidate, JointEffect, Scalar, a, input_of, known, one, pair
 
 
 class PositionDependentFriction(JointEffect):
@@ -30,8 +30,8 @@ class PositionDependentFriction(JointEffect):
         depth = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"depth": depth, "n": self.n, "phase": jnp.arctan2(-self.sine, self.cosine)}
 
-    def signals(self, around):
-        return around.system.coordinates[self.joint - 1], around.system.rates[self.joint - 1]
+    def signals(self, system):
+        return system.coordinates[self.joint - 1], system.rates[self.joint - 1]
 
     def friction(self, torque, scene):
         angle = self.n * self.own(scene.q)
@@ -64,8 +64,8 @@ class FrictionDrift(JointEffect):
     def values(self):
         return {"change": self.change, "tau": jnp.exp(self.pace)}
 
-    def signals(self, around):
-        return around.system.rates[self.joint - 1], "time"
+    def signals(self, system):
+        return system.rates[self.joint - 1], "time"
 
     def friction(self, torque, scene):
         grown = 1 - jnp.exp(-scene.time * jnp.exp(-self.pace))
@@ -96,8 +96,8 @@ class LoadFriction(JointEffect):
     def inputs_named(self):
         return self.names
 
-    def signals(self, around):
-        return self.names
+    def signals(self, system):
+        return input_of(self.joint), system.rates[self.joint - 1]
 
     def possible(self):
         return float(self.mu) > 0

@@ -8,17 +8,23 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..systems.base import AbstractSystem
-from .base import AbstractEffect, Around, Candidate, JointEffect, Scalar, Scene, a
+from .base import AbstractEffect, Around, Candidate, JointEffect, Scalar, Scene, a, input_of
+
+BACKWARDS = 0.1
+"""Share of its range by which a drive may seem to fall with its input: noise of what was learned."""
 
 
 class AbstractAxis(eqx.Module):
     """One axis of the function: what it reads, and where its basis functions stand."""
 
+    answers: ClassVar[bool]
+    """True for an input."""
     names: tuple[str, ...] = eqx.field(static=True)
     low: Scalar = eqx.field(converter=a)
     high: Scalar = eqx.field(converter=a)
@@ -34,21 +40,31 @@ class AbstractAxis(eqx.Module):
     def unit(self, system: AbstractSystem) -> str:
         """Of what it reads."""
 
+    def signals(self, system: AbstractSystem) -> tuple[str, ...]:
+        """What it reads, as effects call it."""
+        return self.names
+
+    def acts(self, system: AbstractSystem) -> int | None:
+        """The joint where a function of it may act; None: at any."""
+        return None
+
     def centres(self) -> Float[Array, " basis"]:
         """Places of the basis functions."""
         return jnp.linspace(self.low, self.high, self.count, endpoint=not self.turns)
 
     def basis(self, value: Scalar) -> Float[Array, " basis"]:
-        """Basis functions at a value."""
+        """Basis functions at a value; beyond the ends, where nothing was learned, those of the end."""
         centres = self.centres().astype(value.dtype)
         width = (self.high - self.low) / (self.count - (not self.turns))
-        away = value - centres
-        away = 2 * jnp.sin(0.5 * away) if self.turns else away
+        inside = jnp.clip(value, self.low.astype(value.dtype), self.high.astype(value.dtype))
+        away = 2 * jnp.sin(0.5 * (value - centres)) if self.turns else inside - centres
         return jnp.exp(-0.5 * (away / width) ** 2)
 
 
 class Axis(AbstractAxis):
     """A coordinate, a rate, the time, or a sum of angles."""
+
+    answers: ClassVar[bool] = False
 
     def value(self, scene):
         system = scene.system
@@ -67,6 +83,7 @@ class Axis(AbstractAxis):
 class InputAxis(AbstractAxis):
     """An input by its column, as it reaches its joint [N m]."""
 
+    answers: ClassVar[bool] = True
     index: int = eqx.field(static=True, kw_only=True)
     """Place among the inputs of the rig, counted from 0."""
 
@@ -75,6 +92,12 @@ class InputAxis(AbstractAxis):
 
     def unit(self, system):
         return system.force_unit(system.joints[self.index])
+
+    def signals(self, system):
+        return (input_of(system.joints[self.index]),)
+
+    def acts(self, system):
+        return system.joints[self.index]
 
 
 class UnknownFunction(JointEffect):
@@ -97,13 +120,32 @@ class UnknownFunction(JointEffect):
         states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
         pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
-        return [_function(j, grid, around) for j in around.joints for grid in grids]
+        places = [(j, grid) for j in around.joints for grid in grids]
+        return [
+            _function(j, grid, around) for j, grid in places if all(axis.acts(system) in (None, j) for axis in grid)
+        ]
 
     def values(self):
         return {}
 
     def inputs_named(self):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.names))
+
+    def signals(self, system):
+        return tuple(dict.fromkeys(name for axis in self.axes for name in axis.signals(system)))
+
+    def answers(self):
+        return any(axis.answers for axis in self.axes)
+
+    def possible(self):
+        """A drive gives no less torque for more input, whatever it loses: what zigzags stands for another cause."""
+        if len(self.axes) > 1 or not self.answers():
+            return True
+        (axis,) = self.axes
+        u = np.linspace(float(axis.low), float(axis.high), 8 * axis.count)
+        total = u + np.asarray(jax.vmap(lambda one: self.torque([one]))(jnp.asarray(u)))
+        rise = np.diff(total)
+        return bool(-rise[rise < 0].sum() < BACKWARDS * np.ptp(total))
 
     def torque(self, values: Sequence[Scalar]) -> Scalar:
         """The learned function at a value of every axis [N m]."""
@@ -119,7 +161,8 @@ class UnknownFunction(JointEffect):
 def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:
     """The unknown functions of the same signals at the same joint: what `effect` would be, were its form not known."""
     axes = _axes(around)
-    names = [(name,) for name in effect.signals(around)]
+    inputs = {input_of(j): around.column(j) for j, _ in around.driven}
+    names = [(inputs.get(name, name),) for name in effect.signals(around.system)]
     if effect.joint is None or not names or not all(name in axes for name in names):
         return []
     return [_function(effect.joint, tuple(axes[name](20 if len(names) == 1 else 6) for name in names), around)]

@@ -14,10 +14,8 @@ from .base import Candidate, JointEffect, Scalar, a, contact, known, one, pair
 class PlaceEffect(JointEffect):
     """A force that depends on the position of its own joint alone."""
 
-    place: ClassVar[bool] = True
-
-    def signals(self, around):
-        return (around.system.coordinates[self.joint - 1],)
+    def signals(self, system):
+        return (system.coordinates[self.joint - 1],)
 
 
 class TorsionalSpring(PlaceEffect):
@@ -199,8 +197,8 @@ class EddyBrake(JointEffect):
         c = jnp.sqrt(self.even**2 + self.odd**2 + 1e-30)
         return {"c": c, "center": 0.5 * jnp.arctan2(self.odd, self.even)}
 
-    def signals(self, around):
-        return around.system.coordinates[self.joint - 1], around.system.rates[self.joint - 1]
+    def signals(self, system):
+        return system.coordinates[self.joint - 1], system.rates[self.joint - 1]
 
     def force(self, scene, memory):
         twice = 2 * self.own(scene.q)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import Logs
-from ..diagnose.findings import Finding, advice, entry, friction_change, verdict
+from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.look import Step
 from ..diagnose.loop import Closed
@@ -59,8 +59,9 @@ def write_diagnosis(
         *_found_pictures(found),
         *_search_pictures(closed.steps),
     ]
+    disputed, rivals = disputes(closed, train.files), undecided(closed)
     document = shared(closed.before, train, test, seed=seed, began=began) | {
-        "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"])),
+        "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"]), rivals),
         "effects": [entry(f) for f in found],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
@@ -69,7 +70,9 @@ def write_diagnosis(
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
-        "next": advice(found),
+        "disagreements": [d._asdict() for d in disputed],
+        "cannot_tell": [_place(key) for key in rivals],
+        "next": advice(found, disputed, rivals),
     }
     write_json(out / "report.json", document)
     replace_text(out / "report.html", page(document, figures))
@@ -161,8 +164,12 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
 
 
 def _told(key: Key, gain: float) -> dict[str, Any]:
+    return _place(key) | {"gain": gain}
+
+
+def _place(key: Key) -> dict[str, Any]:
     name, joint, channel, inputs = key
-    return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs), "gain": gain}
+    return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs)}
 
 
 def _visited(found: Residual, dof: int) -> Float[np.ndarray, "dof node"]:

@@ -1,0 +1,73 @@
+"""A force that repeats itself in time, of any waveform."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .base import Candidate, JointEffect, Scalar, a
+
+FASTEST = 4.0
+"""Frequency [Hz] up to which is looked: a faster force moves little."""
+OVERTONES = 7
+"""Harmonics of the waveform, once its period is known: they hold 95 % of the power of a square wave."""
+COUNTS = (50, 200)
+"""Frequencies that are tried: numbers shared by recordings of many lengths, for programs are compiled for them."""
+
+
+class PeriodicForce(JointEffect):
+    """sum_h s_h sin(2 pi h f t) + c_h cos(2 pi h f t): its period is found first, then its waveform."""
+
+    name: ClassVar[str] = "periodic_force"
+    reported_as: ClassVar[str] = "unknown_function"
+    confirm: ClassVar[str] = (
+        "Log the motion at rest with the drives off: what pushes in time with the machine beside it?"
+    )
+    units: ClassVar[dict[str, str]] = {"size": "N m", "frequency": "Hz"}
+    sine: Float[Array, " harmonic"]
+    cosine: Float[Array, " harmonic"]
+    frequency: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        span = around.duration[1] - around.duration[0]
+        count = next((n for n in COUNTS if n >= FASTEST * span / 0.4), COUNTS[-1])
+        tried = [FASTEST / count * i for i in range(1, count + 1)]
+        return [_at(j, f, 1, around) for j in around.joints for f in tried if f * span >= 1.0]  # one period at least
+
+    def values(self):
+        """Root mean square of the force, and how often it comes."""
+        return {"size": jnp.sqrt(0.5 * jnp.sum(self.sine**2 + self.cosine**2) + 1e-30), "frequency": self.frequency}
+
+    def inputs_named(self):
+        return ("time",)
+
+    def signals(self, system):
+        return ("time",)
+
+    def richer(self, around):
+        if self.sine.size >= OVERTONES:
+            return []
+        return [_at(self.joint, float(self.frequency), OVERTONES, around, self)]
+
+    def waveform(self, turns: Float[Array, "*any"]) -> Float[Array, "*any"]:
+        """The force after so many periods [N m]."""
+        angle = 2 * jnp.pi * turns[..., None] * jnp.arange(1, self.sine.shape[0] + 1, dtype=turns.dtype)
+        return jnp.sin(angle) @ self.sine + jnp.cos(angle) @ self.cosine
+
+    def force(self, scene, memory):
+        return self.at(scene, self.waveform(self.frequency * scene.time))
+
+
+def _at(joint: int | None, frequency: float, count: int, around, known: PeriodicForce | None = None) -> Candidate:
+    """A waveform of `count` harmonics, beginning from one that is `known`."""
+    assert joint is not None
+    size, span = float(around.torque[joint - 1]), around.duration[1] - around.duration[0]
+    start = np.zeros((2, count))
+    if known is not None:
+        start[:, : known.sine.size] = known.sine, known.cosine
+    make = lambda w, f: PeriodicForce(*map(jnp.asarray, w), a(f), joint=joint)  # noqa: E731
+    probes = tuple(make(start + 0.05 * size * row.reshape(2, count), frequency) for row in np.eye(2 * count))
+    spread = make(np.full((2, count), 3.0 * size), 0.3 / span)
+    return Candidate(make(start, frequency), probes, spread)

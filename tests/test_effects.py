@@ -236,12 +236,12 @@ def test_slide_and_pendulum_know_their_effects():
 
 
 def test_the_vocabulary_is_covered(shared):
-    names = set(json.loads((shared / "vocabulary.json").read_text()))
-    assert names - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
-    parameters = json.loads((shared / "vocabulary.json").read_text())
+    words = json.loads((shared / "vocabulary.json").read_text())
+    assert set(words) - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
     for name, kind in catalogue.items():
-        assert kind.confirm and kind.meaning(), name
-        assert set(kind.units) == set(parameters[kind.key()]["parameters"]) or name in plant.UNNAMED, name
+        assert kind.key() in words, f"{name}: {kind.key()} is no word of vocabulary.json; name one by `reported_as`"
+        assert kind.confirm and kind.meaning(), f"{name} says no way to confirm it, or has no docstring"
+        assert set(kind.units) == set(words[kind.key()]["parameters"]) or name in plant.UNNAMED, name
 
 
 UNITS = {

@@ -139,12 +139,18 @@ def test_a_mistake_is_refused(tmp_path, suffix, content, words):
         assert word in str(refused.value)
 
 
-@pytest.mark.parametrize("suffix, module", [(".parquet", "pyarrow.parquet"), (".mat", "scipy.io")])
-def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, suffix, module):
-    monkeypatch.setitem(sys.modules, module, None)
-    (tmp_path / f"01{suffix}").write_bytes(b"any")
-    with pytest.raises(DataError, match=r"cannot be read without \w+; pip install 'nnap-em\[formats\]'"):
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "01.parquet").write_bytes(b"any")
+    with pytest.raises(DataError, match=r"cannot be read without pyarrow; pip install 'nnap-em\[formats\]'"):
         read_logs(tmp_path, RIG)
+
+
+def test_a_mat_file_needs_no_extra(tmp_path, monkeypatch):
+    """scipy comes with JAX."""
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    _mat(tmp_path / "01.mat", _log())
+    assert read_logs(tmp_path, RIG).files == ("01.mat",)
 
 
 def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):

@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from nnap_em.diagnose.keys import words
 from nnap_em.effects import catalogue
 from nnap_em.report.page import LEVEL, Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
@@ -166,6 +167,21 @@ def test_images_are_told_apart_and_others_refused():
         page({}, [("A", "", b"GIF89a")])
     with pytest.raises(ValueError, match="place"):
         page({}, [Picture("A", "", PNG, "top")])
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        (("torsional_spring", 1, None, ()), "torsional spring at joint 1"),
+        (("unknown_function", 2, None, ("theta1", "u")), "unknown function of theta1 and u at joint 2"),
+        (("sensor_delay", None, "all", ()), "sensor delay on all sensors"),
+        (("sensor_bias", None, "x", ()), "sensor bias on x"),
+    ],
+)
+def test_a_report_calls_an_effect_as_the_search_does(key, told):
+    assert words(key) == told
+    assert label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == told
+    assert label({}) == "unnamed"
 
 
 def test_numbers_as_a_reader_writes_them():

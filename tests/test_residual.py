@@ -58,6 +58,12 @@ def _found(seed, **changes):
     return whole._replace(**changes)
 
 
+def test_every_column_has_the_unit_of_its_joint():
+    """Joints count from 1, as those of a system."""
+    assert [NAMES.force_unit(1), NAMES.force_unit(2), NAMES.unit("u")] == ["N m", "N", "N m"]
+    assert [NAMES.unit(name) for name in ("theta1", "dx", "time")] == ["rad", "m/s", "s"]
+
+
 def test_holm_by_hand():
     # sorted .005 .01 .03 .04, times 4 3 2 1, then never falling: .02 .03 .06 .06
     np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02], rtol=1e-12)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import AbstractEffect, catalogue, fields, flat
-from ..effects.function import UnknownFunction
+from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from .hypothesis import blocks
@@ -58,38 +58,6 @@ def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> Abstract
     return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(effect)], effect, new)
 
 
-class Curve(NamedTuple):
-    """A learned function along one signal, its mean taken away."""
-
-    signal: str
-    signal_unit: str
-    joint: int
-    """Where it acts, counted from 1."""
-    unit: str
-    """Of the force."""
-    turns: bool
-    """True where the signal is an angle that goes round."""
-    x: Float[np.ndarray, " node"]
-    mean: Float[np.ndarray, " node"]
-    std: Float[np.ndarray, " node"]
-
-
-def curve(
-    effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: AbstractSystem, nodes: int = 121
-) -> Curve | None:
-    """The learned function of one signal, its parameters of covariance `cov`; None for any other effect."""
-    if not isinstance(effect, UnknownFunction) or len(effect.axes) != 1 or effect.joint is None:
-        return None
-    (axis,) = effect.axes
-    x = np.linspace(float(axis.low), float(axis.high), nodes)
-    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
-    basis = basis - basis.mean(axis=0)
-    std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
-    units = axis.unit(system), system.force_unit(effect.joint)
-    mean = basis @ np.asarray(effect.weights)
-    return Curve(" + ".join(axis.names), units[0], effect.joint, units[1], axis.turns, x, mean, std)
-
-
 def shape(found: Curve) -> str:
     """A learned function in words: a period, a bump, or a slope."""
     x, y, name, across = found.x, found.mean, found.signal, found.signal_unit
@@ -134,13 +102,13 @@ def findings(closed: Closed) -> list[Finding]:
     for effect, found, numbers, law in entries:
         if law is not None:
             continue  # told with the law that it completes
-        drawn = curve(effect, numbers, model.system)
+        drawn = effect.curve(numbers, model.system)
         parameters = estimates(effect, numbers, model.system)
         numbers_told = ", ".join(
             f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
         )
         sentence = ": ".join(filter(None, (words(key_of(effect)), shape(drawn) if drawn else numbers_told)))
-        rest = next((curve(e, c, model.system) for e, _, c, of in entries if of is effect), None)
+        rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
         if rest is not None:
             left = f"{np.ptp(rest.mean):.2g} {rest.unit}"
             sentence += f"; the law is not quite of this form, what is left has {left}"

@@ -20,7 +20,8 @@ def words(key: Key) -> str:
     text = name.replace("_", " ")
     if inputs:
         text += f" of {' and '.join(inputs)}"
-    return text + (f" at joint {joint}" if joint else "") + (f" on {channel}" if channel else "")
+    on = "all sensors" if channel == "all" else channel
+    return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
 
 
 def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:

@@ -55,14 +55,14 @@ class Names(NamedTuple):
         if name == "time":
             return "s"
         if name in self.inputs:
-            return self.force_unit(self.joints[self.inputs.index(name)] - 1)
+            return self.force_unit(self.joints[self.inputs.index(name)])
         place = (self.coordinates + self.rates).index(name)
         dof = len(self.coordinates)
         return state_unit(self.rotary[place % dof], rate=place >= dof)
 
     def force_unit(self, joint: int) -> str:
-        """Unit of the generalised force at a joint, counted from 0."""
-        return force_unit(self.rotary[joint])
+        """Unit of the generalised force at a joint, counted from 1."""
+        return force_unit(self.rotary[joint - 1])
 
 
 class Residual(NamedTuple):

@@ -94,6 +94,22 @@ class Candidate(NamedTuple):
     """Prior standard deviation of every parameter."""
 
 
+class Curve(NamedTuple):
+    """A learned function along one signal, its mean taken away."""
+
+    signal: str
+    signal_unit: str
+    joint: int
+    """Where it acts, counted from 1."""
+    unit: str
+    """Of the force."""
+    turns: bool
+    """True where the signal is an angle that goes round."""
+    x: Float[np.ndarray, " node"]
+    mean: Float[np.ndarray, " node"]
+    std: Float[np.ndarray, " node"]
+
+
 class AbstractEffect(eqx.Module):
     """A law that the declared physics may lack.  The hooks say what it changes.
 
@@ -174,6 +190,10 @@ class AbstractEffect(eqx.Module):
     def signals(self, around: Around) -> tuple[str, ...]:
         """Of what its force at its joint is a function, where its free form is to be tried."""
         return ()
+
+    def curve(self, cov: Float[np.ndarray, "param param"], system: AbstractSystem) -> Curve | None:
+        """A learned function of one signal, its parameters of covariance `cov`; None for what numbers tell."""
+        return None
 
     def memory_scale(self) -> Float[Array, " memory"]:
         """Typical size of its own states."""

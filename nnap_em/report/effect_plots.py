@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from ..diagnose.findings import Curve
+from ..effects.base import Curve
 from .style import AFTER, READING, ZERO, band, head, styled, symbol
 
 

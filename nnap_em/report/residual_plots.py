@@ -141,7 +141,7 @@ def residual_figure(
                 ax.tick_params(labelleft=False)
             else:
                 where = f"joint {j + 1}\n" if dof > 1 else ""
-                ax.set_ylabel(f"{where}missing force [{names.force_unit(j)}]", fontsize=8.5)
+                ax.set_ylabel(f"{where}missing force [{names.force_unit(j + 1)}]", fontsize=8.5)
         for ax in grid[j, len(row) :]:
             ax.set_axis_off()
     head(figure, title, list(grid.ravel()), f"{note}\nPercentage: share of the force's variation that goes with it.")

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..diagnose.keys import words
+
 
 def finite(value: Any) -> bool:
     """Whether it is a number."""
@@ -80,14 +82,8 @@ def parts(entry: Any) -> tuple[Any, Any, Any]:
 
 def label(effect: Mapping[str, Any]) -> str:
     """An effect, or what else has a name, a joint, a channel and inputs, as a reader would call it."""
-    text = str(effect.get("name") or "unnamed").replace("_", " ")
-    if effect.get("inputs"):
-        text += f" of {' and '.join(map(str, effect['inputs']))}"
-    if effect.get("joint"):
-        text += f" at joint {effect['joint']}"
-    if effect.get("channel"):
-        text += " on all sensors" if effect["channel"] == "all" else f" on {effect['channel']}"
-    return text
+    name, joint, channel, inputs = (effect.get(part) for part in ("name", "joint", "channel", "inputs"))
+    return words((str(name or "unnamed"), joint, channel, tuple(inputs or ())))
 
 
 def sentence(text: Any) -> str:

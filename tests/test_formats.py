@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.commands.common import write_states
-from nnap_em.data.dataset import read_logs
-from nnap_em.data.formats import DataError, read_table, write_csv
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig
 from nnap_em.em.identify import Identified
 

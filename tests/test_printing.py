@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.em.identify import begin

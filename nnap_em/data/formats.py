@@ -7,24 +7,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax
 import numpy as np
 import scipy.io
 from jaxtyping import Float, Real
 
 from ..storage.files import replace_text
+from .dataset import Array, DataError
 from .rig import nearest
 
-Array = jax.Array | np.ndarray  # host or device
 LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
-
-
-class DataError(ValueError):
-    """A mistake in a log: the message names the file, the place, what was found and the mend."""
-
-
-class DataWarning(UserWarning):
-    """Something in a log that is possible but seldom meant."""
 
 
 def has_logs(folder: Path) -> bool:

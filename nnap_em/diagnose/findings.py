@@ -15,7 +15,7 @@ from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from .hypothesis import blocks
-from .keys import Key, key_of, rest_of, words
+from .keys import Key, key_of, listed, rest_of, words
 from .loop import Closed
 
 
@@ -153,11 +153,6 @@ def verdict(found: Sequence[Finding], error: Mapping[str, Any] | None, failed: i
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names as a sentence lists them."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:

@@ -16,6 +16,7 @@ import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
+from ..data.units import force_unit, state_unit
 from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import smooth
@@ -24,7 +25,6 @@ from ..model.base import prepare
 from ..model.state_space import with_effects
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, relinearised
-from ..systems.base import force_unit, state_unit
 
 LAGS = 20
 """Samples over which innovations are tested for whiteness."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from ..data.dataset import Dataset, Logs, horizon
-from ..data.formats import Array
+from ..data.dataset import Array, Dataset, horizon
+from ..data.logs import Logs
 from ..data.rig import Rig, RigError
 from ..model.base import prepare
 from ..model.friction import NoFriction

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..data.rig import Declared, Rig, quantities
+from ..data.rig import Declared, Rig
+from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..model.state_space import StateSpaceModel, with_effects
 from ..smoother.gaussian import CubatureSmoother

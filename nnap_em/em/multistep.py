@@ -18,10 +18,10 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, kalman_filter
-from .local import Local, locals_along
+from .local import locals_along
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
-from .quadratic import friction_columns
+from .quadratic import Local, friction_columns
 from .weights import Weights
 
 HORIZONS = (0.25, 0.5)

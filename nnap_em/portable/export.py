@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import __version__
-from ..data.rig import parameter_unit
+from ..data.units import parameter_unit
 from ..effects import AbstractEffect
 from ..em.identify import Identified, friction_table, parameter_table
 from ..em.weights import Weights

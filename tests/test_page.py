@@ -46,14 +46,17 @@ WHOLE = {
         "before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}],
         "after": [TEST | {"p_value": LEVEL}],
     },
-    "parameters": {"before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}}, "after": {"m1": [1.1, 0.1]}},
+    "parameters": {
+        "before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
+        "after": {"m1": {"value": 1.1, "std": 0.1}},
+    },
     "noise": {"before": {"theta1": {"value": 0.005, "unit": "rad"}}, "after": {"theta1": 0.005}},
     "looks": [
         {
             "horizon_s": 1.0,
             "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}],
             "refitted": [],
-            "accepted": {"name": "torsional_spring", "joint": 2},
+            "accepted": "torsional spring at joint 2",
         },
         {"horizon_s": 5.0, "screened": None, "refitted": None, "accepted": None},
     ],
@@ -93,7 +96,11 @@ def _parsed(html):
     return parser
 
 
-FIGURES = (("Errors", "A caption.", PNG), Picture("Learned", "", SVG, "found"), Picture("More", "", PNG, "details"))
+FIGURES = (
+    Picture("Errors", "A caption.", PNG),
+    Picture("Learned", "", SVG, "found"),
+    Picture("More", "", PNG, "details"),
+)
 
 
 @pytest.mark.parametrize("missing", [None, *WHOLE])
@@ -164,7 +171,7 @@ def test_images_are_told_apart_and_others_refused():
     html = page({}, FIGURES)
     assert html.count("data:image/png;base64,") == 2 and html.count("data:image/svg+xml;base64,") == 1
     with pytest.raises(ValueError, match="PNG nor SVG"):
-        page({}, [("A", "", b"GIF89a")])
+        page({}, [Picture("A", "", b"GIF89a")])
     with pytest.raises(ValueError, match="place"):
         page({}, [Picture("A", "", PNG, "top")])
 

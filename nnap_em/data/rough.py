@@ -328,7 +328,9 @@ def _travel(name: str, readings: Columns, run: _Run, dt: float) -> Float[np.ndar
         return None
     y, z = readings[name], readings[other]
     part = z[run.first : run.end]
-    if np.isfinite(part).mean() < 0.5 or np.max(_same(part)) >= max(STILL, 0.5 * run.length):
+    if np.isfinite(part).mean() < 0.5 or max((same.length for same in _runs(part)), default=0) >= max(
+        STILL, 0.5 * run.length
+    ):
         return None
     part = bridge(part)
     since = dt * np.arange(run.length)
@@ -339,10 +341,6 @@ def _travel(name: str, readings: Columns, run: _Run, dt: float) -> Float[np.ndar
     away = part - np.median(part[:3]) - still * since
     doubt = 9 * noise(z) + 3 * _quantum(z) + (_quantum(y) + 0.3 * abs(still)) * since[-1]
     return away / (doubt + 1e-300)
-
-
-def _same(y: Float[np.ndarray, " time"]) -> list[int]:
-    return [run.length for run in _runs(y)] or [0]
 
 
 def _quantum(y: Float[np.ndarray, " time"]) -> float:

@@ -86,6 +86,10 @@ class Residual(NamedTuple):
     used: Bool[np.ndarray, " seq"]
     """False where the track was lost; such a sequence takes part in no test and no figure."""
 
+    def followed(self) -> "Residual":
+        """Of the sequences that were."""
+        return Residual(*(part[self.used] for part in self))
+
 
 class Test(NamedTuple):
     """One test of the innovations of one channel."""
@@ -294,7 +298,7 @@ def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarra
 
 def tests(found: Residual, names: Names) -> list[Test]:
     """All tests of the innovations of every measured channel, over the sequences that were followed."""
-    found = found._replace(**{f: getattr(found, f)[found.used] for f in found._fields if f != "used"})
+    found = found.followed()
     rows: list[tuple[str, str, tuple[float, float, float]]] = []
     for i, channel in enumerate(names.measured):
         e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))

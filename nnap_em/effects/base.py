@@ -70,6 +70,11 @@ class Around(NamedTuple):
         return range(1, len(self.system.coordinates) + 1)
 
     @property
+    def turning(self) -> list[int]:
+        """Those whose coordinate is an angle."""
+        return [j for j in self.joints if self.system.angles[j - 1]]
+
+    @property
     def driven(self) -> list[tuple[int, float]]:
         """Joints whose input ever moves, with its largest value [N m]."""
         return [(j, float(size)) for j, size in zip(self.system.joints, self.drive, strict=True) if size > 0]

@@ -23,7 +23,7 @@ class PositionDependentFriction(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        turning = [j for j in around.joints if around.system.angles[j - 1] and around.learned]
+        turning = around.turning if around.learned else []
         return [pair(partial(cls.of, joint=j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
 
     def values(self):

@@ -245,15 +245,13 @@ def finish(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
-    *,
-    steps: int = STEPS,
 ) -> StateSpaceModel:
     """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until they fall.
 
     Friction, parameters and effects move; noise and start stay.  [Bohlin 2006, "Practical Grey-box Process
     Identification", for prediction-error fits over several horizons]
     """
-    for _ in range(steps):
+    for _ in range(STEPS):
         weights = m_step.weights(model)
         now = forks(model, weights, path, data)
         weight = weighed(now, used)

@@ -62,12 +62,8 @@ def picture(place: str, title: str, caption: str, figure: Figure) -> Picture:
     return Picture(title, caption, image.getvalue(), place)
 
 
-Figures = Sequence[Picture | tuple[str, str, bytes]]
-
-
-def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
+def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     """The whole page; raises ValueError where an image is neither PNG nor SVG."""
-    pictures = [figure if isinstance(figure, Picture) else Picture(*figure) for figure in figures]
     for picture in pictures:
         if picture.place not in PLACES:
             raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")

@@ -67,17 +67,10 @@ def ratio(before: Any, after: Any) -> str:
     return f"{number(times, 2)} ×" if times > 1 else f"{number(1 / times, 2)} × larger"
 
 
-def quantity(entry: Any) -> str:
-    """A parameter with its standard deviation and unit, however it is written."""
-    value, std, unit = parts(entry)
-    return with_std(value, std) + ("" if unit in (None, "", "-") else f" {unit}")
-
-
-def parts(entry: Any) -> tuple[Any, Any, Any]:
-    """Value, standard deviation and unit of a parameter, however it is written."""
-    if isinstance(entry, Mapping):
-        return entry.get("value"), entry.get("std"), entry.get("unit")
-    return tuple([*entry, None, None, None][:3]) if isinstance(entry, list | tuple) else (entry, None, None)  # type: ignore[return-value]
+def quantity(entry: Mapping[str, Any]) -> str:
+    """A parameter with its standard deviation and unit."""
+    unit = entry.get("unit")
+    return with_std(entry.get("value"), entry.get("std")) + ("" if unit in (None, "", "-") else f" {unit}")
 
 
 def label(effect: Mapping[str, Any]) -> str:

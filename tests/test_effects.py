@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,6 +205,14 @@ def test_brakes_never_add_energy(name):
     assert effect.possible()
     assert np.all(alone <= 0) and np.all(whole < 0)
     assert np.all(alone < 0) or np.all(alone == 0)  # a force, or a change of the friction
+
+
+@pytest.mark.parametrize("name", [name for name in MAKE if catalogue[name].above_zero])
+def test_what_must_be_above_zero_is_refused_below(name):
+    effect = MAKE[name]({**plant.STRONG, **plant.UNNAMED}[name][0])
+    number = lambda e: getattr(e, e.above_zero)  # noqa: E731
+    below, none = (eqx.tree_at(number, effect, share * number(effect)) for share in (-1.0, 0.0))
+    assert effect.possible() and not below.possible() and not none.possible()
 
 
 def test_a_bristle_gives_back_less_than_it_was_given():

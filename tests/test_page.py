@@ -7,8 +7,9 @@ from html.parser import HTMLParser
 import pytest
 
 from nnap_em.diagnose.keys import words
+from nnap_em.diagnose.statistics import LEVEL
 from nnap_em.effects import catalogue
-from nnap_em.report.page import LEVEL, Picture, page
+from nnap_em.report.page import Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, number, with_std
 

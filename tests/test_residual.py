@@ -12,20 +12,9 @@ from statsmodels.stats.stattools import jarque_bera
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.residual import (
-    LEVEL,
-    Names,
-    Residual,
-    bias,
-    dependence,
-    holm,
-    names_of,
-    normality,
-    residual,
-    spread,
-    whiteness,
-)
+from nnap_em.diagnose.residual import Names, Residual, names_of, residual
 from nnap_em.diagnose.residual import tests as run_tests
+from nnap_em.diagnose.statistics import LEVEL, bias, dependence, holm, normality, spread, whiteness
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.identify import begin
 from nnap_em.model.state_space import with_effects

@@ -12,9 +12,11 @@ from jaxtyping import Float, Int
 
 from .dataset import DataError, Dataset, pad
 from .formats import log_files, place, read_table, refuse
+from .frozen import FULL
+from .lost import retell
 from .plausible import Columns, doubts, repeats
 from .rig import Rig
-from .rough import FULL, Rough, retell, rough
+from .rough import Rough, rough
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps

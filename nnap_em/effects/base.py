@@ -133,6 +133,8 @@ class AbstractEffect(eqx.Module):
     """Reported parameters and their units on a rotary joint."""
     units_free: ClassVar[dict[str, str]] = {}
     """Those that are others where it acts on no single joint."""
+    above_zero: ClassVar[str] = ""
+    """The parameter that makes no physical sense at zero or below."""
     memory: ClassVar[int] = 0
     """States of its own."""
     substeps: ClassVar[int] = 1
@@ -186,7 +188,7 @@ class AbstractEffect(eqx.Module):
 
     def possible(self) -> bool:
         """Whether a fitted value makes physical sense."""
-        return True
+        return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
     def inputs_named(self) -> tuple[str, ...]:
         """Of what it is a function, for laws that the vocabulary has no name for."""

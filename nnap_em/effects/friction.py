@@ -79,6 +79,7 @@ class LoadFriction(JointEffect):
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Lift and lower a weight slowly: the torques differ by twice the friction, at each weight."
     units: ClassVar[dict[str, str]] = {"mu": "-"}
+    above_zero: ClassVar[str] = "mu"
     mu: Scalar
     knee: Scalar = known()
     """Rate over which the sign is smoothed [rad/s]."""
@@ -98,9 +99,6 @@ class LoadFriction(JointEffect):
 
     def signals(self, around):
         return self.names
-
-    def possible(self):
-        return float(self.mu) > 0
 
     def force(self, scene, memory):
         return self.at(scene, -self.mu * jnp.abs(self.own(scene.drive)) * jnp.tanh(self.own(scene.v) / self.knee))

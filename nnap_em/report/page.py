@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
+from ..diagnose.statistics import LEVEL
 from . import wording
 from .vocabulary import MEANINGS, WORDS
 from .wording import finite, number, ratio
 
-LEVEL = 0.05
-"""Corrected p-value below which a test counts as failed."""
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))

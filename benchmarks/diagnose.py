@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
 from nnap_em.commands.common import set_up
-from nnap_em.data.dataset import read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnose.findings import entry, findings
 from nnap_em.diagnose.loop import close_the_loop

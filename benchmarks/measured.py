@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from nnap_em.data.dataset import read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import predict, smooth

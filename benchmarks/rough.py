@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
 from nnap_em.commands.common import set_up
-from nnap_em.data.dataset import Logs, read_logs
 from nnap_em.data.formats import write_csv
+from nnap_em.data.logs import Logs, read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.em.identify import friction_table, identify
 from nnap_em.em.predict import HORIZONS, horizon_errors, predict

@@ -30,7 +30,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout, sysid
 
-from nnap_em.data.dataset import Dataset, read_logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.em.identify import Identified, identify
 from nnap_em.em.predict import predict

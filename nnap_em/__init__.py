@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .data.dataset import Dataset, Logs, pad, read_logs
-    from .data.formats import DataError, DataWarning
+    from .data.dataset import DataError, Dataset, pad
+    from .data.logs import DataWarning, Logs, read_logs
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .diagnose.findings import findings
     from .diagnose.loop import Closed, close_the_loop
@@ -82,12 +82,12 @@ __all__ = [
 ]
 _homes = {
     "em.check": ("Finding", "check"),
-    "data.dataset": ("Dataset", "Logs", "pad", "read_logs"),
+    "data.dataset": ("DataError", "Dataset", "pad"),
+    "data.logs": ("DataWarning", "Logs", "read_logs"),
     "diagnose.findings": ("findings",),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),
     "storage.files": ("StoreError",),
-    "data.formats": ("DataError", "DataWarning"),
     "model.friction": ("FrictionNetwork",),
     "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "diagnose.loop": ("Closed", "close_the_loop"),

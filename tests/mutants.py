@@ -703,7 +703,7 @@ MUTANTS = (
     ),
     Mutant(
         "Bonferroni for Holm",
-        "diagnose/residual.py",
+        "diagnose/statistics.py",
         "(values.size - np.arange(values.size)) * values[order]",
         "values.size * values[order]",
         "test_residual.py::test_holm_by_hand",
@@ -711,13 +711,13 @@ MUTANTS = (
     Mutant(
         "lost sequences take part in the tests",
         "diagnose/residual.py",
-        "getattr(found, f)[found.used]",
-        "getattr(found, f)",
+        "part[self.used] for part in self",
+        "part for part in self",
         "test_residual.py::test_lost_sequences_take_no_part",
     ),
     Mutant(
         "autocovariance not over that of lag 0",
-        "diagnose/residual.py",
+        "diagnose/statistics.py",
         "np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs",
         "np.maximum(pairs, 1.0), pairs",
         "test_residual.py::test_autoregression_fails_and_its_coefficient_is_the_size",

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
-from nnap_em.data.formats import LARGEST, DataError, read_csv
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import LARGEST, read_csv
 from nnap_em.em.loop import FitError
 
 RIG = """\

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from nnap_em.commands import cli
-from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError
 from nnap_em.em.build import build_system
 from nnap_em.em.check import check, gramian

@@ -20,7 +20,7 @@ import nnap_em
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands import smooth as smooth_command
-from nnap_em.data.dataset import read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.em.store import load, read
 from nnap_em.model.simulate import examples

@@ -10,8 +10,9 @@ from helpers import csv_text, swing, swing_rig, with_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.data.dataset import Dataset, check_split, fill_missing, horizon, pad, read_logs
-from nnap_em.data.formats import DataError, DataWarning, read_csv, write_csv
+from nnap_em.data.dataset import DataError, Dataset, fill_missing, horizon, pad
+from nnap_em.data.formats import read_csv, write_csv
+from nnap_em.data.logs import DataWarning, check_split, read_logs
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.systems import specs
 

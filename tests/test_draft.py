@@ -7,7 +7,8 @@ import pytest
 
 from nnap_em.commands import cli
 from nnap_em.commands.draft import draft
-from nnap_em.data.formats import DataError, write_csv
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import RigError, SystemSpec, read_rig
 from nnap_em.systems import specs
 

@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -213,6 +214,14 @@ def test_brakes_never_add_energy(name):
     assert np.all(alone < 0) or np.all(alone == 0)  # a force, or a change of the friction
 
 
+@pytest.mark.parametrize("name", [name for name in MAKE if catalogue[name].above_zero])
+def test_what_must_be_above_zero_is_refused_below(name):
+    effect = MAKE[name]({**plant.STRONG, **plant.UNNAMED}[name][0])
+    number = lambda e: getattr(e, e.above_zero)  # noqa: E731
+    below, none = (eqx.tree_at(number, effect, share * number(effect)) for share in (-1.0, 0.0))
+    assert effect.possible() and not below.possible() and not none.possible()
+
+
 def test_a_bristle_gives_back_less_than_it_was_given():
     """Work of presliding friction over any path from a slack bristle on: none of it comes from nowhere."""
     case = plant.Case(effects=plant.STRONG["presliding_friction"], steps=STEPS, hidden=False, seed=3)
@@ -243,12 +252,12 @@ def test_slide_and_pendulum_know_their_effects():
 
 
 def test_the_vocabulary_is_covered(shared):
-    names = set(json.loads((shared / "vocabulary.json").read_text()))
-    assert names - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
-    parameters = json.loads((shared / "vocabulary.json").read_text())
+    words = json.loads((shared / "vocabulary.json").read_text())
+    assert set(words) - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
     for name, kind in catalogue.items():
-        assert kind.confirm and kind.meaning(), name
-        assert set(kind.units) == set(parameters[kind.key()]["parameters"]) or name in plant.UNNAMED, name
+        assert kind.key() in words, f"{name}: {kind.key()} is no word of vocabulary.json; name one by `reported_as`"
+        assert kind.confirm and kind.meaning(), f"{name} says no way to confirm it, or has no docstring"
+        assert set(kind.units) == set(words[kind.key()]["parameters"]) or name in plant.UNNAMED, name
 
 
 UNITS = {

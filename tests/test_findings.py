@@ -6,7 +6,8 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnose.findings import findings
 from nnap_em.diagnose.hypothesis import Found, Hypothesis

@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.commands.common import write_states
-from nnap_em.data.dataset import read_logs
-from nnap_em.data.formats import DataError, read_table, write_csv
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig
 from nnap_em.em.identify import Identified
 
@@ -139,12 +140,18 @@ def test_a_mistake_is_refused(tmp_path, suffix, content, words):
         assert word in str(refused.value)
 
 
-@pytest.mark.parametrize("suffix, module", [(".parquet", "pyarrow.parquet"), (".mat", "scipy.io")])
-def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, suffix, module):
-    monkeypatch.setitem(sys.modules, module, None)
-    (tmp_path / f"01{suffix}").write_bytes(b"any")
-    with pytest.raises(DataError, match=r"cannot be read without \w+; pip install 'nnap-em\[formats\]'"):
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "01.parquet").write_bytes(b"any")
+    with pytest.raises(DataError, match=r"cannot be read without pyarrow; pip install 'nnap-em\[formats\]'"):
         read_logs(tmp_path, RIG)
+
+
+def test_a_mat_file_needs_no_extra(tmp_path, monkeypatch):
+    """scipy comes with JAX."""
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    _mat(tmp_path / "01.mat", _log())
+    assert read_logs(tmp_path, RIG).files == ("01.mat",)
 
 
 def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset, read_logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.em.build import build
 from nnap_em.em.identify import identify

@@ -6,8 +6,10 @@ from html.parser import HTMLParser
 
 import pytest
 
+from nnap_em.diagnose.keys import words
+from nnap_em.diagnose.statistics import LEVEL
 from nnap_em.effects import catalogue
-from nnap_em.report.page import LEVEL, Picture, page
+from nnap_em.report.page import Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, number, with_std
 
@@ -45,14 +47,17 @@ WHOLE = {
         "before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}],
         "after": [TEST | {"p_value": LEVEL}],
     },
-    "parameters": {"before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}}, "after": {"m1": [1.1, 0.1]}},
+    "parameters": {
+        "before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
+        "after": {"m1": {"value": 1.1, "std": 0.1}},
+    },
     "noise": {"before": {"theta1": {"value": 0.005, "unit": "rad"}}, "after": {"theta1": 0.005}},
     "looks": [
         {
             "horizon_s": 1.0,
             "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}],
             "refitted": [],
-            "accepted": {"name": "torsional_spring", "joint": 2},
+            "accepted": "torsional spring at joint 2",
         },
         {"horizon_s": 5.0, "screened": None, "refitted": None, "accepted": None},
     ],
@@ -92,7 +97,11 @@ def _parsed(html):
     return parser
 
 
-FIGURES = (("Errors", "A caption.", PNG), Picture("Learned", "", SVG, "found"), Picture("More", "", PNG, "details"))
+FIGURES = (
+    Picture("Errors", "A caption.", PNG),
+    Picture("Learned", "", SVG, "found"),
+    Picture("More", "", PNG, "details"),
+)
 
 
 @pytest.mark.parametrize("missing", [None, *WHOLE])
@@ -163,9 +172,24 @@ def test_images_are_told_apart_and_others_refused():
     html = page({}, FIGURES)
     assert html.count("data:image/png;base64,") == 2 and html.count("data:image/svg+xml;base64,") == 1
     with pytest.raises(ValueError, match="PNG nor SVG"):
-        page({}, [("A", "", b"GIF89a")])
+        page({}, [Picture("A", "", b"GIF89a")])
     with pytest.raises(ValueError, match="place"):
         page({}, [Picture("A", "", PNG, "top")])
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        (("torsional_spring", 1, None, ()), "torsional spring at joint 1"),
+        (("unknown_function", 2, None, ("theta1", "u")), "unknown function of theta1 and u at joint 2"),
+        (("sensor_delay", None, "all", ()), "sensor delay on all sensors"),
+        (("sensor_bias", None, "x", ()), "sensor bias on x"),
+    ],
+)
+def test_a_report_calls_an_effect_as_the_search_does(key, told):
+    assert words(key) == told
+    assert label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == told
+    assert label({}) == "unnamed"
 
 
 def test_numbers_as_a_reader_writes_them():

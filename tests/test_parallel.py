@@ -78,7 +78,7 @@ import numpy as np
 from nnap_em.em.loop import fit
 from nnap_em.em.identify import begin
 from nnap_em.numerics.parallel import AXIS, over
-from nnap_em.data.dataset import read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.smoother.gaussian import CubatureSmoother, GaussianSmoother
 from nnap_em.systems import specs

@@ -12,7 +12,8 @@ import pytest
 from planted_cases import CASES, CONTROLS, LAWS, PLANTED, REST, Plant, case_of, split
 from planted_table import score, table
 
-from nnap_em.data.dataset import Dataset, check_split, read_logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.effects import AbstractEffect
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss

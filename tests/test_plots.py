@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.diagnose.findings import Curve
 from nnap_em.diagnose.residual import Names, Residual
+from nnap_em.effects.base import Curve
 from nnap_em.em.identify import FrictionTable
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure
@@ -47,7 +47,7 @@ def _found(dof: int, seed: int = 0, **changes) -> Residual:
 
 def _table(dof: int) -> FrictionTable:
     v = jnp.tile(jnp.linspace(-3, 3, 51)[None], (dof, 1))
-    return FrictionTable(v, -v, jnp.tile(1e-4 * jnp.eye(51)[None], (dof, 1, 1)))
+    return FrictionTable(v, -v, jnp.tile(1e-4 * jnp.eye(51)[None], (dof, 1, 1)), dof * (("rad/s", "N m"),))
 
 
 @pytest.fixture(scope="module", params=(1, 2, 7))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import nnap_em
-from nnap_em.data.dataset import Dataset, Logs
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.em.identify import begin
@@ -25,7 +26,7 @@ FITTED = begin(RIG, DATA, key=jax.random.key(0), effects=(catalogue["torque_offs
 SLIDE = Rig("bed", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.02, "sequence", ("x",), {"x": 1e-3}, {})
 SPRING = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
 SLID = begin(SLIDE, DATA._replace(y=Y[..., :1]), key=jax.random.key(0), effects=(SPRING,))
-TABLE = nnap_em.friction_table(FITTED._replace(state=FITTED.state._replace(best=FITTED.state.model)), jnp.ones((1, 3)))
+TABLE, BED_TABLE = (nnap_em.friction_table(fitted, jnp.ones((1, 3))) for fitted in (FITTED, SLID))
 SYSTEM = "Pendulum: m = 0.5 kg, lc = 0.2 m, I = 0.002 kg m^2, g = 9.81 m/s^2; driven joints: 1"
 SAID = {
     "rig": (RIG, "Rig 'bench': pendulum, a row every 0.02 s", "m = 0.5 +- 0.05 kg, lc = 0.2 m", "u on joint 1"),
@@ -46,6 +47,7 @@ SAID = {
     "fitted": (FITTED, "Identified 'bench' after 0 epochs", "estimated: m = 0.5 +- ", " kg", SYSTEM),
     "friction": (FITTED.model.unknown, "FrictionNetwork of 1 joints, up to ", " rad/s"),
     "table": (TABLE, "joint 1: ", " N m over 1 to 1 rad/s, std up to "),
+    "table of a slide": (BED_TABLE, "joint 1: ", " N over 1 to 1 m/s, std up to "),
     "prediction": (
         Prediction(jnp.zeros((2, 9, 2)), jnp.full((2, 9, 2), 0.5), jnp.arange(18).reshape(2, 9) > 13),
         "2 sequences, 4 rows ahead",
@@ -53,6 +55,10 @@ SAID = {
     ),
     "experiment": (nnap_em.Experiment(DATA, jnp.zeros((3, ROWS, 2))), "all 2 states known; Dataset: 3 sequences"),
 }
+
+
+def test_a_slide_has_no_torque():
+    assert "N m" not in str(BED_TABLE) and "rad" not in str(BED_TABLE)
 
 
 @pytest.mark.parametrize("thing, words", [(thing, words) for thing, *words in SAID.values()], ids=SAID)

@@ -12,20 +12,9 @@ from statsmodels.stats.stattools import jarque_bera
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.residual import (
-    LEVEL,
-    Names,
-    Residual,
-    bias,
-    dependence,
-    holm,
-    names_of,
-    normality,
-    residual,
-    spread,
-    whiteness,
-)
+from nnap_em.diagnose.residual import Names, Residual, names_of, residual
 from nnap_em.diagnose.residual import tests as run_tests
+from nnap_em.diagnose.statistics import LEVEL, bias, dependence, holm, normality, spread, whiteness
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.identify import begin
 from nnap_em.model.state_space import with_effects
@@ -56,6 +45,12 @@ def _found(seed, **changes):
         used=np.ones(10, bool),
     )
     return whole._replace(**changes)
+
+
+def test_every_column_has_the_unit_of_its_joint():
+    """Joints count from 1, as those of a system."""
+    assert [NAMES.force_unit(1), NAMES.force_unit(2), NAMES.unit("u")] == ["N m", "N", "N m"]
+    assert [NAMES.unit(name) for name in ("theta1", "dx", "time")] == ["rad", "m/s", "s"]
 
 
 def test_holm_by_hand():

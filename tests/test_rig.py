@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, nearest, parameter_unit, read_rig, write_rig
+from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, write_rig
+from nnap_em.data.units import parameter_unit
 from nnap_em.storage.files import replace_text
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")

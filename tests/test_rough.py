@@ -11,10 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, specs
-from nnap_em.data.dataset import Logs
-from nnap_em.data.formats import DataError, DataWarning, write_csv
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import write_csv
+from nnap_em.data.logs import DataWarning, Logs
+from nnap_em.data.lost import retell
 from nnap_em.data.plausible import Columns
-from nnap_em.data.rough import retell, rough, spikes
+from nnap_em.data.rough import rough
+from nnap_em.data.spikes import spikes
 from nnap_em.em.check import check
 
 DT, ROWS = 0.01, 501

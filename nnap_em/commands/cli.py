@@ -136,24 +136,19 @@ def parser() -> argparse.ArgumentParser:
     )
 
     check = command("check", "say whether the logs can identify what is asked", _CHECK)
-    check.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
-
     identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
-    identify.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
-    identify.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
+    for bench in (check, identify, diagnose):
+        bench.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+    for fits in (identify, diagnose):
+        fits.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
-    identify.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-    identify.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
-    identify.add_argument("--quiet", action="store_true", help="no lines of progress")
-
-    diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
-    diagnose.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
-    diagnose.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
-    diagnose.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-    diagnose.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
-    diagnose.add_argument("--quiet", action="store_true", help="no lines of progress")
+    for fits in (identify, diagnose):
+        fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
+        fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
+        fits.add_argument("--quiet", action="store_true", help="no lines of progress")
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)

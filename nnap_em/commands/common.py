@@ -14,8 +14,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ..data.dataset import Logs, check_split, read_logs
-from ..data.formats import DataError, DataWarning, has_logs, write_csv
+from ..data.dataset import DataError
+from ..data.formats import has_logs, write_csv
+from ..data.logs import DataWarning, Logs, check_split, read_logs
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..em.build import build_system, measure_scales
 from ..em.check import BAD, torques

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..data.formats import DataError, csv_fields
-from ..data.rig import SystemSpec, parameter_unit, toml_text
+from ..data.dataset import DataError
+from ..data.formats import csv_fields
+from ..data.rig import SystemSpec, toml_text
+from ..data.units import parameter_unit
 from ..em.build import reading_noise
 
 _NAMES = {  # what people call a column, its number apart

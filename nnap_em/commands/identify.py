@@ -5,7 +5,7 @@ import functools
 import importlib
 import math
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -47,17 +47,6 @@ def smoother(args: argparse.Namespace) -> MakeSmoother:
     return functools.partial(getattr(importlib.import_module(f"nnap_em.smoother.{home}"), name), **options)
 
 
-class Epoch(NamedTuple):
-    """One line of progress."""
-
-    epoch: int
-    horizon_s: float
-    log_likelihood: float
-    left_out: list[int]
-    """Sequences that took no part."""
-    seconds: float
-
-
 def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch:
     """After every epoch: an entry in `epochs`, and a line."""
     last = time.perf_counter()
@@ -65,15 +54,17 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
         nonlocal last
         now, out = time.perf_counter(), np.flatnonzero(~np.asarray(used)).tolist()
-        epoch = Epoch(state.epoch, seen * rig.dt, float(state.loglik[-1]), out, now - last)
-        epochs.append(epoch._asdict())
+        horizon, loglik, seconds = seen * rig.dt, float(state.loglik[-1]), now - last
+        epochs.append(
+            {"epoch": state.epoch, "horizon_s": horizon, "log_likelihood": loglik, "left_out": out, "seconds": seconds}
+        )
         last = now
         noise = _noise(rig, np.asarray(state.best.log_r))
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
         say(
-            f"epoch {state.epoch:3d} of {most}  horizon {epoch.horizon_s:.2f} s"
-            f"  log-likelihood {epoch.log_likelihood:.2f} per sequence"
-            f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {epoch.seconds:.1f} s"
+            f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s"
+            f"  log-likelihood {loglik:.2f} per sequence"
+            f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {seconds:.1f} s"
         )
 
     return watch

@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..data.formats import DataError
+from ..data.dataset import DataError
 from ..storage.files import replace_text
 from ..systems import specs
 from .common import Say

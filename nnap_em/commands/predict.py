@@ -5,7 +5,7 @@ import argparse
 import jax
 import numpy as np
 
-from ..data.dataset import read_logs
+from ..data.logs import read_logs
 from ..em.predict import predict
 from ..em.store import load
 from .common import Say, model_file, write_states

@@ -4,7 +4,7 @@ import argparse
 
 import numpy as np
 
-from ..data.dataset import read_logs
+from ..data.logs import read_logs
 from ..em.predict import smoothed_states
 from ..em.store import load
 from .common import Say, model_file, write_states

@@ -1,31 +1,18 @@
-"""Sequences: logs read and checked once, padded to one length."""
+"""Sequences of one rig, padded to one length."""
 
-import math
-import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from .formats import Array, DataError, DataWarning, log_files, place, read_table, refuse
-from .plausible import Columns, doubts, repeats
-from .rig import Rig
-from .rough import FULL, Rough, retell, rough
+Array = jax.Array | np.ndarray  # host or device
 
-TOLERANCE = 0.01  # of the declared dt, for every interval
-LOST = 0.25  # share of the rows of a file that may be lost in gaps
-TOLD = 0.1  # of the impulse of one row: how wrong inputs that are told over a gap may be
-_REASONS = {
-    "spike": "far from what the readings before and after say",
-    "stuck": "one value over again while the machine moves",
-    "late start": "one value over again until the sensor starts",
-    "saturated": "at the end of the sensor's range while the machine goes beyond",
-}
+
+class DataError(ValueError):
+    """A mistake in a log: the message names the file, the place, what was found and the mend."""
 
 
 class Dataset(NamedTuple):
@@ -43,76 +30,6 @@ class Dataset(NamedTuple):
         longest, inputs = float(np.max(t[..., -1] - t[..., 0])), np.shape(self.u)[-1]
         said = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
         return f"Dataset: {said}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
-
-
-class Masked(NamedTuple):
-    """What a log holds and a fit does not see."""
-
-    file: str
-    kind: str
-    """`spike`, `stuck`, `late start`, `saturated`: readings; `gap`, `cut`: rows."""
-    column: str | None
-    row: int
-    """The first one in the file, counted from 1 under the header."""
-    time: float
-    """Of that row [s]."""
-    amount: int
-    """Readings, or rows."""
-
-
-@dataclass(frozen=True)
-class Logs:
-    """The sequences of one folder, one per file, and the names of their columns."""
-
-    files: tuple[str, ...]  # without folder, in the order of the sequences
-    data: Dataset
-    columns: tuple[str, ...]  # inputs, then measured
-    masked: tuple[Masked, ...] = ()  # is NaN in `data`
-    unmasked: Dataset | None = None
-
-    @property
-    def as_read(self) -> Dataset:
-        """The readings of the files, those that are masked too."""
-        return self.data if self.unmasked is None else self.unmasked
-
-    def __str__(self) -> str:
-        return f"Logs {self.files[0]} to {self.files[-1]}: {', '.join(self.columns)}; {self.data}"
-
-
-def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
-    """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
-
-    Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
-    Those later than `until` [s after the first row] are neither masked nor asked: a prediction may not know of them.
-    Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
-    """
-    files = log_files(Path(folder))
-    tables = [_read_table(path, rig) for path in files]
-    early = [table.readings(rig, until) for table in tables]
-    found = [[] if trust else rough(readings, rig.dt) for readings in early]
-    if limits := {limit for readings, each in zip(early, found, strict=True) for limit in _limits(readings, each)}:
-        found = [rough(readings, rig.dt, limits) for readings in early]
-    sequences = [_sequence(table, each, rig) for table, each in zip(tables, found, strict=True)]
-    data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
-    unmasked = pad([s.as_read for s in sequences]) if masked else None
-    return Logs(tuple(path.name for path in files), data, (*rig.input_columns, *rig.measured), masked, unmasked)
-
-
-def check_split(train: Logs, test: Logs | None = None) -> None:
-    """Raise DataError where a sequence is there twice, or where a test sequence has rows of a training sequence.
-
-    Warns DataWarning where other sequences overlap.  Clocks do not count.
-    """
-    parts = {f"train file {file}": rows for file, rows in _contents(train)}
-    parts |= {f"test file {file}": rows for file, rows in (_contents(test) if test else ())}
-    for name, row, other, there, whole in repeats(parts):
-        leaks = name.startswith("test") and other.startswith("train")
-        if whole:
-            raise DataError(f"{name}: the same content as {other}; remove one of the two")
-        found = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
-        if leaks:
-            raise DataError(f"{found}; remove one of the two: test sequences are new to the fit")
-        warnings.warn(f"{found}; cut sequences without overlap", DataWarning, 2)
 
 
 def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
@@ -154,123 +71,5 @@ def active_steps(valid: Bool[jax.Array, " time"]) -> Bool[jax.Array, " time"]:
     return jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
 
 
-class _Table(NamedTuple):
-    """One file, its clock checked; rows that it lost are back, with inputs told from the others."""
-
-    path: Path
-    table: Float[np.ndarray, "time column"]
-    """Time, inputs, readings."""
-    rows: Int[np.ndarray, " row"]
-    """Where those of the file stand."""
-    masked: list[Masked]
-
-    def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
-        """The columns of readings up to some seconds after the first row."""
-        early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
-        return dict(zip(rig.measured, self.table[early, 1 + len(rig.input_columns) :].T, strict=True))
-
-
-def _limits(readings: Columns, found: Sequence[Rough]) -> set[tuple[str, float]]:
-    """Columns and the values at which they saturate."""
-    flat = [(entry.column, readings[entry.column][entry.rows]) for entry in found if entry.kind == FULL]
-    return {(column, float(limit)) for column, y in flat for limit in (y.min(), y.max()) if np.sum(y == limit) > 2}
-
-
-class _Sequence(NamedTuple):
-    """One file: t, u, y as a fit sees them, the same with all readings, and what is masked."""
-
-    used: tuple[np.ndarray, np.ndarray, np.ndarray]
-    as_read: tuple[np.ndarray, np.ndarray, np.ndarray]
-    masked: list[Masked]
-
-
-def _read_table(path: Path, rig: Rig) -> _Table:
-    table = read_table(path, ("time", *rig.input_columns), rig.measured)
-    return _whole(path, table, _rows(path, table[:, 0], rig), rig)
-
-
-def _sequence(whole: _Table, found: Sequence[Rough], rig: Rig) -> _Sequence:
-    """One file, checked against the rig, without what was found in it."""
-    path, table, masked = whole.path, whole.table, list(whole.masked)
-    first = 1 + len(rig.input_columns)
-    t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
-    line = np.searchsorted(whole.rows, np.arange(len(t)))  # of each row of the table, in the file
-    y = read.copy()
-    for entry in found:
-        y[entry.rows, rig.measured.index(entry.column)] = np.nan
-    inputs, readings = dict(zip(rig.input_columns, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
-    for doubt in doubts(inputs, readings, rig.dt):
-        where = place(path, doubt.column, None if doubt.row is None else int(line[doubt.row]))
-        if doubt.ruins:
-            refuse(path, where, doubt.found, doubt.mend)
-        warnings.warn(f"{path}: {where}: {doubt.found}; {doubt.mend}", DataWarning, 2)
-    for entry in found:
-        k, count = int(entry.rows[0]), entry.rows.size
-        masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
-        said = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
-        mend = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {said}; {mend}", DataWarning, 2)
-    return _Sequence((t, u, y), (t, u, read), masked)
-
-
-def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray, " time"]:
-    """Where the rows of a file stand in a uniform one; refuses a clock that is not uniform but for a few gaps."""
-    steps = np.diff(t) / rig.dt
-    typical = np.median(steps)
-    if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
-        thousand = 0.99 < typical / 1000 < 1.01 or 0.99 < typical * 1000 < 1.01
-        mend = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
-        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", mend)
-    whole = np.maximum(np.round(steps), 1)
-    wrong = np.abs(steps - whole) > TOLERANCE
-    lost = int(np.sum(whole[~wrong] - 1))
-    if not wrong.any() and lost > LOST * (t.size + lost):
-        wrong = whole > 1
-    if wrong.any():
-        k, count = np.flatnonzero(wrong)[0], wrong.sum()
-        kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
-        found = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
-        mend = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
-        refuse(path, place(path, "time", int(k) + 1), found, f"{mend} (dt = {rig.dt:g} s)")
-    if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
-        mend = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
-        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", mend)
-    return np.append(0, np.cumsum(whole)).astype(int)
-
-
-def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
-    """The rows that the file lost, without readings; cut at the first gap where inputs cannot be told."""
-    size, inputs = int(rows[-1]) + 1, slice(1, 1 + len(rig.input_columns))
-    if size == len(rows):
-        return _Table(path, table, rows, [])
-    full = np.full((size, table.shape[1]), np.nan)
-    full[rows] = table
-    lost = np.isnan(full[:, 0])
-    full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
-    told = [retell(u, lost) for u in full[:, inputs].T]
-    full[:, inputs] = np.stack([u for u, _ in told], axis=1) if told else full[:, inputs]
-    dark = np.any([doubt > TOLD for _, doubt in told], axis=0) if told else np.zeros(size, bool)
-    end = int(np.argmax(dark)) if dark.any() else size
-    here, masked = rows[rows < end], []
-    for first, count, kind, mend in (
-        (int(lost.argmax()), int(lost[:end].sum()), "gap", "inputs there are told from the rows around"),
-        (end, len(rows) - len(here), "cut", "inputs before these rows were lost and cannot be told: not used"),
-    ):
-        if count:
-            k = int(np.searchsorted(rows, first))  # the row of the file after the gap
-            masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
-            said = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
-            said += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
-            warnings.warn(f"{path}: {place(path, 'time', k)}: {said}; {mend}", DataWarning, 2)
-    return _Table(path, full[:end], here, masked)
-
-
 def _lengthen(values: Array, time: int, filler: float) -> np.ndarray:
     return np.pad(np.asarray(values, np.float64), ((0, time - len(values)), (0, 0)), constant_values=filler)
-
-
-def _contents(logs: Logs) -> Iterator[tuple[str, Float[np.ndarray, "time column"]]]:
-    """Inputs and readings of each file."""
-    u, y, valid = (np.asarray(x) for x in logs.as_read[1:])
-    for i, file in enumerate(logs.files):
-        yield file, np.hstack([u[i][valid[i]], y[i][valid[i]]])

@@ -1,30 +1,21 @@
 """One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with its mend."""
 
-import importlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NoReturn
 
-import jax
 import numpy as np
+import scipy.io
 from jaxtyping import Float, Real
 
 from ..storage.files import replace_text
+from .dataset import Array, DataError
 from .rig import nearest
 
-Array = jax.Array | np.ndarray  # host or device
 LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
-
-
-class DataError(ValueError):
-    """A mistake in a log: the message names the file, the place, what was found and the mend."""
-
-
-class DataWarning(UserWarning):
-    """Something in a log that is possible but seldom meant."""
 
 
 def has_logs(folder: Path) -> bool:
@@ -114,7 +105,11 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
 
 def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a Parquet file, where null and NaN are missing samples."""
-    parquet = _extra(path, "pyarrow.parquet", "pyarrow")
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without pyarrow; {mend}") from None
     with _damaged(path, "Parquet"):
         file = parquet.ParquetFile(path)
         names = file.schema_arrow.names
@@ -127,10 +122,9 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
 
 def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
-    io = _extra(path, "scipy.io", "scipy")
     with _damaged(path, "MAT"):
         try:
-            content = io.loadmat(path, squeeze_me=True, struct_as_record=True)
+            content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
     found = {name: value for name, value in content.items() if not name.startswith("__")}
@@ -147,29 +141,18 @@ def _logs(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob("*") if p.suffix.lower() in _readers and not p.name.startswith("."))
 
 
-class _damaged:
+@contextmanager
+def _damaged(path: Path, form: str) -> Iterator[None]:
     """Whatever a parser raises on bytes that are none of its format, as a DataError."""
-
-    def __init__(self, path: Path, format: str) -> None:
-        self.path, self.format = path, format
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, DataError):
-            if isinstance(error, OSError) and error.errno:
-                raise _unreadable(self.path, error) from None
-            mend = "use another copy, or write it as CSV"
-            raise DataError(f"{self.path}: no {self.format} file, or damaged or cut short; {mend}") from None
-
-
-def _extra(path: Path, module: str, package: str) -> ModuleType:
     try:
-        return importlib.import_module(module)
-    except ImportError:
-        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
-        raise DataError(f"{path}: cannot be read without {package}; {mend}") from None
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise _unreadable(path, error) from None
+        mend = "use another copy, or write it as CSV"
+        raise DataError(f"{path}: no {form} file, or damaged or cut short; {mend}") from None
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:

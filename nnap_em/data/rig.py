@@ -3,7 +3,6 @@
 import difflib
 import json
 import math
-import re
 import tomllib
 import warnings
 from collections.abc import Collection, Mapping
@@ -12,12 +11,9 @@ from pathlib import Path
 from typing import NoReturn
 
 from ..storage.files import replace_text
+from .units import parameter_unit, quantities
 
 _FRICTION = {"unknown": True, "none": False}
-_UNITS = {  # of parameters and states, by their names
-    r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
-    r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
-}  # fmt: skip
 _CLOCKS = ("sequence", "session")
 _MEND = {  # how the line of a key or table should look
     "format": "format = 1",
@@ -306,17 +302,6 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
     noise = table.table("noise_std", absent={})
     noise.check((), columns)
     return columns, {column: noise.positive(column) for column in noise.items}
-
-
-def parameter_unit(name: str) -> str:
-    """The SI unit of a parameter or state that is called as in the machines here; "SI" where it is not."""
-    return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
-
-
-def quantities(values: Mapping[str, object]) -> str:
-    """Parameters or states as text, with their units."""
-    numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
-    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
 
 
 def _lines(values: Mapping[str, str]) -> list[str]:

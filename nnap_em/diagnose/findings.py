@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import AbstractEffect, catalogue, fields, flat
-from ..effects.function import UnknownFunction
+from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from .hypothesis import blocks
-from .keys import Key, key_of, rest_of, words
+from .keys import Key, key_of, listed, rest_of, words
 from .loop import Closed
 
 
@@ -56,38 +56,6 @@ def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> Abstract
     parts = jnp.split(numbers, np.cumsum([np.size(part) for part in old])[:-1])
     new = [part.reshape(jnp.shape(was)) for part, was in zip(parts, old, strict=True)]
     return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(effect)], effect, new)
-
-
-class Curve(NamedTuple):
-    """A learned function along one signal, its mean taken away."""
-
-    signal: str
-    signal_unit: str
-    joint: int
-    """Where it acts, counted from 1."""
-    unit: str
-    """Of the force."""
-    turns: bool
-    """True where the signal is an angle that goes round."""
-    x: Float[np.ndarray, " node"]
-    mean: Float[np.ndarray, " node"]
-    std: Float[np.ndarray, " node"]
-
-
-def curve(
-    effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: AbstractSystem, nodes: int = 121
-) -> Curve | None:
-    """The learned function of one signal, its parameters of covariance `cov`; None for any other effect."""
-    if not isinstance(effect, UnknownFunction) or len(effect.axes) != 1 or effect.joint is None:
-        return None
-    (axis,) = effect.axes
-    x = np.linspace(float(axis.low), float(axis.high), nodes)
-    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
-    basis = basis - basis.mean(axis=0)
-    std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
-    units = axis.unit(system), system.force_unit(effect.joint)
-    mean = basis @ np.asarray(effect.weights)
-    return Curve(" + ".join(axis.names), units[0], effect.joint, units[1], axis.turns, x, mean, std)
 
 
 def shape(found: Curve) -> str:
@@ -134,13 +102,13 @@ def findings(closed: Closed) -> list[Finding]:
     for effect, found, numbers, law in entries:
         if law is not None:
             continue  # told with the law that it completes
-        drawn = curve(effect, numbers, model.system)
+        drawn = effect.curve(numbers, model.system)
         parameters = estimates(effect, numbers, model.system)
         numbers_told = ", ".join(
             f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
         )
         sentence = ": ".join(filter(None, (words(key_of(effect)), shape(drawn) if drawn else numbers_told)))
-        rest = next((curve(e, c, model.system) for e, _, c, of in entries if of is effect), None)
+        rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
         if rest is not None:
             left = f"{np.ptp(rest.mean):.2g} {rest.unit}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
@@ -194,11 +162,6 @@ def verdict(
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names as a sentence lists them."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:

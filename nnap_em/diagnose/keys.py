@@ -1,4 +1,6 @@
-"""What tells two effects apart, and which law completes or replaces which."""
+"""What tells two effects apart, how a reader would call them, and which law completes or replaces which."""
+
+from collections.abc import Sequence
 
 import jax
 
@@ -20,7 +22,13 @@ def words(key: Key) -> str:
     text = name.replace("_", " ")
     if inputs:
         text += f" of {' and '.join(inputs)}"
-    return text + (f" at joint {joint}" if joint else "") + (f" on {channel}" if channel else "")
+    on = "all sensors" if channel == "all" else channel
+    return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a sentence lists them."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:

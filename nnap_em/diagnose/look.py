@@ -289,13 +289,15 @@ def _is_sound(case: Case, rule: AbstractRule, say: Say) -> bool:
 
 
 def _disputed(screen: Screen, rule: AbstractRule) -> tuple[Disputed, ...]:
-    """The best of every kind on which recordings disagree."""
+    """The best of every kind on which a few recordings disagree with the others."""
     best: dict[Key, Disputed] = {}
     for one in filter(rule.disputed, screen.screened):
         if not seeded(one.candidate, one.coefficients).possible():
             continue
         key, folds = key_of(one.candidate.start), np.asarray(one.share.folds if one.share else ())
         against = screen.members[folds < 0].any(axis=0)
+        if 2 * against.sum() >= screen.members.any(axis=0).sum():
+            continue  # no odd ones: it is no law
         told = Disputed(key, one.share.least if one.share else 0.0, tuple(np.flatnonzero(against)), -float(folds.min()))
         if key not in best or best[key].share < told.share:
             best[key] = told

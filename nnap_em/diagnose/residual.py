@@ -5,17 +5,16 @@ Innovations of a right model are white, normal, of variance 1, and have nothing 
 with Applications to Tracking and Navigation", section 5.4]
 """
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
+from ..data.units import force_unit, state_unit
 from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import smooth
@@ -24,18 +23,12 @@ from ..model.base import prepare
 from ..model.state_space import with_effects
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, relinearised
-from ..systems.base import force_unit, state_unit
+from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, whiteness
 
-LAGS = 20
-"""Samples over which innovations are tested for whiteness."""
-LEVEL = 0.05
-"""Corrected p-value below which a test counts as failed."""
 SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
 """Sizes below which a failed test is called small."""
 WHITE = 0.25
 """Largest autocorrelation of the innovations of a model whose noise is what it says; .4 to .5 on real machines."""
-_GROUPS, _GROUP = 20, 50
-"""Groups at least, readings in a group at least where these are enough."""
 
 
 class Names(NamedTuple):
@@ -55,14 +48,14 @@ class Names(NamedTuple):
         if name == "time":
             return "s"
         if name in self.inputs:
-            return self.force_unit(self.joints[self.inputs.index(name)] - 1)
+            return self.force_unit(self.joints[self.inputs.index(name)])
         place = (self.coordinates + self.rates).index(name)
         dof = len(self.coordinates)
         return state_unit(self.rotary[place % dof], rate=place >= dof)
 
     def force_unit(self, joint: int) -> str:
-        """Unit of the generalised force at a joint, counted from 0."""
-        return force_unit(self.rotary[joint])
+        """Unit of the generalised force at a joint, counted from 1."""
+        return force_unit(self.rotary[joint - 1])
 
 
 class Residual(NamedTuple):
@@ -85,6 +78,10 @@ class Residual(NamedTuple):
     valid: Bool[np.ndarray, "seq time"]
     used: Bool[np.ndarray, " seq"]
     """False where the track was lost; such a sequence takes part in no test and no figure."""
+
+    def followed(self) -> "Residual":
+        """Of the sequences that were."""
+        return Residual(*(part[self.used] for part in self))
 
 
 class Test(NamedTuple):
@@ -161,115 +158,12 @@ def residual(fitted: Identified, data: Dataset, *, add_back: bool = False) -> Re
 # --- tests
 
 
-def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
-    """p-values corrected for their number: the chance that any test of all true hypotheses fails [Holm 1979]."""
-    values = np.asarray(p, float)
-    order = np.argsort(values)
-    steps = np.maximum.accumulate((values.size - np.arange(values.size)) * values[order])
-    out = np.empty_like(values)
-    out[order] = np.minimum(steps, 1.0)
-    return out
-
-
-def whiteness(e: Float[np.ndarray, "seq time"], lags: int = LAGS) -> tuple[float, float, float]:
-    """Ljung & Box's portmanteau test over all sequences together: statistic, p-value, largest autocorrelation.
-
-        Q = (N + 2) / N sum_l N_l r_l^2 ~ chi^2_lags,  N_l pairs of readings l samples apart
-
-    NaN is not measured.  [Ljung & Box 1978; Box, Jenkins, Reinsel & Ljung 2015, "Time Series Analysis", section 8.2]
-    """
-    r, pairs = autocorrelation(e, lags)
-    count = int(np.isfinite(e).sum())
-    known = pairs[1:] > 0
-    statistic = float((count + 2) / count * np.sum((pairs[1:] * r[1:] ** 2)[known]))
-    largest = r[1:][known][np.argmax(np.abs(r[1:][known]))] if known.any() else 0.0
-    return statistic, float(scipy.stats.chi2.sf(statistic, max(1, int(known.sum())))), float(largest)
-
-
 def white_innovations(fitted: Identified, data: Dataset) -> bool:
     """Whether one-step errors of every reading hardly remember each other."""
     left = residual(fitted, data)
     e = left.innovation[left.used]
     sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
     return bool(sizes) and max(map(abs, sizes)) < WHITE
-
-
-def autocorrelation(
-    e: Float[np.ndarray, "seq time"], lags: int
-) -> tuple[Float[np.ndarray, " lag"], Float[np.ndarray, " lag"]]:
-    """Autocorrelation at lags 0 to `lags` samples over all sequences, and the number of pairs behind each."""
-    centred = e - np.nanmean(e)
-    seen = np.isfinite(centred)
-    filled = np.where(seen, centred, 0.0)
-    rows = e.shape[1]
-    spans = range(min(lags, rows - 1) + 1)
-    pairs = np.asarray([np.sum(seen[:, : rows - k] & seen[:, k:]) for k in spans], float)
-    sums = np.asarray([np.sum(filled[:, : rows - k] * filled[:, k:]) for k in spans])
-    return sums / np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs
-
-
-def normality(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Jarque & Bera's test: statistic, p-value, excess kurtosis (0 if normal, above 0 with outliers).
-
-    JB = N (skewness^2 / 6 + kurtosis^2 / 24) ~ chi^2_2      [Jarque & Bera 1987]
-    """
-    x = e[np.isfinite(e)]
-    z = (x - x.mean()) / x.std()
-    skewness, kurtosis = np.mean(z**3), np.mean(z**4) - 3.0
-    statistic = float(x.size * (skewness**2 / 6 + kurtosis**2 / 24))
-    return statistic, float(scipy.stats.chi2.sf(statistic, 2)), float(kurtosis)
-
-
-def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Normalised innovation squared: its mean (1 if the stated uncertainty is right), p-value, std minus 1.
-
-    N times the mean is chi^2_N.  [Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2]
-    """
-    x = e[np.isfinite(e)]
-    mean = float(np.mean(x**2))
-    tails = scipy.stats.chi2.sf(x.size * mean, x.size), scipy.stats.chi2.cdf(x.size * mean, x.size)
-    return mean, min(1.0, 2 * float(min(tails))), math.sqrt(mean) - 1.0
-
-
-def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Correlation of innovations with a cause known before them: Student's t, p-value, correlation.
-
-    The sums of their product over sequences, cut in parts of some 50 readings, are of mean 0, as good as independent,
-    and of unlike variance; the t-test of them is conservative then, and holds where errors follow each other over
-    some samples.  [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453]
-    """
-    seen = np.isfinite(e) & np.isfinite(cause)
-    x, g = (np.where(seen, a - np.mean(a, where=seen), 0.0) for a in (e, cause))
-    scale = math.sqrt(np.sum(x**2) * np.sum(g**2))
-    if not scale > 1e-9 * math.sqrt(seen.sum()) * max(1e-300, float(np.max(np.abs(cause), where=seen, initial=0))):
-        return 0.0, 1.0, 0.0  # a cause that never changes
-    t, p = _t_test(_group_sums(x * g, seen))
-    return t, p, float(np.sum(x * g) / scale)
-
-
-def bias(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Mean of innovations: Student's t over groups as in `dependence`, p-value, mean over standard deviation."""
-    seen = np.isfinite(e)
-    t, p = _t_test(_group_sums(np.where(seen, e, 0.0), seen))
-    return t, p, float(np.nanmean(e) / np.nanstd(e))
-
-
-def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "seq time"]):
-    """Sums over groups of about equally many readings: parts of sequences."""
-    active = seen.any(1)
-    values, seen = values[active], seen[active]
-    parts = max(1, -(-_GROUPS // max(len(values), 1)), int(np.median(seen.sum(1)) // _GROUP) if len(seen) else 1)
-    sums = []
-    for row, known in zip(values, seen, strict=True):
-        sums += [piece.sum() for piece in np.array_split(row[known], parts) if piece.size]
-    return np.asarray(sums)
-
-
-def _t_test(sums: Float[np.ndarray, " group"]) -> tuple[float, float]:
-    if sums.size < 3 or not np.std(sums) > 0:
-        return 0.0, 1.0
-    t = float(np.mean(sums) / np.std(sums, ddof=1) * math.sqrt(sums.size))
-    return t, 2 * float(scipy.stats.t.sf(abs(t), sums.size - 1))
 
 
 def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
@@ -294,7 +188,7 @@ def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarra
 
 def tests(found: Residual, names: Names) -> list[Test]:
     """All tests of the innovations of every measured channel, over the sequences that were followed."""
-    found = found._replace(**{f: getattr(found, f)[found.used] for f in found._fields if f != "used"})
+    found = found.followed()
     rows: list[tuple[str, str, tuple[float, float, float]]] = []
     for i, channel in enumerate(names.measured):
         e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))

@@ -43,6 +43,7 @@ class DeadZone(InputEffect):
     name: ClassVar[str] = "dead_zone"
     confirm: ClassVar[str] = "Raise the command slowly from zero until the joint moves, both ways."
     units: ClassVar[dict[str, str]] = {"width": "N m"}
+    above_zero: ClassVar[str] = "width"
     linear: ClassVar[bool] = False
     width: Scalar
 
@@ -50,9 +51,6 @@ class DeadZone(InputEffect):
     def candidates(cls, around):
         grid = (0.03, 0.08, 0.15, 0.25, 0.4)
         return [one(partial(cls, joint=j), 0.0, s * size, 0.3 * size) for j, size in around.driven for s in grid]
-
-    def possible(self):
-        return float(self.width) > 0
 
     def input(self, u, dt):
         return u - jnp.clip(u, -self.width, self.width)
@@ -66,6 +64,7 @@ class Saturation(InputEffect):
         "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
     )
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
+    above_zero: ClassVar[str] = "limit"
     linear: ClassVar[bool] = False
     limit: Scalar
 
@@ -73,9 +72,6 @@ class Saturation(InputEffect):
     def candidates(cls, around):
         grid = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)
         return [one(partial(cls, joint=j), 2 * size, s * size, 0.2 * size) for j, size in around.driven for s in grid]
-
-    def possible(self):
-        return float(self.limit) > 0
 
     def input(self, u, dt):
         return jnp.clip(u, -self.limit, self.limit)
@@ -114,15 +110,13 @@ class InputDelay(JointEffect):
     name: ClassVar[str] = "input_delay"
     confirm: ClassVar[str] = "Log command and motor current on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
+    above_zero: ClassVar[str] = "delay"
     delay: Scalar
 
     @classmethod
     def candidates(cls, around):
         grid, dt = (0.5, 1.5, 2.5, 4.0, 6.0, 9.0), around.dt
         return [one(partial(cls, joint=j), 0.0, n * dt, 3 * dt) for j, _ in around.driven for n in grid]
-
-    def possible(self):
-        return float(self.delay) > 0
 
     def input(self, u, dt):
         late = jnp.arange(u.shape[0], dtype=u.dtype) - jnp.maximum(self.delay, 0.0) / dt
@@ -139,15 +133,13 @@ class ActuatorLag(JointEffect):
     name: ClassVar[str] = "actuator_lag"
     confirm: ClassVar[str] = "Log command and motor current on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}
+    above_zero: ClassVar[str] = "tau"
     tau: Scalar
 
     @classmethod
     def candidates(cls, around):
         grid, dt = (0.7, 1.5, 3.0, 5.0, 8.0, 15.0), around.dt
         return [one(partial(cls, joint=j), 0.0, n * dt, 5 * dt) for j, _ in around.driven for n in grid]
-
-    def possible(self):
-        return float(self.tau) > 0
 
     def input(self, u, dt):
         tau = jnp.maximum(self.tau, 0.05 * dt)

@@ -70,6 +70,11 @@ class Around(NamedTuple):
         return range(1, len(self.system.coordinates) + 1)
 
     @property
+    def turning(self) -> list[int]:
+        """Those whose coordinate is an angle."""
+        return [j for j in self.joints if self.system.angles[j - 1]]
+
+    @property
     def driven(self) -> list[tuple[int, float]]:
         """Joints whose input ever moves, with its largest value [N m]."""
         return [(j, float(size)) for j, size in zip(self.system.joints, self.drive, strict=True) if size > 0]
@@ -94,6 +99,22 @@ class Candidate(NamedTuple):
     """Prior standard deviation of every parameter."""
 
 
+class Curve(NamedTuple):
+    """A learned function along one signal, its mean taken away."""
+
+    signal: str
+    signal_unit: str
+    joint: int
+    """Where it acts, counted from 1."""
+    unit: str
+    """Of the force."""
+    turns: bool
+    """True where the signal is an angle that goes round."""
+    x: Float[np.ndarray, " node"]
+    mean: Float[np.ndarray, " node"]
+    std: Float[np.ndarray, " node"]
+
+
 class AbstractEffect(eqx.Module):
     """A law that the declared physics may lack.  The hooks say what it changes.
 
@@ -112,6 +133,8 @@ class AbstractEffect(eqx.Module):
     """Reported parameters and their units on a rotary joint."""
     units_free: ClassVar[dict[str, str]] = {}
     """Those that are others where it acts on no single joint."""
+    above_zero: ClassVar[str] = ""
+    """The parameter that makes no physical sense at zero or below."""
     memory: ClassVar[int] = 0
     """States of its own."""
     substeps: ClassVar[int] = 1
@@ -163,7 +186,7 @@ class AbstractEffect(eqx.Module):
 
     def possible(self) -> bool:
         """Whether a fitted value makes physical sense."""
-        return True
+        return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
     def inputs_named(self) -> tuple[str, ...]:
         """Of what it is a function, for laws that the vocabulary has no name for."""
@@ -180,6 +203,10 @@ class AbstractEffect(eqx.Module):
     def answers(self) -> bool:
         """Whether it is a free function of an input, which under feedback answers whatever disturbs the machine."""
         return False
+
+    def curve(self, cov: Float[np.ndarray, "param param"], system: AbstractSystem) -> Curve | None:
+        """A learned function of one signal, its parameters of covariance `cov`; None for what numbers tell."""
+        return None
 
     def memory_scale(self) -> Float[Array, " memory"]:
         """Typical size of its own states."""

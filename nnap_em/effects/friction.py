@@ -23,7 +23,7 @@ class PositionDependentFriction(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        turning = [j for j in around.joints if around.system.angles[j - 1] and around.learned]
+        turning = around.turning if around.learned else []
         return [pair(partial(cls.of, joint=j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
 
     def values(self):
@@ -79,6 +79,7 @@ class LoadFriction(JointEffect):
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Lift and lower a weight slowly: the torques differ by twice the friction, at each weight."
     units: ClassVar[dict[str, str]] = {"mu": "-"}
+    above_zero: ClassVar[str] = "mu"
     mu: Scalar
     knee: Scalar = known()
     """Rate over which the sign is smoothed [rad/s]."""
@@ -98,9 +99,6 @@ class LoadFriction(JointEffect):
 
     def signals(self, system):
         return input_of(self.joint), system.rates[self.joint - 1]
-
-    def possible(self):
-        return float(self.mu) > 0
 
     def force(self, scene, memory):
         return self.at(scene, -self.mu * jnp.abs(self.own(scene.drive)) * jnp.tanh(self.own(scene.v) / self.knee))

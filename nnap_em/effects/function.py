@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..systems.base import AbstractSystem
-from .base import AbstractEffect, Around, Candidate, JointEffect, Scalar, Scene, a, input_of
+from .base import AbstractEffect, Around, Candidate, Curve, JointEffect, Scalar, Scene, a, input_of
 
 BACKWARDS = 0.1
 """Share of its range by which a drive may seem to fall with its input: noise of what was learned."""
@@ -156,6 +156,17 @@ class UnknownFunction(JointEffect):
 
     def force(self, scene, memory):
         return self.at(scene, self.torque([axis.value(scene) for axis in self.axes]))
+
+    def curve(self, cov, system):
+        if len(self.axes) != 1:
+            return None
+        (axis,) = self.axes
+        x = np.linspace(float(axis.low), float(axis.high), 121)
+        basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+        basis = basis - basis.mean(axis=0)
+        std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
+        units, mean = (axis.unit(system), system.force_unit(self.joint)), basis @ np.asarray(self.weights)
+        return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std)
 
 
 def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import Candidate, JointEffect, Scalar, a
+from .base import Candidate, Curve, JointEffect, Scalar, a
 
 FASTEST = 4.0
 """Frequency [Hz] up to which is looked: a faster force moves little."""
@@ -55,6 +55,17 @@ class PeriodicForce(JointEffect):
         """The force after so many periods [N m]."""
         angle = 2 * jnp.pi * turns[..., None] * jnp.arange(1, self.sine.shape[0] + 1, dtype=turns.dtype)
         return jnp.sin(angle) @ self.sine + jnp.cos(angle) @ self.cosine
+
+    def curve(self, cov, system):
+        """Two periods of the waveform, its mean taken away."""
+        x, count = np.linspace(0.0, 2.0, 121), self.sine.size
+        angle = 2 * np.pi * x[:, None] * np.arange(1, count + 1)
+        basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+        own = cov[: 2 * count, : 2 * count]
+        std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, own, basis), 0.0))
+        mean = basis @ np.concatenate([self.sine, self.cosine])
+        time = x / float(self.frequency)
+        return Curve("time", "s", self.joint, system.force_unit(self.joint), False, time, mean, std)
 
     def force(self, scene, memory):
         return self.at(scene, self.waveform(self.frequency * scene.time))

@@ -87,9 +87,7 @@ class Cogging(PlaceEffect):
     @classmethod
     def candidates(cls, around):
         out = []
-        for j in around.joints:
-            if not around.system.angles[j - 1]:
-                continue
+        for j in around.turning:
             size = float(around.torque[j - 1])
             for k in (*np.arange(1.0, 8.1, 0.5), 9.0, 10.0, 11.0, 12.0, 14.0, 16.0, 18.0, 20.0, 24.0):
                 none, *probes = (cls.of(s * size, c * size, k, k, joint=j) for s, c in ((0, 0), (0.05, 0), (0, 0.05)))
@@ -185,13 +183,8 @@ class EddyBrake(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        out = []
-        for j in around.joints:
-            if not around.system.angles[j - 1]:
-                continue
-            size = float(around.torque[j - 1] / around.speed[j - 1])
-            out.append(pair(partial(cls.of, joint=j), 0.1 * size, size))
-        return out
+        sizes = ((j, float(around.torque[j - 1] / around.speed[j - 1])) for j in around.turning)
+        return [pair(partial(cls.of, joint=j), 0.1 * size, size) for j, size in sizes]
 
     def values(self):
         c = jnp.sqrt(self.even**2 + self.odd**2 + 1e-30)

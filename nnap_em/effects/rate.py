@@ -16,6 +16,7 @@ class AirDrag(AbstractEffect):
     confirm: ClassVar[str] = "Swing once with the tip shrouded, or once slow and once fast."
     units: ClassVar[dict[str, str]] = {"c": "N m s^2/rad^2"}
     units_free: ClassVar[dict[str, str]] = {"c": "N s^2/m^2"}
+    above_zero: ClassVar[str] = "c"
     c: Scalar
 
     @classmethod
@@ -24,9 +25,6 @@ class AirDrag(AbstractEffect):
         out = [one(partial(cls, joint=j), 0.0, 0.1 * size, size) for j, size in zip(around.joints, sizes, strict=True)]
         tip = around.system.tip(jnp.zeros(len(sizes)))
         return out if tip is None else [*out, one(cls, 0.0, sizes[-1], 100 * sizes[-1])]
-
-    def possible(self):
-        return float(self.c) > 0
 
     def force(self, scene, memory):
         if self.joint is not None:

@@ -52,15 +52,13 @@ class SensorDelay(SensorEffect):
     name: ClassVar[str] = "sensor_delay"
     confirm: ClassVar[str] = "Tap the link and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
+    above_zero: ClassVar[str] = "delay"
     delay: Scalar
 
     @classmethod
     def candidates(cls, around):
         names = (*around.measured, *(("all",) if len(around.measured) > 1 else ()))
         return [one(partial(cls, channel=name), 0.0, 0.5 * around.dt, 3 * around.dt) for name in names]
-
-    def possible(self):
-        return float(self.delay) > 0
 
     def reading(self, value, past):
         return past(self.delay)

@@ -79,6 +79,7 @@ class Backlash(Transmission):
     name: ClassVar[str] = "backlash"
     confirm: ClassVar[str] = "Block the motor and wiggle the link."
     units: ClassVar[dict[str, str]] = {"gap": "rad"}
+    above_zero: ClassVar[str] = "gap"
     substeps: ClassVar[int] = 10
     gap: Scalar
     log_inertia: Scalar
@@ -95,9 +96,6 @@ class Backlash(Transmission):
             none, *loose = (cls.of(gap, *rest, joint=j) for gap in (0.0, 0.03, 0.1, 0.25))
             out += [Candidate(none, (play,), cls.of(0.1, 0.7, 1.0, 0.7, joint=j)) for play in loose]
         return out
-
-    def possible(self):
-        return float(self.gap) > 0
 
     def torque(self, twist, rate):
         half = 0.5 * jnp.maximum(self.gap, 0.0)

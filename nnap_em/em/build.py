@@ -41,7 +41,7 @@ class Problem(NamedTuple):
     bank: StartBank
 
 
-def build_system(rig: Rig, dtype=float) -> AbstractSystem:
+def build_system(rig: Rig) -> AbstractSystem:
     """The declared physics, at the mean of what is uncertain.
 
     Raises RigError where its mass matrix is not positive definite.
@@ -49,9 +49,9 @@ def build_system(rig: Rig, dtype=float) -> AbstractSystem:
     kind = systems[rig.system]
     names = [f.name for f in dataclasses.fields(kind) if f.name != "joints"]
     values = {n: rig.parameters[n].mean if n in rig.parameters else kind.optional[n] for n in names}
-    system = kind(**{n: jnp.asarray(v, dtype) for n, v in values.items()}, joints=rig.input_joints)
+    system = kind(**{n: jnp.asarray(v, float) for n, v in values.items()}, joints=rig.input_joints)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(kind.coordinates)))
-    if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, dtype)))).min() <= 0:
+    if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, float)))).min() <= 0:
         raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
     return system
 
@@ -71,7 +71,18 @@ def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
     return float(np.median(np.abs(d)) / 0.6745 / np.sqrt(20.0)) if d.size else 0.0
 
 
-def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset, lag: int = 5) -> Scales:
+def loads(system: AbstractSystem) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Inertia of every joint at zero, and gravity with the first at a quarter turn [kg m^2 and N m, or kg and N]."""
+    still = jnp.zeros(len(system.coordinates))
+    gravity = system.bias(still.at[0].set(jnp.pi / 2), still)
+    return np.diag(np.asarray(system.mass(still))), np.abs(np.asarray(gravity))
+
+
+LAG = 5
+"""Rows over which differences are taken."""
+
+
+def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
     """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy."""
     dof = len(system.coordinates)
     y, u = np.asarray(data.y), np.asarray(data.u)
@@ -80,21 +91,19 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset, lag: int = 5
         position, rate = system.coordinates[joint], system.rates[joint]
         if rate in rig.measured:
             signal = y[..., rig.measured.index(rate)]
-            v, a = signal[np.isfinite(signal)], _differences(signal, 1, lag) / (lag * rig.dt)
+            v, a = signal[np.isfinite(signal)], _differences(signal, 1, LAG) / (LAG * rig.dt)
         elif position in rig.measured:
             signal = y[..., rig.measured.index(position)]
-            v = _differences(signal, 1, lag) / (lag * rig.dt)
-            a = _differences(signal, 2, lag) / (lag * rig.dt) ** 2
+            v = _differences(signal, 1, LAG) / (LAG * rig.dt)
+            a = _differences(signal, 2, LAG) / (LAG * rig.dt) ** 2
         else:
             continue
         speed[joint] = np.max(np.abs(v), initial=0.0)
         acceleration[joint] = np.sqrt(np.mean(a**2)) if a.size else 0.0
-    mass = np.diag(np.asarray(system.mass(jnp.zeros(dof, system.mass(jnp.zeros(dof)).dtype))))
+    mass, gravity = loads(system)
     for scale in (speed, acceleration):
         energy = np.nanmean(scale**2 * mass) if np.any(np.isfinite(scale)) else 1.0
         scale[np.isnan(scale)] = np.sqrt(energy / mass[np.isnan(scale)])
-    quarter = jnp.full(dof, 0.0).at[0].set(jnp.pi / 2)
-    gravity = np.abs(np.asarray(system.bias(quarter, jnp.zeros(dof))))
     drive = np.zeros(dof)
     for i, joint in enumerate(rig.input_joints):
         drive[joint - 1] = np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
@@ -125,7 +134,7 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
     return Gaussian(jnp.asarray(means), jnp.diag(jnp.asarray(stds) ** 2)), tuple(open_)
 
 
-def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: int = 41) -> Problem:
+def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     """The model that EM starts from: declared physics, a small random friction network, noise as large as motion."""
     system = build_system(rig)
     scales = measure_scales(rig, system, data)
@@ -138,9 +147,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
     ]
     unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
     if rig.friction:
-        unknown = FrictionNetwork(
-            jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque), key=key, width=width, resolution=300.0
-        )
+        speed, scale = jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque)
+        unknown = FrictionNetwork(speed, scale, key=key, resolution=300.0)
         unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_hush)
     model = StateSpaceModel(
         system=system,
@@ -157,7 +165,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray, width: int = 8, nodes: 
         jnp.asarray([rig.parameters[n].mean for n in free]),
         jnp.asarray([rig.parameters[n].std for n in free]),
     )
-    mstep = ScoringMStep(prior, unknown.weights(), open_, tuple(d is None for d in declared), nodes, shape=model.log_q)
+    mstep = ScoringMStep(prior, unknown.weights(), open_, tuple(d is None for d in declared), shape=model.log_q)
     return Problem(model, mstep, start_bank(model, states, rig, system))
 
 

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from ..data.dataset import Dataset, Logs, horizon
-from ..data.formats import Array
+from ..data.dataset import Array, Dataset, horizon
+from ..data.logs import Logs
 from ..data.rig import Rig, RigError
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .build import NO_MACHINE, Scales, measure_scales, reading_noise
+from .build import LAG, NO_MACHINE, Scales, loads, measure_scales, reading_noise
 from .identify import begin
 
 OK, LOOK, BAD = "ok", "look", "bad"
@@ -166,12 +166,10 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[Finding]
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[Finding]:
     """The inputs against gravity and inertia of the declared bodies."""
-    dof = len(system.coordinates)
-    mass = np.diag(np.asarray(system.mass(jnp.zeros(dof))))
-    quarter = jnp.zeros(dof).at[0].set(jnp.pi / 2)
-    needed = np.abs(np.asarray(system.bias(quarter, jnp.zeros(dof)))) + mass * scales.acceleration
+    mass, gravity = loads(system)
+    needed = gravity + mass * scales.acceleration
     for name, joint, u in zip(rig.input_columns, rig.input_joints, np.moveaxis(np.asarray(data.u), -1, 0), strict=True):
-        unit = "N m" if system.angles[joint - 1] else "N"
+        unit = system.force_unit(joint)
         given = float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = given / needed[joint - 1]
         text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
@@ -219,8 +217,8 @@ def _velocity(
     if rate in rig.measured:
         return np.asarray(data.y)[..., rig.measured.index(rate)], ""
     if position in rig.measured:
-        y, lag = np.asarray(data.y)[..., rig.measured.index(position)], 5
-        v = (y[:, lag:] - y[:, :-lag]) / (lag * rig.dt)
+        y = np.asarray(data.y)[..., rig.measured.index(position)]
+        v = (y[:, LAG:] - y[:, :-LAG]) / (LAG * rig.dt)
         if np.isfinite(v).any():
             return v, ""
     x = along.x[..., len(model.system.coordinates) + joint]

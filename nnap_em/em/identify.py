@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..data.rig import Declared, Rig, quantities
+from ..data.rig import Declared, Rig
+from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..model.state_space import StateSpaceModel, with_effects
 from ..smoother.gaussian import CubatureSmoother
@@ -57,6 +58,8 @@ class FrictionTable(NamedTuple):
     """[N m]"""
     cov: Float[Array, "dof node node"]
     """Covariance of the torque over the nodes of a joint [N^2 m^2]."""
+    units: tuple[tuple[str, str], ...]
+    """Of velocity and torque of every joint: on a slide they are m/s and N."""
 
     @property
     def std(self) -> Float[Array, "dof node"]:
@@ -64,12 +67,12 @@ class FrictionTable(NamedTuple):
         return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
 
     def __str__(self) -> str:
-        lines = [
-            f"joint {j + 1}: {t.min():.3g} to {t.max():.3g} N m over {v.min():.3g} to {v.max():.3g} rad/s, std up to"
-            f" {s.max():.2g} N m"
-            for j, (v, t, s) in enumerate(zip(*map(np.asarray, (self.velocity, self.torque, self.std)), strict=True))
-        ]
-        return "\n  ".join(["FrictionTable (on a slide: N and m/s)", *lines])
+        lines = ["FrictionTable"]
+        joints = zip(self.velocity, self.torque, self.std, self.units, strict=True)
+        for j, (v, t, s, (rate, force)) in enumerate(joints, 1):
+            over = f"over {v.min():.3g} to {v.max():.3g} {rate}"
+            lines.append(f"joint {j}: {t.min():.3g} to {t.max():.3g} {force} {over}, std up to {s.max():.2g} {force}")
+        return "\n  ".join(lines)
 
 
 def begin(
@@ -163,7 +166,9 @@ def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> Fr
     half = jax.scipy.linalg.solve_triangular(
         jnp.linalg.cholesky(fitted.state.hessian), jac.reshape(-1, w.shape[0]).T, lower=True
     ).T.reshape(jac.shape)
-    return FrictionTable(velocity, torque(w), jnp.einsum("jaw,jbw->jab", half, half))
+    system = fitted.model.system
+    units = tuple((system.unit(rate), system.force_unit(j)) for j, rate in enumerate(system.rates, 1))
+    return FrictionTable(velocity, torque(w), jnp.einsum("jaw,jbw->jab", half, half), units)
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:

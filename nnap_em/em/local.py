@@ -1,7 +1,5 @@
 """A model along a path: its affine form in every row, and how next state and reading move with what is estimated."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,21 +10,10 @@ from ..model.base import AbstractModel, Prepared, prepare
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..smoother.kalman import TANGENT, Affine, Cubature, Reading, Tangent, linear_reading
+from ..smoother.kalman import TANGENT, Cubature, Tangent, linear_reading
 from ..smoother.posterior import Posterior
 from .prior import ParameterPrior
-
-
-class Local(NamedTuple):
-    """A model along a path: all that depends on its structure."""
-
-    seq: Prepared
-    affine: Affine
-    reading: Reading
-    by_force: Float[Array, "*time state dof"]
-    """Sensitivity of the next state to a force held over the step."""
-    by_parameter: Float[Array, "*time state param"]
-    reading_by_parameter: Float[Array, "*time obs param"]
+from .quadratic import Local
 
 
 def local(

@@ -25,9 +25,9 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import Cubature, Tangent
 from ..smoother.posterior import Posterior
-from .local import Local, locals_along, readings_along
+from .local import locals_along, readings_along
 from .prior import ParameterPrior
-from .quadratic import Quadratic, quadratic
+from .quadratic import Local, Quadratic, quadratic
 from .weights import Weights
 
 

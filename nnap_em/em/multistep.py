@@ -18,10 +18,10 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, kalman_filter
-from .local import Local, locals_along
+from .local import locals_along
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
-from .quadratic import friction_columns
+from .quadratic import Local, friction_columns
 from .weights import Weights
 
 HORIZONS = (0.25, 0.5)
@@ -245,15 +245,13 @@ def finish(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
-    *,
-    steps: int = STEPS,
 ) -> StateSpaceModel:
     """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until they fall.
 
     Friction, parameters and effects move; noise and start stay.  [Bohlin 2006, "Practical Grey-box Process
     Identification", for prediction-error fits over several horizons]
     """
-    for _ in range(steps):
+    for _ in range(STEPS):
         weights = m_step.weights(model)
         now = forks(model, weights, path, data)
         weight = weighed(now, used)

@@ -6,10 +6,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..model.base import Prepared
 from ..numerics.gaussian import Gaussian, spd_solve
-from ..smoother.kalman import Filtered, kalman_filter
+from ..smoother.kalman import Affine, Filtered, Reading, kalman_filter
 from ..smoother.posterior import Posterior
-from .local import Local
+
+
+class Local(NamedTuple):
+    """A model along a path: all that depends on its structure."""
+
+    seq: Prepared
+    affine: Affine
+    reading: Reading
+    by_force: Float[Array, "*time state dof"]
+    """Sensitivity of the next state to a force held over the step."""
+    by_parameter: Float[Array, "*time state param"]
+    reading_by_parameter: Float[Array, "*time obs param"]
 
 
 class Quadratic(NamedTuple):

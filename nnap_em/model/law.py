@@ -55,11 +55,6 @@ class LawFit(NamedTuple):
     difference_std: Float[Array, "dof node"]
 
     @property
-    def law(self) -> StribeckLaw:
-        """The law without its constant torque."""
-        return StribeckLaw(*self.value.T[:5])
-
-    @property
     def departs(self) -> Bool[Array, "dof node"]:
         """Velocities at which the curve is not this law: more than 2 standard deviations away."""
         return jnp.abs(self.difference) > 2 * self.difference_std

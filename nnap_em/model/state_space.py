@@ -1,5 +1,6 @@
 """The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k) + v_k."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -132,14 +133,4 @@ def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) ->
     mean = jnp.concatenate([model.start.mean[: 2 * dof], jnp.zeros_like(wide)])
     cov = jax.scipy.linalg.block_diag(model.start.cov[: 2 * dof, : 2 * dof], jnp.diag((0.1 * wide) ** 2))
     log_q = jnp.concatenate([model.log_q[: 2 * dof], 2 * jnp.log(1e-3 * wide)])
-    return StateSpaceModel(
-        system=model.system,
-        unknown=model.unknown,
-        start=Gaussian(mean, cov),
-        log_q=log_q,
-        log_r=model.log_r,
-        measured=model.measured,
-        dt=model.dt,
-        substeps=model.substeps,
-        effects=effects,
-    )
+    return dataclasses.replace(model, start=Gaussian(mean, cov), log_q=log_q, effects=effects)

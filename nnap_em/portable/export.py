@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import __version__
-from ..data.rig import parameter_unit
+from ..data.units import parameter_unit
 from ..effects import AbstractEffect
 from ..em.identify import Identified, friction_table, parameter_table
 from ..em.weights import Weights
@@ -230,12 +230,11 @@ def _friction(fitted: Identified) -> dict[str, Any]:
     table = friction_table(fitted, nodes)
     unknown = cast(FrictionNetwork, fitted.model.unknown)
     columns = {"velocity": table.velocity, "torque": table.torque, "torque_std": table.std}
-    system = fitted.model.system
     return {
         "joints": [
-            {"joint": j + 1, "velocity_unit": system.unit(rate), "torque_unit": system.force_unit(j + 1)}
+            {"joint": j + 1, "velocity_unit": rate, "torque_unit": force}
             | {name: np.asarray(values[j]).tolist() for name, values in columns.items()}
-            for j, rate in enumerate(system.rates)
+            for j, (rate, force) in enumerate(table.units)
         ],
         "network": {
             "form": "scale * mlp(v / speed, asinh(v / knee) / asinh(speed / knee)), tanh layers, one network per joint",

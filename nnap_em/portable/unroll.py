@@ -48,7 +48,8 @@ class Source(NamedTuple):
     """A Python function of NumPy scalars or equal batches."""
 
     name: str
-    arguments: tuple[str, ...]
+    sizes: dict[str, int]
+    """The number of scalars in each argument."""
     lines: tuple[str, ...]
     results: tuple[tuple[str, ...], ...]
     """The expressions of each result, flat."""
@@ -58,11 +59,6 @@ class Source(NamedTuple):
         unpack = [f"{''.join(f'{name}{i}, ' for i in range(n))}= {name}" for name, n in self.sizes.items() if n]
         body = "\n".join(f"    {line}" for line in [*unpack, *self.lines, f"return {results}"])
         return f"def {self.name}({', '.join(self.sizes)}):\n{body}\n"
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The number of scalars in each argument."""
-        return {name: int(size) for name, size in (argument.split(":") for argument in self.arguments)}
 
 
 class _Writer:
@@ -109,7 +105,7 @@ def unroll(name: str, function: Callable[..., tuple[jax.Array, ...]], **argument
     ]
     results = [np.ravel(result) for result in _run(writer, *_opened(closed), names)]
     lines = writer.needed(list(itertools.chain(*results)))
-    sizes = tuple(f"{key}:{np.size(value)}" for key, value in arguments.items())
+    sizes = {key: np.size(value) for key, value in arguments.items()}
     return Source(name, sizes, lines, tuple(tuple(map(_text, result)) for result in results))
 
 

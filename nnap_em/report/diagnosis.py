@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import Logs
+from ..data.logs import Logs
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.look import Step

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from .. import __version__
-from ..data.dataset import Logs
-from ..data.rig import parameter_unit
+from ..data.logs import Logs
+from ..data.units import parameter_unit
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from ..diagnose.findings import Curve
+from ..effects.base import Curve
 from .style import AFTER, READING, ZERO, band, head, styled, symbol
 
 
 @styled
-def effect_figure(found: Curve, *, title: str = "What was found") -> Figure:
+def effect_figure(found: Curve) -> Figure:
     """A learned function with its 90 % band."""
     figure = Figure(figsize=(5.4, 3.4), layout="constrained")
     ax = figure.subplots()
@@ -18,7 +18,7 @@ def effect_figure(found: Curve, *, title: str = "What was found") -> Figure:
     signal = " + ".join(symbol(name) for name in found.signal.split(" + "))
     ax.set(xlim=(found.x[0], found.x[-1]), xlabel=f"{signal} [{found.signal_unit}]")
     ax.set_ylabel(f"force at joint {found.joint} [{found.unit}]")
-    head(figure, title, [ax])
+    head(figure, "What was found", [ax])
     return figure
 
 
@@ -28,11 +28,9 @@ def screen_figure(
     measure: str = "expected gain in log-likelihood [nat]",
     *,
     chosen: str | None = None,
-    best: int = 10,
-    title: str = "What the first look suggested",
 ) -> Figure:
-    """What the `best` candidates promise, in the `measure`, as bars; the `chosen` label in colour."""
-    top = sorted(entries, key=lambda e: -e[1])[:best]
+    """What the candidates promise, in the `measure`, as bars; the `chosen` label in colour."""
+    top = sorted(entries, key=lambda e: -e[1])
     figure = Figure(figsize=(7.4, 0.28 * max(len(top), 1) + 1.0), layout="constrained")
     ax = figure.subplots()
     colours = [AFTER if label == chosen else READING for label, _ in top]
@@ -41,5 +39,5 @@ def screen_figure(
     ax.grid(axis="y", visible=False)
     ax.axvline(0, color=ZERO, lw=0.7)
     ax.set_xlabel(measure)
-    head(figure, title, [ax])
+    head(figure, "What the first look suggested", [ax])
     return figure

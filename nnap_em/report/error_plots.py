@@ -17,9 +17,7 @@ _SIDES = {"before": (BEFORE, "s"), "fit": (AFTER, "o"), "after": (AFTER, "o")}
 
 
 @styled
-def error_figure(
-    error: Mapping[str, Any], names: Names, *, title: str = "Prediction error on test sequences"
-) -> Figure:
+def error_figure(error: Mapping[str, Any], names: Names) -> Figure:
     """Root mean square error against horizon; `error` as in report.json, a panel for each column."""
     sides = {name: error[name] for name in _SIDES if name in error}
     columns = list(next(iter(sides.values())))
@@ -35,7 +33,7 @@ def error_figure(
             dotted(ax, horizons, np.where(y > 0, y, np.nan), colour, side, mark)
         ax.set(title=symbol(name), xlabel="time predicted ahead [s]", ylabel=f"rms error [{names.unit(name)}]")
         _logarithmic(ax, horizons)
-    head(figure, title, list(grid))
+    head(figure, "Prediction error on test sequences", list(grid))
     return figure
 
 

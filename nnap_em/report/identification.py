@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import Logs
-from ..diagnose.findings import listed
+from ..data.logs import Logs
+from ..diagnose.keys import listed
 from ..diagnose.residual import names_of
 from ..em.identify import FrictionTable, Identified, friction_table
 from ..em.predict import smooth

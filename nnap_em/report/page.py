@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
+from ..diagnose.statistics import LEVEL
 from . import wording
 from .vocabulary import MEANINGS, WORDS
 from .wording import finite, number, ratio
 
-LEVEL = 0.05
-"""Corrected p-value below which a test counts as failed."""
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
@@ -62,12 +61,8 @@ def picture(place: str, title: str, caption: str, figure: Figure) -> Picture:
     return Picture(title, caption, image.getvalue(), place)
 
 
-Figures = Sequence[Picture | tuple[str, str, bytes]]
-
-
-def page(document: Mapping[str, Any], figures: Figures = ()) -> str:
+def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     """The whole page; raises ValueError where an image is neither PNG nor SVG."""
-    pictures = [figure if isinstance(figure, Picture) else Picture(*figure) for figure in figures]
     for picture in pictures:
         if picture.place not in PLACES:
             raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..diagnose.residual import LAGS, Names, Residual, autocorrelation
+from ..diagnose.residual import Names, Residual
+from ..diagnose.statistics import LAGS, autocorrelation
 from .style import ACROSS, AFTER, BEFORE, NORMAL_90, ZERO, dotted, head, styled, symbol
 
 
@@ -78,8 +79,8 @@ def _causes(found: Residual, names: Names) -> Iterator[_Cause]:
 
 
 def _followed(found: Residual) -> Residual:
-    used = found.used if found.used.any() else ~found.used
-    return found._replace(**{f: getattr(found, f)[used] for f in found._fields if f != "used"})
+    """Where no sequence was, all of them."""
+    return (found if found.used.any() else found._replace(used=~found.used)).followed()
 
 
 _Side = tuple[Residual, str, str]
@@ -112,8 +113,6 @@ def residual_figure(
     after: Residual | None = None,
     *,
     bins: int = 24,
-    title: str = "Force that the declared model lacks, against all that could cause it",
-    note: str = "Line: mean. Dark band: 90 % band of the mean. Light band: 90 % of all samples. A flat line is good.",
 ) -> Figure:
     """Residual generalised force of each joint against every candidate cause, binned; `after`: with the effects.
 
@@ -141,9 +140,11 @@ def residual_figure(
                 ax.tick_params(labelleft=False)
             else:
                 where = f"joint {j + 1}\n" if dof > 1 else ""
-                ax.set_ylabel(f"{where}missing force [{names.force_unit(j)}]", fontsize=8.5)
+                ax.set_ylabel(f"{where}missing force [{names.force_unit(j + 1)}]", fontsize=8.5)
         for ax in grid[j, len(row) :]:
             ax.set_axis_off()
+    title = "Force that the declared model lacks, against all that could cause it"
+    note = "Line: mean. Dark band: 90 % band of the mean. Light band: 90 % of all samples. A flat line is good."
     head(figure, title, list(grid.ravel()), f"{note}\nPercentage: share of the force's variation that goes with it.")
     return figure
 
@@ -218,14 +219,7 @@ def _half_turns(k: int) -> str:
 
 
 @styled
-def innovation_figure(
-    before: Residual,
-    names: Names,
-    after: Residual | None = None,
-    *,
-    lags: int = LAGS,
-    title: str = "One-step errors: should be independent and bell-shaped",
-) -> Figure:
+def innovation_figure(before: Residual, names: Names, after: Residual | None = None) -> Figure:
     """Autocorrelation with its 95 % bounds and quantile plot of the innovations of every measured channel."""
     sides = _sides(before, after, ("before", "after"))
     count = len(names.measured)
@@ -235,13 +229,13 @@ def innovation_figure(
     grid = figure.subplots(deep, 2 * pairs, squeeze=False).reshape(-1, 2)
     for i, ((across, quantile), name) in enumerate(zip(grid, names.measured, strict=False)):
         errors = [(found.innovation[..., i], colour, label) for found, colour, label in sides]
-        _autocorrelations(across, errors, lags)
+        _autocorrelations(across, errors)
         _quantiles(quantile, errors)
         across.set(ylabel=f"{symbol(name)}\nautocorrelation [-]", xlabel="lag [samples]")
         quantile.set(xlabel="quantile of a normal distribution [-]", ylabel="error over its\nstated std [-]")
     for ax in grid[count:].ravel():
         ax.set_axis_off()
-    head(figure, title, list(grid.ravel()))
+    head(figure, "One-step errors: should be independent and bell-shaped", list(grid.ravel()))
     return figure
 
 
@@ -249,8 +243,8 @@ _Errors = Sequence[tuple[Float[np.ndarray, "seq time"], str, str]]
 """Of one channel: innovations, colour and name of every side."""
 
 
-def _autocorrelations(ax: Axes, errors: _Errors, lags: int) -> None:
-    found = [(*autocorrelation(e, lags), colour, label) for e, colour, label in errors]
+def _autocorrelations(ax: Axes, errors: _Errors) -> None:
+    found = [(*autocorrelation(e, LAGS), colour, label) for e, colour, label in errors]
     bound = 1.96 / np.sqrt(np.maximum(found[0][1][1:], 1))
     ax.fill_between(
         np.arange(1, bound.size + 1), -bound, bound, color="#DDDDDD", lw=0, label="95 % bounds if independent"
@@ -259,7 +253,7 @@ def _autocorrelations(ax: Axes, errors: _Errors, lags: int) -> None:
         dotted(ax, np.arange(1, r.size), r[1:], colour, label)
     reach = max(0.1, *(1.15 * float(np.max(np.abs(r[1:]), initial=0)) for r, *_ in found))
     ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
-    ax.set(ylim=(-reach, reach), xlim=(0.5, lags + 0.5))
+    ax.set(ylim=(-reach, reach), xlim=(0.5, LAGS + 0.5))
 
 
 def _quantiles(ax: Axes, errors: _Errors) -> None:

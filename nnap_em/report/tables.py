@@ -26,11 +26,11 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def visited_nodes(velocity: Float[np.ndarray, "sample dof"], nodes: int = 101) -> Float[np.ndarray, "dof node"]:
+def visited_nodes(velocity: Float[np.ndarray, "sample dof"]) -> Float[np.ndarray, "dof node"]:
     """Velocities from the 0.5th to the 99.5th percentile of each joint, dense near rest, where friction bends."""
     low, high = np.percentile(velocity, [0.5, 99.5], axis=0)
     knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
-    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), nodes))).T
+    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), 101))).T
 
 
 def write_friction(path: Path, velocity, torque, std) -> None:

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..diagnose.keys import words
+
 
 def finite(value: Any) -> bool:
     """Whether it is a number."""
@@ -65,29 +67,16 @@ def ratio(before: Any, after: Any) -> str:
     return f"{number(times, 2)} ×" if times > 1 else f"{number(1 / times, 2)} × larger"
 
 
-def quantity(entry: Any) -> str:
-    """A parameter with its standard deviation and unit, however it is written."""
-    value, std, unit = parts(entry)
-    return with_std(value, std) + ("" if unit in (None, "", "-") else f" {unit}")
-
-
-def parts(entry: Any) -> tuple[Any, Any, Any]:
-    """Value, standard deviation and unit of a parameter, however it is written."""
-    if isinstance(entry, Mapping):
-        return entry.get("value"), entry.get("std"), entry.get("unit")
-    return tuple([*entry, None, None, None][:3]) if isinstance(entry, list | tuple) else (entry, None, None)  # type: ignore[return-value]
+def quantity(entry: Mapping[str, Any]) -> str:
+    """A parameter with its standard deviation and unit."""
+    unit = entry.get("unit")
+    return with_std(entry.get("value"), entry.get("std")) + ("" if unit in (None, "", "-") else f" {unit}")
 
 
 def label(effect: Mapping[str, Any]) -> str:
     """An effect, or what else has a name, a joint, a channel and inputs, as a reader would call it."""
-    text = str(effect.get("name") or "unnamed").replace("_", " ")
-    if effect.get("inputs"):
-        text += f" of {' and '.join(map(str, effect['inputs']))}"
-    if effect.get("joint"):
-        text += f" at joint {effect['joint']}"
-    if effect.get("channel"):
-        text += " on all sensors" if effect["channel"] == "all" else f" on {effect['channel']}"
-    return text
+    name, joint, channel, inputs = (effect.get(part) for part in ("name", "joint", "channel", "inputs"))
+    return words((str(name or "unnamed"), joint, channel, tuple(inputs or ())))
 
 
 def sentence(text: Any) -> str:

@@ -6,6 +6,9 @@ from jaxtyping import Array, Float
 
 from ..numerics.gaussian import Gaussian
 
+REACH = 2.5
+"""Outermost hypotheses, in standard deviations of the prior."""
+
 
 class StartBank(eqx.Module):
     """The prior of the start cut into narrow Gaussians on a grid of its wide directions.
@@ -19,11 +22,11 @@ class StartBank(eqx.Module):
     shrink: Float[Array, " state"]
     """Standard deviation of a hypothesis over that of the prior."""
 
-    def __init__(self, counts: tuple[int, ...], dtype=float, reach: float = 2.5):
+    def __init__(self, counts: tuple[int, ...]):
         """`counts` hypotheses along each state (1: as it is)."""
-        lines = [jnp.linspace(-reach, reach, n, dtype=dtype) if n > 1 else jnp.zeros(1, dtype) for n in counts]
+        lines = [jnp.linspace(-REACH, REACH, n, dtype=float) if n > 1 else jnp.zeros(1) for n in counts]
         self.offsets = jnp.stack([a.ravel() for a in jnp.meshgrid(*lines, indexing="ij")], axis=-1)
-        self.shrink = jnp.asarray([1.2 * reach / (n - 1) if n > 1 else 1.0 for n in counts], dtype)
+        self.shrink = jnp.asarray([1.2 * REACH / (n - 1) if n > 1 else 1.0 for n in counts], float)
 
     def padded(self, states: int) -> "StartBank":
         """This bank for a state with more entries, which it leaves as they are."""

@@ -9,17 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..data.rig import quantities
-
-
-def state_unit(angle: bool, *, rate: bool) -> str:
-    """SI unit of a coordinate or of its rate: of an angle or of a position."""
-    return ("rad" if angle else "m") + ("/s" if rate else "")
-
-
-def force_unit(angle: bool) -> str:
-    """SI unit of the generalised force that belongs to an angle or to a position."""
-    return "N m" if angle else "N"
+from ..data.units import force_unit, quantities, state_unit
 
 
 class AbstractSystem(eqx.Module):

@@ -1,0 +1,185 @@
+"""Single readings or short runs that leave the trend of their neighbours.
+
+The neighbours on both sides agree without a spike, and no jump or kink in its place explains them.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+SPIKE = 6.0  # standard deviations of a reading from what its neighbours tell
+LONGEST = 3  # rows of a spike
+_SIDE, _NEAR = 5, 3  # rows on either side of a spike that are asked, and where the signal is too quick for these
+_MARGIN = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
+_END = 5.0  # times as large it must be in the first and last three rows, which have neighbours on one side
+_PAIR = 2.5  # times as large it must be where another row near by has to be left out to see it
+_AROUND = 10  # rows before and after a spike that say how restless the signal is
+_RESTLESS = 5.0  # times its own jerks that a spike must be
+_LEAST = 0.015  # of the standard deviation of the column: a smaller spike does no harm, and machines make small wiggles
+_QUICK = 3.0  # times what the curve of `_SIDE` neighbours misses that a spike from that of `_NEAR` must be
+_DOUBT = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them tell little
+_SHORT = 5.0  # times as large a run must be as a single reading: machines make short wiggles too
+
+
+def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
+    """Rows of single readings or short runs that leave the trend of the readings before and after them."""
+    y, out = np.array(y), []
+    while True:
+        sigma = max(noise(y), 1e-9 * float(np.nanmax(np.abs(y), initial=0.0)), 1e-300)
+        tried = list(_candidates(y, sigma))
+        alone = [int(run[0]) for run in tried if run.size == 1]
+        taken = [run for run in tried if _is_spike(y, run, alone, sigma)]
+        if not taken:
+            return np.array(sorted(out), int)
+        for run in taken:
+            out += [int(row) for row in run if np.isfinite(y[row])]
+            y[run] = np.nan
+
+
+def noise(y: Float[np.ndarray, " time"]) -> float:
+    """Standard deviation of a reading about its neighbours' cubic, by the median; at least a third of a step."""
+    left = _left(np.flatnonzero(np.isfinite(y)), y, 1)
+    step = np.abs(np.diff(y[np.isfinite(y)]))
+    least = float(np.min(step, where=step > 0, initial=math.inf)) / 3
+    spread = float(np.median(np.abs(left.miss) / left.factor)) / 0.6745 if left.miss.size else 0.0
+    return max(spread, least if math.isfinite(least) else 0.0)
+
+
+class _Left(NamedTuple):
+    """What is left of the readings of runs when the cubic through two neighbours on either side is taken off."""
+
+    rows: Int[np.ndarray, "run row"]
+    miss: Float[np.ndarray, "run row"]
+    factor: Float[np.ndarray, "run row"]
+    """Standard deviation of `miss` over that of a reading."""
+
+
+def _left(k: Int[np.ndarray, " seen"], y: Float[np.ndarray, " time"], length: int) -> _Left:
+    """Of all runs of `length` among the rows `k` that were read."""
+    count = max(k.size - length - 3, 0)
+    at = np.arange(count)[:, None]
+    nodes, inner = k[at + np.array([0, 1, length + 2, length + 3])], k[at + 2 + np.arange(length)]
+    usual = float(np.median(np.diff(k))) if k.size > 1 else 1.0
+    near = nodes[:, 3] - nodes[:, 0] <= (length + 3) * usual + 4
+    nodes, inner = nodes[near], inner[near]
+    x, z = nodes.astype(float), inner.astype(float)
+    weight = np.ones((*inner.shape, 4))
+    for i in range(4):
+        for j in range(4):
+            if i != j:
+                weight[..., i] *= (z - x[:, j : j + 1]) / (x[:, i] - x[:, j])[:, None]
+    miss = y[inner] - np.einsum("rli,ri->rl", weight, y[nodes])
+    return _Left(inner, miss, np.sqrt(1 + np.sum(weight**2, axis=-1)))
+
+
+def _candidates(y: Float[np.ndarray, " time"], sigma: float) -> Iterator[Int[np.ndarray, " row"]]:
+    """Runs whose readings all lie far from the cubic through their neighbours, and the rows at both ends."""
+    k = np.flatnonzero(np.isfinite(y))
+    if k.size > 4 * _SIDE:
+        yield from k[[0, 1, -2, -1], None]
+    for length in range(1, LONGEST + 1):
+        left = _left(k, y, length)
+        far = (np.abs(left.miss) > 0.9 * SPIKE * sigma * left.factor).all(axis=1)
+        yield from left.rows[far]
+
+
+def _is_spike(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone: list[int], sigma: float) -> bool:
+    """Whether the neighbours agree without the run; one of them that may be a spike itself may be left out."""
+    if _stands_out(y, run, sigma, _SIDE) or _stands_out(y, run, sigma, _NEAR):
+        return True
+    for other in alone:
+        if 2 <= np.min(np.abs(run - other)) <= _SIDE:
+            without = y.copy()
+            without[other] = np.nan
+            if _stands_out(without, run, sigma, _SIDE, _PAIR):
+                return True
+    return False
+
+
+class _Fit(NamedTuple):
+    """The curve through the neighbours of a run."""
+
+    x: Float[np.ndarray, " row"]
+    """Rows, the run's among them, about its middle, over their number."""
+    y: Float[np.ndarray, " row"]
+    base: Float[np.ndarray, "row term"]
+    size: float
+    """How far the nearest reading of the run lies from it."""
+    rest: float
+    """The least squares that it leaves."""
+    freedom: int
+    end: bool
+    """Fewer than three neighbours on one side: at the end of the file."""
+
+
+def _fit(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], side: int) -> _Fit:
+    seen = np.flatnonzero(np.isfinite(y))
+    before, after = seen[seen < run[0]][-side:], seen[seen > run[-1]][:side]
+    end = min(before.size, after.size) < 3
+    if end:
+        before, after = seen[seen < run[0]][-_SIDE - 2 :], seen[seen > run[-1]][: _SIDE + 2]
+    rows = np.concatenate([before, run, after])
+    x = (rows - run.mean()) / (rows[-1] - rows[0])
+    base = np.vander(x, 3 if end else 4)
+    keep = ~np.isin(rows, run)
+    left = y[rows] - base @ np.linalg.lstsq(base[keep], y[rows][keep], rcond=None)[0]
+    rest, freedom = float(left[keep] @ left[keep]), max(int(keep.sum()) - base.shape[1], 1)
+    return _Fit(x, y[rows], base, float(np.min(np.abs(left[~keep]))), rest, freedom, end)
+
+
+def _stands_out(
+    y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float, side: int, strict: float = 1.0
+) -> bool:
+    """Whether the run is far from the curve of `side` neighbours, and a jump, a kink or both explain the rows worse."""
+    fit = _fit(y, run, side)
+    excess = max(fit.rest / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
+    spread = max(sigma, math.sqrt(fit.rest / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
+    size = fit.size / strict / (_END if fit.end else 1.0 if run.size == 1 else _SHORT)
+    if size < 1.1 * SPIKE * spread or size < _LEAST * float(np.std(y[np.isfinite(y)])):
+        return False
+    if size < _RESTLESS * _activity(y, run, sigma):
+        return False
+    if fit.end:
+        return True
+    if side < _SIDE and size < _QUICK * math.sqrt((wide := _fit(y, run, _SIDE)).rest / wide.freedom):
+        return False
+    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.rest + _MARGIN * sigma**2
+    return worse and _in_two(fit.x, fit.y) > 1.5 * fit.rest
+
+
+def _in_two(x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]) -> float:
+    """The least squares that two parabolas leave, one up to a row and one from the next: an impact, a reversal."""
+    least = math.inf
+    for k in range(3, x.size - 2):
+        parts = [(np.vander(x[part], 3), y[part]) for part in (slice(k), slice(k, None))]
+        miss = [v - base @ np.linalg.lstsq(base, v, rcond=None)[0] for base, v in parts]
+        least = min(least, sum(float(m @ m) for m in miss))
+    return least
+
+
+def _broken(x: Float[np.ndarray, " row"], base: Float[np.ndarray, "row term"], y: Float[np.ndarray, " row"]) -> float:
+    """The least squares that the curve and one jump or one kink, anywhere between the rows, leave."""
+    corner = np.concatenate([x[1:-1], 0.5 * (x[1:] + x[:-1])])[:, None]
+    breaks = np.concatenate([(x > corner) * 1.0, np.maximum(x - corner, 0.0)])
+    unit = np.linalg.qr(base)[0]
+    left, beyond = y - unit @ (unit.T @ y), breaks - (breaks @ unit) @ unit.T
+    size = np.sum(beyond**2, axis=1)
+    explained = (beyond @ left) ** 2 / np.maximum(size, 1e-12)
+    return float(left @ left - np.max(explained[size > 1e-9], initial=0.0))
+
+
+def _activity(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float) -> float:
+    """How far readings around the run lie from the cubic through their neighbours, as far as noise does not explain it.
+
+    The upper quartile: one more spike near by does not hide this one.
+    """
+    first = max(run[0] - _AROUND, 0)
+    there = y[first : run[-1] + _AROUND + 1].copy()
+    there[run - first] = np.nan
+    left = _left(np.flatnonzero(np.isfinite(there)), there, 1)
+    beside = (left.rows < run[0] - first - 2) | (left.rows > run[-1] - first + 2)
+    bend = (np.abs(left.miss) / left.factor)[beside]
+    return max(float(np.percentile(bend, 75)) - 1.5 * sigma, 0.0) if bend.size else math.inf

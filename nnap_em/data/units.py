@@ -1,0 +1,30 @@
+"""SI units: of parameters and states by their names, of what belongs to an angle or to a position."""
+
+import re
+from collections.abc import Mapping
+
+_UNITS = {  # of parameters and states, by their names
+    r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
+    r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
+}  # fmt: skip
+
+
+def parameter_unit(name: str) -> str:
+    """The SI unit of a parameter or state that is called as in the machines here; "SI" where it is not."""
+    return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
+
+
+def quantities(values: Mapping[str, object]) -> str:
+    """Parameters or states as text, with their units."""
+    numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
+    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
+
+
+def state_unit(angle: bool, *, rate: bool) -> str:
+    """SI unit of a coordinate or of its rate: of an angle or of a position."""
+    return ("rad" if angle else "m") + ("/s" if rate else "")
+
+
+def force_unit(angle: bool) -> str:
+    """SI unit of the generalised force that belongs to an angle or to a position."""
+    return "N m" if angle else "N"

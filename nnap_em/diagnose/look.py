@@ -298,7 +298,9 @@ def _disputed(screen: Screen, rule: AbstractRule) -> tuple[Disputed, ...]:
         against = screen.members[folds < 0].any(axis=0)
         if 2 * against.sum() >= screen.members.any(axis=0).sum():
             continue  # no odd ones: it is no law
-        told = Disputed(key, one.share.least if one.share else 0.0, tuple(np.flatnonzero(against)), -float(folds.min()))
+        told = Disputed(
+            key, one.share.least if one.share else 0.0, tuple(map(int, np.flatnonzero(against))), -float(folds.min())
+        )
         if key not in best or best[key].share < told.share:
             best[key] = told
     return tuple(sorted(best.values(), key=lambda told: -told.share))

@@ -139,7 +139,7 @@ class UnknownFunction(JointEffect):
 
     def possible(self):
         """A drive gives no less torque for more input, whatever it loses: what zigzags stands for another cause."""
-        if len(self.axes) > 1 or not self.answers():
+        if len(self.axes) != 1 or not self.answers():
             return True
         (axis,) = self.axes
         u = np.linspace(float(axis.low), float(axis.high), 8 * axis.count)

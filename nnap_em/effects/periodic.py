@@ -78,7 +78,7 @@ def _at(joint: int | None, frequency: float, count: int, around, known: Periodic
     start = np.zeros((2, count))
     if known is not None:
         start[:, : known.sine.size] = known.sine, known.cosine
-    make = lambda w, f: PeriodicForce(*map(jnp.asarray, w), a(f), joint=joint)  # noqa: E731
+    make = lambda w, f: PeriodicForce(jnp.asarray(w[0]), jnp.asarray(w[1]), a(f), joint=joint)  # noqa: E731
     probes = tuple(make(start + 0.05 * size * row.reshape(2, count), frequency) for row in np.eye(2 * count))
     spread = make(np.full((2, count), 3.0 * size), 0.3 / span)
     return Candidate(make(start, frequency), probes, spread)

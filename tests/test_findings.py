@@ -9,7 +9,7 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.findings import findings
+from nnap_em.diagnose.findings import entry, findings
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.loop import Closed
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
@@ -66,12 +66,22 @@ def test_a_learned_rest_is_told_with_its_law_and_the_next_function_keeps_its_joi
         assert np.sign(found.curve.mean[-1] - found.curve.mean[0]) == sign
         assert (found.curve.std > 0).all()
     assert set(spring.parameters) == {"k", "theta0"} and not other.parameters
+    for found, sign in ((spring, 1), (other, -1)):  # weights along a line, their sum falls off at the ends
+        told = entry(found)["shape"]
+        middle = told["numbers"]["slope_middle"]
+        assert (told["kind"], middle["unit"], np.sign(middle["value"])) == ("cubic", "N m/rad", sign)
+        assert found.shape.words in found.sentence
 
 
 def test_a_curve_has_the_units_of_its_machine():
     (found,) = findings(_closed(SLIDE, _function("x", 1, 1.0)))
     assert (found.curve.signal_unit, found.curve.unit) == ("m", "N")
     assert "N/m" in found.sentence and "N m" not in found.sentence
+
+
+def test_a_law_of_known_form_has_no_shape():
+    (found,) = findings(_closed(ARM, _spring(2)))
+    assert found.curve is None and found.shape is None and "shape" not in entry(found)
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from ..systems import AbstractSystem
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, rest_of, words
 from .loop import Closed
+from .shapes import Shape, shape
 
 
 class Estimate(NamedTuple):
@@ -58,27 +59,6 @@ def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> Abstract
     return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(effect)], effect, new)
 
 
-def shape(found: Curve) -> str:
-    """A learned function in words: a period, a bump, or a slope."""
-    x, y, name, across = found.x, found.mean, found.signal, found.signal_unit
-    size = f"{np.ptp(y):.2g} {found.unit} from trough to peak"
-    if found.turns:
-        power = np.abs(np.fft.rfft(y[:-1])) ** 2
-        n = int(np.argmax(power[1:])) + 1
-        if power[n] > 0.8 * power[1:].sum():
-            return f"period {n} in {name}, {size}"
-    line = np.polyfit(x, y, 1)
-    if np.var(y - np.polyval(line, x)) < 0.15 * np.var(y):
-        return f"nearly a straight line in {name}, slope {line[0]:.2g} {found.unit}/{across}"
-    level = np.median(y)
-    peak = int(np.argmax(np.abs(y - level)))
-    width = np.mean(np.abs(y - level) > 0.5 * abs(y[peak] - level)) * np.ptp(x)
-    if width < 0.4 * np.ptp(x):
-        kind, height = "bump" if y[peak] > level else "dip", f"{y[peak] - level:.2g} {found.unit} high"
-        return f"a {kind} at {name} = {x[peak]:.2f} {across}, about {width:.2f} wide, {height}"
-    return f"a smooth function of {name}, largest at {x[int(np.argmax(y))]:.2f} {across}, {size}"
-
-
 class Finding(NamedTuple):
     """One effect as it is reported."""
 
@@ -89,6 +69,8 @@ class Finding(NamedTuple):
     sentence: str
     curve: Curve | None = None
     """What was learned of its form: the function itself, or what is left beside a law."""
+    shape: Shape | None = None
+    """What the curve looks like."""
 
 
 def findings(closed: Closed) -> list[Finding]:
@@ -107,10 +89,13 @@ def findings(closed: Closed) -> list[Finding]:
         numbers_told = ", ".join(
             f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
         )
-        sentence = ": ".join(filter(None, (words(key_of(effect)), shape(drawn) if drawn else numbers_told)))
         rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
-        if rest is not None:
-            left = f"{np.ptp(rest.mean):.2g} {rest.unit}"
+        learned = drawn or rest
+        form = shape(learned) if learned else None
+        formed = form.words if drawn and form else ""
+        sentence = ": ".join(filter(None, (words(key_of(effect)), numbers_told, formed)))
+        if rest is not None and form is not None:
+            left = f"{np.ptp(rest.mean):.2g} {rest.unit}: {form.words}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
         evidence = {
             "log_likelihood_gain": found.gain,
@@ -118,7 +103,7 @@ def findings(closed: Closed) -> list[Finding]:
             "held_out_gain": found.held_out,
             "share_of_error": found.share,
         }
-        out.append(Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest))
+        out.append(Finding(effect, parameters, evidence, found.equivalent, sentence, learned, form))
     return out
 
 
@@ -231,6 +216,7 @@ def entry(finding: Finding) -> dict[str, Any]:
     """A finding as the report has it."""
     _, joint, channel, inputs = key_of(finding.effect)
     return {
+        **({"shape": finding.shape.entry()} if finding.shape else {}),
         "name": finding.effect.key(),
         "joint": joint,
         "channel": channel,

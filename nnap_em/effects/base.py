@@ -113,6 +113,8 @@ class Curve(NamedTuple):
     x: Float[np.ndarray, " node"]
     mean: Float[np.ndarray, " node"]
     std: Float[np.ndarray, " node"]
+    basis: Float[np.ndarray, "node basis"] | None = None
+    """Functions whose sum the curve is; None: the values as they stand."""
 
 
 class AbstractEffect(eqx.Module):

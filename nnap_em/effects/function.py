@@ -163,10 +163,12 @@ class UnknownFunction(JointEffect):
         (axis,) = self.axes
         x = np.linspace(float(axis.low), float(axis.high), 121)
         basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
-        basis = basis - basis.mean(axis=0)
+        # its mean is that of the nodes, each weighted by how well it is known: what was never visited moves nothing
+        variance = np.einsum("xi,ij,xj->x", basis, cov, basis)
+        basis = basis - np.average(basis, axis=0, weights=1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300))
         std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
         units, mean = (axis.unit(system), system.force_unit(self.joint)), basis @ np.asarray(self.weights)
-        return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std)
+        return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std, basis)
 
 
 def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:

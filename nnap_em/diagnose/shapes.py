@@ -1,0 +1,186 @@
+"""A learned curve in words: the simplest of a few shapes that explains it, as the basis of the curve would show it."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from ..effects.base import Curve
+from .forms import Family, Told, View, forms, say
+from .waves import waves
+
+EXPLAINS = 0.85
+"""Share of the variance, adjusted for the numbers spent, from which on a shape is named: a sine is 81 % of a square."""
+FLOOR = 0.05
+"""Times the rms of the curve: no difference below it counts, since curves bend with what else the model lacks."""
+KNOWN = 0.5
+"""Standard deviation, in rms of the curve, up to which it is looked at."""
+EVEN = 2.0
+"""Difference in the information criterion that is no evidence [Kass & Raftery 1995]: the simpler shape is told."""
+
+
+class Shape(NamedTuple):
+    """What a curve looks like."""
+
+    kind: str
+    numbers: dict[str, tuple[float, str]]
+    """By name: a value and its unit."""
+    explains: float
+    """Share of the variance of the curve, weighted by how well it is known."""
+    resolution: float
+    """Distance of the basis functions, in units of the signal: no transition, bump or dip is seen to be narrower."""
+    known: tuple[float, float]
+    """The range of the signal in which the curve is known; of an angle it may pass the end of the turn."""
+    rivals: tuple[str, ...]
+    """Shapes of no more numbers that explain it as well."""
+    words: str
+
+    def entry(self) -> dict[str, Any]:
+        """As the report has it."""
+        numbers = {name: {"value": value, "unit": unit} for name, (value, unit) in self.numbers.items()}
+        return {"kind": self.kind, "numbers": numbers} | {n: getattr(self, n) for n in Shape._fields[2:-1]}
+
+
+class _Seen(NamedTuple):
+    """The curve as its basis shows it, every direction in units of its error, the constant taken out."""
+
+    target: Float[np.ndarray, " direction"]
+    project: Float[np.ndarray, "direction node"]
+
+    def fit(
+        self, columns: Float[np.ndarray, "place node column"]
+    ) -> tuple[Float[np.ndarray, "place column"], Float[np.ndarray, "place direction"]]:
+        """Sizes of the columns by linear least squares, and what is left, for each of many places."""
+        seen = self.project @ columns
+        gram = seen.swapaxes(1, 2) @ seen
+        eye = np.eye(gram.shape[1])
+        gram = gram + (1e-6 * np.trace(gram, axis1=1, axis2=2) + 1e-300)[:, None, None] * eye
+        size = np.linalg.solve(gram, seen.swapaxes(1, 2) @ self.target[:, None])
+        return size[..., 0], self.target - (seen @ size)[..., 0]
+
+
+def shape(found: Curve) -> Shape:
+    """The simplest shape that explains a learned curve, with numbers and units; a smooth function where none does.
+
+    Every shape is seen through the basis of the curve, so that a sharp step and the transition that the basis makes of
+    it are one. Places and widths from a grid, polished, sizes by linear least squares [Golub & Pereyra 1973]; of the
+    shapes the first, in the order of simplicity, whose Schwarz criterion is not clearly above the lowest.
+    """
+    known = _known(found)
+    if known is None:
+        return _smooth(found, np.ones(found.x.shape, bool))
+    view, seen = _view(found, known), _seen(found, known)
+    total, n = float(seen.target @ seen.target), len(seen.target)
+    tried: list[tuple[float, int, float, Told]] = []
+    for family in sorted(waves(view) + forms(view), key=lambda family: family.price):
+        if n - family.price < 2:
+            continue
+        place, size, rss = _best(family, seen, view)
+        explains = 1 - rss / total
+        if 1 - (1 - explains) * n / (n - family.price) >= EXPLAINS:
+            criterion = (n + 1) * np.log(rss + known.sum()) + family.price * np.log(n + 1)  # an error at every node
+            tried.append((criterion, family.price, explains, family.tell(view, place, size)))
+    if not tried:
+        return _smooth(found, known)
+    lowest = min(criterion for criterion, *_ in tried)
+    (_, price, explains, told), *others = [one for one in tried if one[0] < lowest + EVEN]
+    rivals = tuple(dict.fromkeys(t.kind for _, p, _, t in others if t.kind != told.kind and p <= price))
+    words = told.words + _looked(found, known)
+    if rivals:
+        words += f" (a {' or '.join(rivals)} would explain it as well)"
+    limits = view.low + view.length * view.start, view.low + view.length * (view.start + view.span)
+    return Shape(told.kind, told.numbers, explains, view.fine * view.length, limits, rivals, words)
+
+
+def _known(found: Curve) -> np.ndarray | None:
+    """Nodes at which the curve is better known than it is large; None where these are less than a quarter."""
+    weight = 1 / np.maximum(found.std, 1e-3 * np.ptp(found.mean) + 1e-300) ** 2
+    level = np.average(found.mean, weights=weight)
+    rms = np.sqrt(np.average((found.mean - level) ** 2, weights=weight))
+    known = found.std < KNOWN * rms
+    return known if rms > 0 and known.mean() > 0.25 else None
+
+
+def _view(found: Curve, known: np.ndarray) -> View:
+    """The axis of the curve, an angle cut where the widest gap of what is known ends."""
+    low, length = float(found.x[0]), float(np.ptp(found.x))
+    z = (found.x - low) / length
+    whole = found.turns and bool(known.mean() > 0.9)
+    if found.turns and not whole:
+        inside = np.sort(z[known])
+        gaps = np.diff(inside, append=inside[0] + 1)
+        cut = inside[(int(np.argmax(gaps)) + 1) % inside.size]
+        z = cut + (z - cut) % 1.0
+    start, end = float(z[known].min()), float(z[known].max())
+    across = found.signal, found.signal_unit, found.unit
+    return View(*across, low, length, found.turns, whole, start, end - start, _fine(found), z[known])
+
+
+def _seen(found: Curve, known: np.ndarray) -> _Seen:
+    """Orthonormal directions that the basis has where the curve is known, in units of its error there."""
+    y = found.mean[known]
+    root = 1 / np.hypot(found.std[known], FLOOR * np.std(y))
+    basis = np.eye(y.size) if found.basis is None else found.basis[known]
+    one = root / np.linalg.norm(root)
+    left, size, _ = np.linalg.svd(root[:, None] * basis - one[:, None] * (one @ (root[:, None] * basis)))
+    project = left[:, : size.size].T[size > 1e-3 * size[0]] * root
+    return _Seen(project @ y, project)
+
+
+def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarray, float]:
+    """Place, size and squared residual of the best member of a family: the best three of its grid, polished."""
+    free = list(family.free)
+
+    def left(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        size, rest = seen.fit(family.columns(view, place[None]))
+        return size[0], rest[0]
+
+    _, rest = seen.fit(family.columns(view, family.grid))
+    rss = (rest**2).sum(axis=1)
+    free = [] if rss.min() > 0.5 * seen.target @ seen.target else free  # far from an explanation
+    places = [family.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
+    low, high = family.grid.min(axis=0), family.grid.max(axis=0)
+    if free:
+        places = [_polished(lambda p: left(p)[1], place, free, low, high) for place in places]
+    fits = [(place, *left(place)) for place in places]
+    place, size, rest = min(fits, key=lambda fit: float(fit[2] @ fit[2]))
+    return place, size, float(rest @ rest)
+
+
+def _polished(
+    left: Callable[[np.ndarray], np.ndarray], start: np.ndarray, free: list[int], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """A place moved, in its free entries, to where least is left."""
+
+    def moved(part: np.ndarray) -> np.ndarray:
+        place = start.copy()
+        place[free] = part
+        return place
+
+    found = least_squares(lambda part: left(moved(part)), start[free], bounds=(low[free], high[free]), max_nfev=15)
+    return moved(found.x)
+
+
+def _smooth(found: Curve, known: np.ndarray) -> Shape:
+    """Where no shape is: where it is largest, and how large it is."""
+    x, y, unit = found.x[known], found.mean[known], found.unit
+    top, size = float(x[int(np.argmax(y))]), float(np.ptp(y))
+    at, tall = say(top, found.signal_unit), say(size, unit)
+    words = f"a smooth function of {found.signal}, largest at {at}, {tall} from trough to peak"
+    numbers = {"largest_at": (top, found.signal_unit), "height": (size, unit)}
+    fine, limits = _fine(found) * float(np.ptp(found.x)), (float(x[0]), float(x[-1]))
+    return Shape("smooth", numbers, 0.0, fine, limits, (), words + _looked(found, known))
+
+
+def _fine(found: Curve) -> float:
+    """Distance of the basis functions, as a share of the axis."""
+    count = found.x.size if found.basis is None else found.basis.shape[1]
+    return 1 / (count - (not found.turns))
+
+
+def _looked(found: Curve, known: np.ndarray) -> str:
+    """Over how much of its range, where that is not nearly all of it."""
+    share = known.mean()
+    return "" if share > 0.9 else f", seen on {100 * share:.0f} % of the range of {found.signal}"

@@ -1,0 +1,235 @@
+"""Curves made by formula, and learned from noisy readings in the basis of an unknown function, are told as they are."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.diagnose.findings import curve
+from nnap_em.diagnose.shapes import Curve, shape
+from nnap_em.effects import catalogue
+from nnap_em.effects.function import Axis, InputAxis
+from nnap_em.systems.pendulum import Pendulum
+from nnap_em.systems.slide import Slide
+
+PENDULUM = Pendulum(**{k: jnp.asarray(v) for k, v in dict(m=0.5, lc=0.3, I=0.02, g=9.81).items()}, joints=(1,))
+SLIDE = Slide(m=jnp.asarray(1.0), joints=(1,))
+PART = Axis(("theta1",), -1.5, 1.5, False, 20)
+NODE = 3.0 / 19
+TURN = Axis(("theta1",), -np.pi, np.pi, True, 20)
+TURNS = Axis(("theta1",), -2 * np.pi, 2 * np.pi, False, 43)
+TIME = Axis(("time",), 0.0, 5.0, False, 20)
+
+
+def _learned(f, axis, rng, *, noise=0.08, inside=(0.0, 1.0), system=PENDULUM) -> Curve:
+    """The curve that 2000 readings of f teach, at random places of the axis; `noise` is its error in rms of f."""
+    low, high = float(axis.low), float(axis.high)
+    x = low + (high - low) * rng.uniform(*inside, 2000)
+    y = f(x)
+    std = noise * np.std(y) * np.sqrt(x.size / axis.count)
+    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+    cov = np.linalg.inv(basis.T @ basis / std**2 + np.eye(axis.count) / (3 * np.std(y)) ** 2)
+    weights = cov @ basis.T @ (y + std * rng.standard_normal(x.size)) / std**2
+    found = curve(catalogue["unknown_function"](jnp.asarray(weights), (axis,), joint=1), cov, system)
+    assert found is not None
+    return found
+
+
+def _hinge(rng):
+    a, slope, side = rng.uniform(-0.7, 0.7), rng.uniform(-3, 3), rng.choice([-1.0, 1.0])
+    names = ("slope_above", "slope_below") if side > 0 else ("slope_below", "slope_above")
+    truth = {"place": (a, NODE / 2), names[0]: (slope, 0.1 * abs(slope)), names[1]: (0.0, 0.0)}
+    return "hinge", PART, lambda x: slope * side * np.maximum(0, side * (x - a)), truth
+
+
+def _zone(rng):
+    low, high, slope = rng.uniform(-0.8, -0.3), rng.uniform(0.3, 0.8), rng.uniform(1, 3)
+    truth = {"from": (low, NODE / 2), "to": (high, NODE / 2), "slope": (slope, 0.15 * slope)}
+    return "dead zone", PART, lambda x: slope * (np.maximum(0, x - high) + np.minimum(0, x - low)), truth
+
+
+def _bend(rng):
+    a, below, above = rng.uniform(-0.5, 0.5), rng.uniform(-3, -1), rng.uniform(1, 3)
+    truth = {"place": (a, NODE / 2), "slope_below": (below, 0.3), "slope_above": (above, 0.3)}
+    return "bend", PART, lambda x: np.where(x < a, below, above) * (x - a), truth
+
+
+def _line(rng):
+    slope = rng.uniform(-3, 3)
+    return "line", PART, lambda x: slope * x, {"slope": (slope, 0.1 * abs(slope))}
+
+
+def _parabola(rng):
+    c = rng.uniform(1, 3)
+    truth = {"slope_first": (-3 * c, 0.5 * c), "slope_middle": (0.0, 0.2 * c), "slope_last": (3 * c, 0.5 * c)}
+    return "parabola", PART, lambda x: c * x**2, truth
+
+
+def _step(rng):
+    a, height = rng.uniform(-0.9, 0.9), rng.uniform(-2, 2)
+    truth = {"place": (a, NODE / 4), "height": (height, 0.1 * abs(height)), "transition": (1.5 * NODE, 1e-9)}
+    return "step", PART, lambda x: height * (x > a), truth
+
+
+def _saturation(rng):
+    a, scale = rng.uniform(-0.3, 0.3), rng.uniform(0.55, 0.65)
+    truth = {"place": (a, NODE / 2), "height": (-2.0, 0.4), "transition": (2.2 * scale, 0.5 * scale)}
+    return "saturation", PART, lambda x: -np.tanh((x - a) / scale), truth
+
+
+def _bump(rng):
+    a, height, width = rng.uniform(-0.8, 0.8), rng.uniform(0.5, 2), rng.uniform(0.2, 0.3)
+    truth = {"place": (a, NODE / 4), "height": (height, 0.1 * height), "width": (2.355 * width, 0.1)}
+    return "bump", PART, lambda x: height * np.exp(-0.5 * ((x - a) / width) ** 2), truth
+
+
+def _round(rng):
+    """A dip across the end of the turn."""
+    a, width = rng.choice([-1, 1]) * rng.uniform(2.95, 3.05), rng.uniform(0.4, 0.6)
+    truth = {"place": (a, 0.08), "height": (-1.0, 0.1), "width": (2.355 * width, 0.2)}
+    return "dip", TURN, lambda x: -np.exp(-0.5 * (((x - a + np.pi) % (2 * np.pi) - np.pi) / width) ** 2), truth
+
+
+def _ripple(rng):
+    n, a, phase = rng.integers(2, 7), rng.uniform(0.1, 1), rng.uniform(-3, 3)
+    truth = {"periods_per_turn": (n, 1e-9), "amplitude": (a, 0.1 * a), "phase": (phase, 0.15)}
+    return "ripple", TURN, lambda x: a * np.sin(n * x + phase), truth
+
+
+def _two(axis, limit):
+    def make(rng):
+        one = rng.integers(2, 5)
+        other, a, b, phase = (
+            rng.integers(one + 2, limit),
+            rng.uniform(0.5, 1),
+            rng.uniform(0.3, 0.5),
+            rng.uniform(-3, 3),
+        )
+        rates = {"periods_per_turn_1": (one, 0.06), "periods_per_turn_2": (other, 0.1)}
+        truth = rates | {"amplitude_1": (a, 0.15 * a), "amplitude_2": (b, 0.3 * b), "phase_1": (phase, 0.3)}
+        return "two ripples", axis, lambda x: a * np.sin(one * x + phase) + b * np.cos(other * x), truth
+
+    return make
+
+
+def _square(rng):
+    f, a, duty, start = rng.uniform(0.35, 0.45), rng.uniform(0.1, 1), rng.uniform(0.4, 0.6), rng.uniform(0.1, 0.9)
+    truth = {"frequency": (f, 0.01), "amplitude": (a, 0.1 * a), "duty": (duty, 0.04), "rises_at": (start, 0.06)}
+    return "square wave", TIME, lambda t: a * np.where((f * (t - start)) % 1.0 < duty, 1, -1), truth
+
+
+_FORMS = (_line, _parabola, _hinge, _zone, _bend, _step, _saturation, _bump, _round, _ripple, _square)
+FORMS = {f.__name__[1:]: f for f in _FORMS} | {"two": _two(TURN, 9), "two on two turns": _two(TURNS, 9)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_a_known_shape_is_named_with_its_numbers(form, seed):
+    rng = np.random.default_rng(seed)
+    kind, axis, f, truth = form(rng)
+    told = shape(_learned(f, axis, rng))
+    assert told.kind == kind, told.words
+    for name, (value, tolerance) in truth.items():
+        assert told.numbers[name][0] == pytest.approx(value, abs=tolerance, rel=0), (name, told.words)
+    assert told.explains > 0.95
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.25, 0.75), (-0.25, 0.25)], ids=["in the middle", "across the end of the turn"]
+)
+def test_what_was_not_visited_has_no_say(low, high):
+    """Half a turn was seen: a step there is a step, and not what the curve does elsewhere."""
+    rng = np.random.default_rng(0)
+    centre = np.pi * (low + high) - np.pi
+    away = lambda x: (x - centre + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
+    found = _learned(lambda x: 0.4 * (away(x) > 0.2), TURN, rng, inside=(low, high))
+    told = shape(found)
+    assert told.kind == "step" and "of the range of theta1" in told.words
+    assert told.numbers["place"][0] == pytest.approx((centre + 0.2 + np.pi) % (2 * np.pi) - np.pi, abs=0.1)
+    assert told.numbers["height"][0] == pytest.approx(0.4, rel=0.1)
+    far = found.std > 0.8 * found.std.max()
+    wild = found._replace(mean=found.mean + far * rng.standard_normal(far.size))
+    assert far.any() and shape(wild).words == told.words
+
+
+def test_noise_is_no_shape():
+    """Random weights whose standard deviations say that they are noise."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        cov = np.diag(rng.uniform(0.5, 2.0, 20))
+        weights = jnp.asarray(np.sqrt(np.diag(cov)) * rng.standard_normal(20))
+        found = curve(catalogue["unknown_function"](weights, (PART,), joint=1), cov, PENDULUM)
+        told = shape(found)
+        assert told.kind == "smooth" and told.explains == 0.0, told.words
+
+
+def test_a_curve_without_a_form_is_seldom_given_one():
+    """Random weights that are well known: 20 free numbers, of which a shape may explain 85 % by chance, at most."""
+    named = []
+    for seed in range(60):
+        weights = jnp.asarray(np.random.default_rng(seed).standard_normal(20))
+        effect = catalogue["unknown_function"](weights, ((PART, TURN)[seed % 2],), joint=1)
+        told = shape(curve(effect, 1e-3 * np.eye(20), PENDULUM))
+        named += [told.explains] if told.kind != "smooth" else []
+    assert len(named) <= 12
+    assert all(explains > 0.85 for explains in named)
+
+
+def test_all_at_rest_is_told_as_nothing_known():
+    told = shape(_learned(lambda x: x, PART, np.random.default_rng(0))._replace(mean=np.zeros(121)))
+    assert told.kind == "smooth" and told.numbers["height"][0] == 0.0
+
+
+@pytest.mark.parametrize("form", (_hinge, _step, _two(TURN, 9), _bump), ids=["hinge", "step", "two", "bump"])
+def test_sign_and_units_change_nothing_but_the_numbers(form):
+    rng = np.random.default_rng(1)
+    _, axis, f, _ = form(rng)
+    found = _learned(f, axis, rng)
+    told = shape(found)
+    other = shape(found._replace(mean=-1e3 * found.mean, std=1e3 * found.std))
+    assert {told.kind, other.kind} in ({told.kind}, {"bump", "dip"})
+    assert other.explains == pytest.approx(told.explains, abs=1e-6)
+    for name, (value, unit) in told.numbers.items():
+        if not name.startswith("phase"):
+            size = -1e3 if name in ("height", "slope_above", "slope_below") else 1e3 if "amplitude" in name else 1.0
+            assert other.numbers[name] == (pytest.approx(size * value, rel=1e-4), unit)
+    if not found.turns:  # along any other signal, in metres and millimetres
+        metres = found._replace(signal_unit="m")
+        told, other = shape(metres), shape(metres._replace(signal_unit="mm", x=1e3 * found.x))
+        assert other.numbers["place"] == (pytest.approx(1e3 * told.numbers["place"][0], rel=1e-4), "mm")
+
+
+def test_words_own_up_to_what_the_basis_cannot_show():
+    rng = np.random.default_rng(2)
+    step = shape(_learned(lambda x: 1.0 * (x > 0.3), PART, rng))
+    assert "a step up at theta1 = " in step.words and "(or a transition no wider than 0.237 rad)" in step.words
+    wide = shape(_learned(lambda x: np.tanh((x - 0.3) / 0.3), PART, rng))
+    assert wide.kind == "step" and "no wider" not in wide.words
+    fast = shape(_learned(lambda t: np.sin(2 * np.pi * t), TIME, rng))  # overtones would be faster than the nodes
+    assert fast.words.startswith("a ripple in time of 1.00 Hz") and "overtones not seen" in fast.words
+    assert fast.numbers["amplitude"][0] == pytest.approx(1.0, rel=0.1)
+    finest = shape(_learned(lambda x: np.sin(3 * x) + np.cos(10 * x), TURN, rng))
+    assert finest.kind == "two ripples" and "3 and 10 periods a turn" in finest.words and "at least" in finest.words
+
+
+def test_words_have_the_units_of_the_signal():
+    rng = np.random.default_rng(3)
+    position = _learned(lambda x: np.sin(2 * np.pi * x / 0.25), Axis(("x",), 0.0, 1.0, False, 20), rng, system=SLIDE)
+    assert "a ripple in x of period 0.25 m, amplitude " in shape(position).words
+    own = InputAxis(("tau2",), -0.3, 0.3, False, 20, index=0)
+    loss = shape(_learned(lambda u: 0.2 * np.maximum(0, u - 0.05), own, rng))
+    assert loss.numbers["slope_above"][1] == "" and loss.words.endswith("above")
+    once = shape(_learned(lambda x: 1.0 * ((x > -1) & (x < 1.5)), TURN, rng))
+    assert once.words.startswith("a step up at theta1 = -1") and "and down again at 1.5" in once.words
+
+
+def test_the_entry_is_what_json_holds():
+    told = shape(_learned(lambda x: np.maximum(0, x - 0.4), PART, np.random.default_rng(4)))
+    entry = json.loads(json.dumps(told.entry()))
+    assert entry["kind"] == "hinge" and entry["numbers"]["place"] == {
+        "value": told.numbers["place"][0], "unit": "rad"}  # fmt: skip
+    assert set(entry) == {"kind", "numbers", "explains", "resolution", "known", "rivals"}
+    assert entry["resolution"] == pytest.approx(NODE)
+    assert entry["known"] == pytest.approx([-1.5, 1.5], abs=0.1)

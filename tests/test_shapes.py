@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.diagnose.findings import curve
-from nnap_em.diagnose.shapes import Curve, shape
+from nnap_em.diagnose.shapes import shape
 from nnap_em.effects import catalogue
+from nnap_em.effects.base import Curve
 from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.systems.pendulum import Pendulum
 from nnap_em.systems.slide import Slide
@@ -32,7 +32,7 @@ def _learned(f, axis, rng, *, noise=0.08, inside=(0.0, 1.0), system=PENDULUM) ->
     basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
     cov = np.linalg.inv(basis.T @ basis / std**2 + np.eye(axis.count) / (3 * np.std(y)) ** 2)
     weights = cov @ basis.T @ (y + std * rng.standard_normal(x.size)) / std**2
-    found = curve(catalogue["unknown_function"](jnp.asarray(weights), (axis,), joint=1), cov, system)
+    found = catalogue["unknown_function"](jnp.asarray(weights), (axis,), joint=1).curve(cov, system)
     assert found is not None
     return found
 
@@ -160,7 +160,7 @@ def test_noise_is_no_shape():
         rng = np.random.default_rng(seed)
         cov = np.diag(rng.uniform(0.5, 2.0, 20))
         weights = jnp.asarray(np.sqrt(np.diag(cov)) * rng.standard_normal(20))
-        found = curve(catalogue["unknown_function"](weights, (PART,), joint=1), cov, PENDULUM)
+        found = catalogue["unknown_function"](weights, (PART,), joint=1).curve(cov, PENDULUM)
         told = shape(found)
         assert told.kind == "smooth" and told.explains == 0.0, told.words
 
@@ -171,7 +171,7 @@ def test_a_curve_without_a_form_is_seldom_given_one():
     for seed in range(60):
         weights = jnp.asarray(np.random.default_rng(seed).standard_normal(20))
         effect = catalogue["unknown_function"](weights, ((PART, TURN)[seed % 2],), joint=1)
-        told = shape(curve(effect, 1e-3 * np.eye(20), PENDULUM))
+        told = shape(effect.curve(1e-3 * np.eye(20), PENDULUM))
         named += [told.explains] if told.kind != "smooth" else []
     assert len(named) <= 12
     assert all(explains > 0.85 for explains in named)

@@ -75,7 +75,7 @@ def _play(e):
 def _pulses(e):
     h = np.arange(1, 8)
     sine = _a(np.where(h % 2, 4 * e["amplitude"] / (np.pi * h), 0.0))
-    return catalogue["periodic_force"](sine, jnp.zeros(7), _a(e["frequency"]), joint=e["joint"])
+    return catalogue["periodic_force"](sine, jnp.zeros(7), _a(e["frequency"]), harmonics=7, joint=e["joint"])
 
 
 MAKE = {

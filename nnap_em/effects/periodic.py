@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -28,6 +29,7 @@ class PeriodicForce(JointEffect):
     sine: Float[Array, " harmonic"]
     cosine: Float[Array, " harmonic"]
     frequency: Scalar
+    harmonics: int = eqx.field(static=True, kw_only=True)
 
     @classmethod
     def candidates(cls, around):
@@ -47,18 +49,18 @@ class PeriodicForce(JointEffect):
         return ("time",)
 
     def richer(self, around):
-        if self.sine.size >= OVERTONES:
+        if self.harmonics >= OVERTONES:
             return []
         return [_at(self.joint, float(self.frequency), OVERTONES, around, self)]
 
     def waveform(self, turns: Float[Array, "*any"]) -> Float[Array, "*any"]:
         """The force after so many periods [N m]."""
-        angle = 2 * jnp.pi * turns[..., None] * jnp.arange(1, self.sine.shape[0] + 1, dtype=turns.dtype)
+        angle = 2 * jnp.pi * jnp.tensordot(turns, jnp.arange(1, self.harmonics + 1, dtype=turns.dtype), axes=0)
         return jnp.sin(angle) @ self.sine + jnp.cos(angle) @ self.cosine
 
     def curve(self, cov, system):
         """Two periods of the waveform, its mean taken away."""
-        x, count = np.linspace(0.0, 2.0, 121), self.sine.size
+        x, count = np.linspace(0.0, 2.0, 121), self.harmonics
         angle = 2 * np.pi * x[:, None] * np.arange(1, count + 1)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         own = cov[: 2 * count, : 2 * count]
@@ -77,8 +79,8 @@ def _at(joint: int | None, frequency: float, count: int, around, known: Periodic
     size, span = float(around.torque[joint - 1]), around.duration[1] - around.duration[0]
     start = np.zeros((2, count))
     if known is not None:
-        start[:, : known.sine.size] = known.sine, known.cosine
-    make = lambda w, f: PeriodicForce(jnp.asarray(w[0]), jnp.asarray(w[1]), a(f), joint=joint)  # noqa: E731
+        start[:, : known.harmonics] = known.sine, known.cosine
+    make = lambda w, f: PeriodicForce(jnp.asarray(w[0]), jnp.asarray(w[1]), a(f), harmonics=count, joint=joint)  # noqa: E731
     probes = tuple(make(start + 0.05 * size * row.reshape(2, count), frequency) for row in np.eye(2 * count))
     spread = make(np.full((2, count), 3.0 * size), 0.3 / span)
     return Candidate(make(start, frequency), probes, spread)

@@ -319,8 +319,8 @@ MUTANTS = (
     Mutant(
         "a recording may be harmed by any share",
         "diagnose/accept.py",
-        "min(share.folds) > -self.harm",
-        "min(share.folds) < self.harm",
+        "min(folds) > -self.harm",
+        "min(folds) < self.harm",
         "test_accept.py::test_a_share_is_the_smaller_one_where_recordings_agree",
     ),
     Mutant(
@@ -436,11 +436,11 @@ MUTANTS = (
         "test_search.py::test_a_law_with_a_name_is_preferred_where_it_is_nearly_as_good",
     ),
     Mutant(
-        "rest of a law that is no function of position",
+        "rest of a law at another joint",
         "diagnose/keys.py",
-        "if e.place and e.joint == effect.joint), None)",
-        "if e.joint == effect.joint), None)",
-        "test_search.py::test_a_rest_belongs_to_the_law_of_its_own_joint",
+        "own == its and one.joint == other.joint",
+        "own == its",
+        "test_search.py::test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint",
     ),
     Mutant(
         "a law takes the place of its like",
@@ -508,8 +508,8 @@ MUTANTS = (
     Mutant(
         "strengths fitted to the fold that judges them",
         "diagnose/shares.py",
-        "fitted(every[every != f])[0]",
-        "fitted(every)[0]",
+        "fitted(gram - own, score - its)[0]",
+        "fitted(gram, score)[0]",
         "test_forks.py::test_shares_are_those_of_least_squares",
     ),
     Mutant(

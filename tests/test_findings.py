@@ -1,5 +1,7 @@
 """What was found, as it is told: each effect with its own curve, joint and units, whatever stands beside it."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +11,10 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.findings import entry, findings
+from nnap_em.diagnose.findings import advice, disputes, entry, findings, undecided, verdict
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
+from nnap_em.diagnose.keys import key_of
+from nnap_em.diagnose.look import Disputed, Step
 from nnap_em.diagnose.loop import Closed
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
@@ -82,6 +86,49 @@ def test_a_curve_has_the_units_of_its_machine():
 def test_a_law_of_known_form_has_no_shape():
     (found,) = findings(_closed(ARM, _spring(2)))
     assert found.curve is None and found.shape is None and "shape" not in entry(found)
+
+
+def _doubtful() -> Closed:
+    """A search that saw a gain on which the second recording disagrees, and a spring and a dead zone that are even."""
+    gain, zone, spring = (key_of(e) for e in (_law("motor_gain"), _law("dead_zone"), _spring(1)))
+    last = Step(ROWS, (), (), None, 3, disputed=(Disputed(gain, 0.8, (1,), 0.61),), rivals=(zone, spring))
+    return _closed(ARM)._replace(steps=(Step(ROWS, (), (), zone, 3), last))
+
+
+def _law(name: str) -> AbstractEffect:
+    return catalogue[name](jnp.asarray(0.1), joint=2)
+
+
+def test_a_recording_that_disagrees_is_named():
+    (told,) = disputes(_doubtful(), ("a.csv", "b.csv"))
+    assert (told.name, told.joint, told.files) == ("motor_gain", 2, ["b.csv"])
+    assert told.description == (
+        "motor gain at joint 2 would remove 80% of the prediction error, "
+        "but b.csv says the opposite (up to 61% more error)"
+    )
+    assert any("b.csv" in text for text in advice([], [told]))
+    assert not disputes(_closed(ARM), ("a.csv", "b.csv"))
+
+
+def test_what_cannot_be_told_is_a_verdict():
+    rivals = undecided(_doubtful())
+    text = verdict([], None, 3, rivals)
+    assert "cannot tell" in text and "dead zone at joint 2 and torsional spring at joint 1" in text
+    assert len(advice([], (), rivals)) == 2
+    assert "cannot tell" not in verdict([], None, 3)
+
+
+@pytest.mark.slow
+def test_the_page_tells_what_is_in_doubt(tmp_path):
+    logs = Logs(("a.csv", "b.csv"), _data(ARM), ("time", "u", "theta1", "theta2"))
+    write_diagnosis(tmp_path, _doubtful(), [], logs, None, seed=0, began=0.0, say=lambda text: None)
+    report, html = json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
+    assert report["effects"] == [] and report["disagreements"][0]["files"] == ["b.csv"]
+    assert [(rival["name"], rival["joint"]) for rival in report["cannot_tell"]] == [
+        ("dead_zone", 2),
+        ("torsional_spring", 1),
+    ]
+    assert "b.csv says the opposite" in html and "cannot tell what" in html
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """What the search makes of numbers: which candidates are refitted, what is asked of the rule, what goes again."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -134,6 +135,7 @@ def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
     model = with_effects(MODEL, (_law("motor_gain"), _spring()))
     assert rest_of(_function(), model) == 1
     assert rest_of(_of_input(), model) == 0
+    assert rest_of(dataclasses.replace(_function(), joint=2), model) is None
     assert rest_of(_spring(), model) is None
     assert rest_of(_function(), with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
     free = with_effects(MODEL, (_function(),))

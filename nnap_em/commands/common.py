@@ -92,6 +92,8 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
     for finding in torques(rig, system, data, measure_scales(rig, system, data)):
         if finding.mark == BAD:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
+        elif finding.subject == "scale":
+            warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)
 
 
 def model_file(path: Path) -> Path:

@@ -238,8 +238,13 @@ def _rivals(sound: list[Case], rule: AbstractRule, system: AbstractSystem) -> li
     """The best and those that explain the same by another cause, where there are any: nothing chooses among them."""
     best, *others = sound
     own = set(best.effect.signals(system))
-    apart = lambda case: bool(own) and bool(its := set(case.effect.signals(system))) and own.isdisjoint(its)  # noqa: E731
-    rivals = [case for case in others if apart(case) and rule.multistep and rule.even(best, case)]
+
+    def unlike(case: Case) -> bool:
+        """A law of another kind, and of other signals."""
+        its = set(case.effect.signals(system))
+        return case.effect.name != best.effect.name and bool(own and its) and own.isdisjoint(its)
+
+    rivals = [case for case in others if unlike(case) and rule.multistep and rule.even(best, case)]
     return [best, *rivals] if rivals else []
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset, horizon
 from ..data.logs import Logs
 from ..data.rig import Rig, RigError
+from ..data.units import parameter_unit
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
@@ -19,6 +20,7 @@ from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .build import LAG, NO_MACHINE, Scales, loads, measure_scales, reading_noise
 from .identify import begin
+from .scale import untold
 
 OK, LOOK, BAD = "ok", "look", "bad"
 SEQUENCES, SECONDS = 6, 1.0
@@ -176,6 +178,14 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
+    kept = untold(rig, system, data)
+    if kept:
+        declared, unit = rig.parameters[kept], parameter_unit(kept)
+        text = (
+            "nothing drives the machine, so that its motion cannot tell the scale of all masses and friction: "
+            f"{kept} is kept as declared ({declared} {unit}), and all else is relative to it"
+        )
+        yield Finding(_mark(True, False), "scale", text)
 
 
 def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[Finding]:

@@ -17,11 +17,12 @@ from ..model.state_space import StateSpaceModel, with_effects
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
-from .build import build
+from .build import build, build_system
 from .loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
 from .mstep import ScoringMStep, kept
 from .multistep import FALLS, errors, finish, ratio, robust_hessian
 from .noise import white_readings
+from .scale import holding, untold
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
@@ -107,6 +108,8 @@ def identify(
     Without a `smoother` it is that of `start`, or the cubature smoother.
     Raises FitError when no sequence can be followed.
     """
+    if start is None:
+        rig = holding(rig, untold(rig, build_system(rig), data))
     now = begin(rig, data, key=key) if start is None else start
     now = now if smoother is None else now._replace(smoother=smoother(now.bank))
     state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)

@@ -1,0 +1,67 @@
+"""What a machine that nothing drives cannot tell: the scale of its masses and friction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plant
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.build import build_system, measure_scales
+from nnap_em.em.check import torques
+from nnap_em.em.identify import identify
+from nnap_em.em.scale import holding, untold
+
+BODY = {"m": Declared(1.3, 0.3), "lc": Declared(0.3, 0.0), "I": Declared(0.02, 0.01), "g": Declared(9.81, 0.0)}
+SWING = Rig("swing", "pendulum", BODY, True, ("u",), (1,), 0.02, "sequence", ("theta1",), {"theta1": 0.002}, {})
+ARM = {n: Declared(v, 0.1 * v if n[0] in "mI" else 0.0) for n, v in plant.SYSTEMS["acrobot"].parameters.items()}
+
+
+def _swinging(rig: Rig, scale: float = 1.0, torque: float = 0.0) -> Dataset:
+    """A pendulum of the declared body with viscous friction, all masses `scale` times as large."""
+    system = build_system(rig)
+    rng, rows = np.random.default_rng(0), 150
+    x, u = np.empty((4, rows, 2)), torque * np.sin(3 * rig.dt * np.arange(rows) + np.arange(4)[:, None])
+    for s in range(4):
+        x[s, 0] = rng.uniform(0.6, 1.4), 0.0
+        q, v = x[s, 0]
+        for k in range(1, rows):
+            for _ in range(20):
+                force = u[s, k - 1] / scale - 0.02 * v - float(system.m * system.lc * system.g) * np.sin(q)
+                v += rig.dt / 20 * force / float(system.m * system.lc**2 + system.I)
+                q += rig.dt / 20 * v
+            x[s, k] = q, v
+    y = x[..., :1] + 0.002 * rng.normal(size=x[..., :1].shape)
+    t = np.tile(rig.dt * np.arange(rows), (4, 1))
+    return Dataset(*map(jnp.asarray, (t, u[..., None], y, np.ones(t.shape, bool))))
+
+
+def test_the_most_closely_declared_mass_carries_the_scale():
+    still = _swinging(SWING)
+    assert untold(SWING, build_system(SWING), still) == "m"  # 23 % against 50 %
+    assert untold(SWING, build_system(SWING), still._replace(u=still.u + 0.1)) is None
+    for known in ("m", "I"):  # what is trusted tells the scale
+        held = holding(SWING, known)
+        assert held.parameters[known] == Declared(BODY[known].mean, 0.0)
+        assert untold(held, build_system(held), still) is None
+
+
+@pytest.mark.parametrize(("joints", "columns"), [((2,), ("u",)), ((), ())])
+def test_an_arm_with_an_idle_motor_or_none(joints, columns):
+    rig = Rig("arm", "acrobot", ARM, True, columns, joints, 0.02, "sequence", ("theta1", "theta2"), {}, {})
+    still = Dataset(np.zeros((2, 9)), np.zeros((2, 9, len(columns))), np.zeros((2, 9, 2)), np.ones((2, 9), bool))
+    system = build_system(rig)
+    name = untold(rig, system, still)
+    assert name is not None and name[0] in "mI"
+    told = [f for f in torques(rig, system, still, measure_scales(rig, system, still)) if f.subject == "scale"]
+    assert len(told) == 1 and name in told[0].text and "cannot tell the scale" in told[0].text
+
+
+@pytest.mark.slow
+def test_the_prior_is_kept_where_nothing_is_told():
+    """The ratio of the masses is learned, their scale is not: of a body twice as heavy the logs are the same."""
+    fitted = identify(SWING, _swinging(SWING), key=jax.random.key(0), epochs=8)
+    system = fitted.model.system
+    assert float(system.m) == BODY["m"].mean
+    assert float(system.I / system.m) == pytest.approx(0.02 / 1.3, abs=0.01)

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from .data.logs import DataWarning, Logs, read_logs
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .diagnose.findings import findings
-    from .diagnose.loop import Closed, close_the_loop
+    from .diagnose.loop import close_the_loop
+    from .diagnose.outcome import Closed
     from .em.check import Finding, check
     from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
@@ -90,7 +91,8 @@ _homes = {
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
     "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
-    "diagnose.loop": ("Closed", "close_the_loop"),
+    "diagnose.loop": ("close_the_loop",),
+    "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),
     "numerics.parallel": ("all_devices", "over"),
     "smoother.particle": ("ParticleSmoother",),

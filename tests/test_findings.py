@@ -14,8 +14,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnose.findings import advice, disputes, entry, findings, undecided, verdict
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import key_of
-from nnap_em.diagnose.look import Disputed, Step
-from nnap_em.diagnose.loop import Closed
+from nnap_em.diagnose.outcome import Closed, Disputed, Step
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 from nnap_em.em.identify import begin

@@ -11,17 +11,17 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import grow, loop, undo
 from nnap_em.diagnose import look as search
-from nnap_em.diagnose import loop
 from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
 from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Share
+from nnap_em.diagnose.grow import Loop
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import covered, key_of, rest_of
 from nnap_em.diagnose.look import (
     EFFORT,
     Case,
     Look,
-    Step,
     _best_of_kind,
     _disputed,
     _named_first,
@@ -30,7 +30,7 @@ from nnap_em.diagnose.look import (
     significance,
     trimmed,
 )
-from nnap_em.diagnose.loop import Closed, Loop
+from nnap_em.diagnose.outcome import Closed, Step
 from nnap_em.diagnose.propose import seeded
 from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import Candidate, catalogue
@@ -110,12 +110,12 @@ def test_a_sixth_is_trimmed_at_either_end():
 
 def test_one_fit_is_ahead_of_another_by_what_it_is_likelier():
     one, other = (_emstate(MODEL, top) for top in (5.0, 3.0))
-    assert loop._ahead(one, other) == pytest.approx(12.0)
+    assert grow.ahead(one, other) == pytest.approx(12.0)
 
 
 @pytest.mark.parametrize(("length", "further"), [(60, 150), (150, 375), (300, 500)])
 def test_a_playoff_is_two_and_a_half_times_as_far(length, further):
-    assert loop._further(length, 500) == further
+    assert grow.playoff(length, 500) == further
 
 
 # --- records
@@ -268,26 +268,26 @@ def _top(model) -> float:
 
 @pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])
 def test_the_least_needed_goes_where_a_fit_without_it_loses_nothing(monkeypatch, names):
-    monkeypatch.setattr(loop, "_loss", lambda now, state, i: WORTH[now.model.effects[i].name])
-    monkeypatch.setattr(loop, "_asked", lambda *_: (SimpleNamespace(path=None, used=np.ones(6, bool)), None))
-    monkeypatch.setattr(loop, "refit", lambda model, *_, **__: Trial(model, RULE, None, np.full(6, _top(model)), None))
-    monkeypatch.setattr(loop, "_grow", lambda asked, now, *_: _emstate(now.model, _top(now.model)))
+    monkeypatch.setattr(undo, "_loss", lambda now, state, i: WORTH[now.model.effects[i].name])
+    monkeypatch.setattr(undo, "asked", lambda *_: (SimpleNamespace(path=None, used=np.ones(6, bool)), None))
+    monkeypatch.setattr(undo, "refit", lambda model, *_, **__: Trial(model, RULE, None, np.full(6, _top(model)), None))
+    monkeypatch.setattr(undo, "grow", lambda asked, now, *_: _emstate(now.model, _top(now.model)))
     now, state = _with(*names), _emstate(_with(*names).model, 51.0)
-    left, _ = loop._needed(_loop([]), now, state)
+    left, _ = undo.needed(_loop([]), now, state)
     assert _names(left.model) == ["motor_gain"]
 
 
 def test_what_is_not_worth_it_over_the_whole_length_goes_from_the_last_on(monkeypatch):
     """Two effects together are no better than none; the first alone is."""
     tops = {2: 1.0, 1: 5.0}
-    monkeypatch.setattr(loop, "finished", lambda fitted, data: fitted)
-    monkeypatch.setattr(loop, "_grow", lambda asked, now, *_: _emstate(now.model, tops[len(now.found)]))
+    monkeypatch.setattr(undo, "finished", lambda fitted, data: fitted)
+    monkeypatch.setattr(undo, "grow", lambda asked, now, *_: _emstate(now.model, tops[len(now.found)]))
     now = _with("motor_gain", "dead_zone")
-    closed = loop._whole(_loop([]), now, _emstate(now.model, tops[2]), [])
+    closed = undo.concluded(_loop([]), now, _emstate(now.model, tops[2]), [])
     assert _names(closed.after.model) == ["motor_gain"]
     assert [f.candidate.start.name for f in closed.found] == ["motor_gain"]
     tops[1] = 1.0
-    assert not loop._whole(_loop([]), now, _emstate(now.model, tops[2]), []).found
+    assert not undo.concluded(_loop([]), now, _emstate(now.model, tops[2]), []).found
 
 
 @pytest.mark.parametrize(("held_out", "added"), [(50.0, ["motor_gain"]), (20.0, [])])
@@ -298,7 +298,7 @@ def test_only_what_the_rule_believes_is_added(monkeypatch, held_out, added):
     empty = Screen((), Projected(np.zeros(0), np.eye(0)))
     looks = [Look(Step(9, (), (), None, 1), empty, [case], [case]), Look(Step(9, (), (), None, 1), empty, [], [])]
     monkeypatch.setattr(loop, "let_go", lambda: None)
-    monkeypatch.setattr(loop, "_asked", lambda *_: (SimpleNamespace(used=np.ones(6, bool)), np.ones(6, bool)))
+    monkeypatch.setattr(loop, "asked", lambda *_: (SimpleNamespace(used=np.ones(6, bool)), np.ones(6, bool)))
     monkeypatch.setattr(loop, "look", lambda *_: looks.pop(0))
     monkeypatch.setattr(loop, "_found", lambda *_: _found("motor_gain"))
     monkeypatch.setattr(loop, "_plain", lambda *_: None)

@@ -16,7 +16,7 @@ from ..em.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, rest_of, words
-from .loop import Closed
+from .outcome import Closed
 from .shapes import Shape, shape
 
 

@@ -15,6 +15,7 @@ from .accept import AbstractRule
 from .evidence import Evidence, Question, Screen, Screened, lazy
 from .hypothesis import Hypothesis, blocks
 from .keys import Key, covered, key_of, replaced, rest_of, words
+from .outcome import Disputed, Step
 from .propose import extended, proposals, seeded, surroundings
 from .refit import Trial, refit
 from .screen import unlike
@@ -42,36 +43,6 @@ class Effort(NamedTuple):
 
 
 EFFORT = Effort()
-
-
-class Disputed(NamedTuple):
-    """A law on which recordings disagree."""
-
-    key: Key
-    share: float
-    """Of the squared error that it would remove."""
-    against: tuple[int, ...]
-    """Sequences that it would harm."""
-    harm: float
-    """Share by which the error of the worst part of them would rise."""
-
-
-class Step(NamedTuple):
-    """What was seen at one look, for the report."""
-
-    horizon: int
-    screened: tuple[tuple[Key, float], ...]
-    """Best of every kind with its promise: nat, or a share."""
-    refitted: tuple[tuple[Key, float], ...]
-    accepted: Key | None
-    tried: int
-    """Candidates screened."""
-    measure: str = "expected gain in log-likelihood [nat]"
-    """What the numbers are."""
-    disputed: tuple[Disputed, ...] = ()
-    """Best first."""
-    rivals: tuple[Key, ...] = ()
-    """Laws of other causes that explain the same, so that none of them was added."""
 
 
 def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:

@@ -22,8 +22,8 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..storage.journal import HERE, step
+from .columns import candidate_columns, tracks
 from .evidence import Projected, Question, Screen, Screened, Share
-from .screen import candidate_columns, tracks
 
 FOLDS = 5
 """Parts that are left out in turn, as far as there are recordings."""

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from ..data.logs import Logs
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
-from ..diagnose.look import Step
-from ..diagnose.loop import Closed
+from ..diagnose.outcome import Closed, Step
 from ..diagnose.residual import Names, Residual, names_of, residual, tests
 from ..em.identify import FrictionTable, friction_table
 from ..em.predict import GIVEN, Prediction

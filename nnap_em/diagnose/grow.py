@@ -1,0 +1,150 @@
+"""Asking and fitting at longer and longer horizons: what the search and its undoing both do."""
+
+import math
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from ..data.dataset import Dataset, horizon
+from ..em.identify import Identified
+from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
+from ..em.mstep import kept
+from ..model.state_space import StateSpaceModel
+from .accept import SHORT, AbstractRule
+from .evidence import Question
+from .hypothesis import Found, Hypothesis
+from .keys import Key, key_of
+from .look import Case, Effort, Say, trimmed
+
+Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
+"""State of a fit at the end of each of its horizons, and the sequences used."""
+
+
+class Loop(NamedTuple):
+    """What does not change while the loop runs."""
+
+    before: Identified
+    stages: Stages
+    data: Dataset
+    rule: AbstractRule
+    effort: Effort
+    say: Say
+
+    @property
+    def longest(self) -> int:
+        """Rows of the longest sequence."""
+        return int(np.max(np.sum(np.asarray(self.data.valid), axis=1)))
+
+    @property
+    def bare(self) -> Hypothesis:
+        """The declared model."""
+        return Hypothesis(self.before.model, self.before.m_step)
+
+
+def beginning(data: Dataset, length: int) -> Dataset:
+    """The first `length` rows."""
+    part = horizon(data, length)
+    return jax.tree.map(lambda a: a[:, :SHORT], part) if length <= SHORT else part
+
+
+def asked(loop: Loop, now: Hypothesis, every: Dataset) -> tuple[Question, Bool[np.ndarray, " seq"]]:
+    """The question along the smoothed paths of `now`, and the sequences that are followed whole.
+
+    A sequence that is lost tells most where it is being lost: it is used until a little later, as late as it can be.
+    """
+    before, rows = loop.before, loop.data.t.shape[1]
+    smoother = before.smoother
+    posterior = e_step(now.model, every, smoother, key=before.state.key)
+    whole = np.asarray(kept(posterior, every))
+    question = Question(loop.bare, now, posterior.state, every, whole, rows)
+    if whole.all():
+        return question, whole
+    dof = len(now.model.system.coordinates)
+    kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
+    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < loop.effort.loud)
+    first = np.where(loud.any(axis=1), loud.argmax(axis=1), every.t.shape[1])
+    row, used, cut = np.arange(every.t.shape[1]), whole, every
+    for later in loop.effort.later:
+        early = every.valid & jnp.asarray(row < first[:, None] + later)
+        cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
+        posterior = e_step(now.model, cut, smoother, key=before.state.key)
+        used = np.asarray(kept(posterior, cut))
+        if used.all():
+            break
+    return question._replace(path=posterior.state, data=cut, used=used), whole
+
+
+LOOSER = 3.0
+"""What is added to the log of the process noise where every track is lost."""
+
+
+def grow(loop: Loop, now: Hypothesis, first: int, length: int, state: EMState | None = None) -> EMState:
+    """EM of the model as it stands, from the horizon where it was found (or from `state`) to a longer one."""
+    before, part = loop.before, beginning(loop.data, length)
+    if state is not None:
+        now = now.refitted(cast(StateSpaceModel, state.best))
+    schedule = Schedule(first=min(first, length), growth=1.6, hold=1)
+    growing = math.ceil(math.log(length / schedule.first) / math.log(1.6)) if length > schedule.first else 0
+    smoother = before.smoother
+    epochs = growing + (8 if length == loop.longest else 3)
+
+    def run(model: StateSpaceModel) -> EMState:
+        begun = start_state(model, now.m_step, key=before.state.key)._replace(epoch=1)
+        return fit(begun, part, smoother, now.m_step, epochs=epochs, schedule=schedule)
+
+    try:
+        state = run(now.model)
+    except FitError:  # a looser filter keeps a track that a tight one loses
+        state = run(eqx.tree_at(lambda m: m.log_q, now.model, now.model.log_q + LOOSER))
+    reach = f"{length * before.rig.dt:.2f} s"
+    loop.say(f"  fitted over {reach} in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
+    return state
+
+
+def playoff(length: int, longest: int) -> int:
+    """The horizon of a playoff."""
+    return min(longest, SHORT if length < SHORT else round(2.5 * length))
+
+
+def taken(now: Hypothesis, case: Case, found: Found | None = None) -> Hypothesis:
+    """The hypothesis with a case in it, under the hold on process noise of the old one."""
+    m_step = eqx.tree_at(lambda r: r.tie, case.after.m_step, now.m_step.tie)
+    after = case.after._replace(m_step=m_step)
+    return after if found is None else after.because(-1, found)
+
+
+def settle(
+    loop: Loop, now: Hypothesis, length: int, sound: list[Case]
+) -> tuple[Case, EMState | None, dict[Key, float]]:
+    """The winner; where the next ones are near, each is followed to a longer horizon, where the wrong ones fail.
+
+    With it the fit to that horizon, and how many nats each rival fell behind there.
+    """
+    rule, longest = loop.rule, loop.longest
+    rivals = [case for case in sound if rule.worth(case) > rule.near * rule.worth(sound[0])][:3]
+    if len(rivals) == 1 or length == longest:
+        return sound[0], None, {}
+    further = playoff(length, longest)
+    loop.say(f"  {len(rivals)} of them are near: followed to {further * loop.before.rig.dt:.2f} s")
+    states: list[tuple[Case, EMState]] = []
+    for rival in rivals:
+        try:
+            states.append((rival, grow(loop, taken(now, rival), length, further)))
+        except FitError:
+            continue
+    if not states:
+        return sound[0], None, {}
+    winner, state = states[0]
+    for rival, other in states[1:]:
+        if ahead(other, state) > 0:
+            winner, state = rival, other
+    return winner, state, {key_of(rival.effect): ahead(state, other) for rival, other in states}
+
+
+def ahead(a: EMState, b: EMState) -> float:
+    """Log-likelihood of one fit over another [nat]; a sixth of the sequences is trimmed at either end."""
+    return trimmed(np.nan_to_num(a.top, nan=-1e3) - np.nan_to_num(b.top, nan=-1e3))

@@ -1,0 +1,46 @@
+"""What a search leaves behind: every look at it, and the models before and after."""
+
+from typing import NamedTuple
+
+from ..em.identify import Identified
+from .hypothesis import Found
+from .keys import Key
+
+
+class Disputed(NamedTuple):
+    """A law on which recordings disagree."""
+
+    key: Key
+    share: float
+    """Of the squared error that it would remove."""
+    against: tuple[int, ...]
+    """Sequences that it would harm."""
+    harm: float
+    """Share by which the error of the worst part of them would rise."""
+
+
+class Step(NamedTuple):
+    """What was seen at one look, for the report."""
+
+    horizon: int
+    screened: tuple[tuple[Key, float], ...]
+    """Best of every kind with its promise: nat, or a share."""
+    refitted: tuple[tuple[Key, float], ...]
+    accepted: Key | None
+    tried: int
+    """Candidates screened."""
+    measure: str = "expected gain in log-likelihood [nat]"
+    """What the numbers are."""
+    disputed: tuple[Disputed, ...] = ()
+    """Best first."""
+    rivals: tuple[Key, ...] = ()
+    """Laws of other causes that explain the same, so that none of them was added."""
+
+
+class Closed(NamedTuple):
+    """The outcome."""
+
+    before: Identified
+    after: Identified
+    found: tuple[Found, ...]
+    steps: tuple[Step, ...]

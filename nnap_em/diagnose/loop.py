@@ -27,6 +27,7 @@ from ..numerics.programs import let_go
 from .accept import SHORT, AbstractRule, LikelihoodRule, ShareRule
 from .evidence import Question, Worth, lazy, readings
 from .hypothesis import Found, Hypothesis
+from .interventions import Intervention, untouched
 from .keys import Key, key_of, replaced, rest_of, words
 from .look import EFFORT, Case, Effort, Look, Say, Step, alike, look, open_loop_error, significance, trimmed
 from .refit import refit
@@ -43,6 +44,8 @@ class Closed(NamedTuple):
     after: Identified
     found: tuple[Found, ...]
     steps: tuple[Step, ...]
+    interventions: tuple[Intervention, ...] = ()
+    """Touches from outside, which no fit saw."""
 
 
 class Loop(NamedTuple):
@@ -418,7 +421,7 @@ def close_the_loop(
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
 
     Without a `rule`: one-step likelihood where readings carry white noise and the innovations of the outcome are
-    white; else, as on real machines, shares of the multi-step error.
+    white; else, as on real machines, shares of the multi-step error, and touches from outside are left out before.
     Raises FitError when no sequence can be followed.
     """
     data = Dataset(*map(jnp.asarray, data))
@@ -430,7 +433,10 @@ def close_the_loop(
 
     if len(data.t) < 2:
         say("one sequence: only pieces of it can be left out, so that little will be believed; record at least two")
-    before = identify(rig, data, key=key, watch=watch)
+
+    def fitted(part: Dataset) -> Identified:
+        stages.clear()
+        return identify(rig, part, key=key, watch=watch)
 
     def closed(rule: AbstractRule) -> Closed:
         try:
@@ -439,6 +445,7 @@ def close_the_loop(
             say(f"  with what was added no sequence can be followed to its end ({lost}); nothing is kept of it")
             return Closed(before, before, (), ())
 
+    before = fitted(data)
     if rule is not None:
         return closed(rule)
     if white_readings(data):
@@ -446,4 +453,7 @@ def close_the_loop(
         if white_innovations(outcome.after, data):
             return outcome
         say("one-step errors follow each other, so that their likelihood proves nothing: multi-step errors decide")
-    return closed(ShareRule())
+    before, data, touches = untouched(fitted, before, data)
+    if touches:
+        say(f"{len(touches)} touches from outside: their rows are left out")
+    return closed(ShareRule())._replace(interventions=touches)

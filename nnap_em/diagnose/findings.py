@@ -181,7 +181,7 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
     out = []
     for told in closed.steps[-1].disputed[:most] if closed.steps else ():
         name, joint, channel, inputs = told.key
-        against = [files[i] for i in told.against]
+        against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in told.against))
         text = (
             f"{words(told.key)} would remove {told.share:.0%} of the prediction error, but {listed(against)} "
             f"{'says' if len(against) == 1 else 'say'} the opposite (up to {told.harm:.0%} more error)"

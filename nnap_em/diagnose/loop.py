@@ -15,7 +15,7 @@ from scipy import stats
 from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..effects import AbstractEffect
-from ..em.identify import identify
+from ..em.identify import Identified, identify
 from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
@@ -25,6 +25,7 @@ from .accept import AbstractRule, LikelihoodRule, ShareRule
 from .evidence import Question
 from .grow import Loop, Stages, asked, beginning, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
+from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
 from .look import EFFORT, Case, Effort, Look, Say, alike, look, trimmed
 from .outcome import Closed, Step
@@ -192,7 +193,7 @@ def close_the_loop(
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
 
     Without a `rule`: one-step likelihood where readings carry white noise and the innovations of the outcome are
-    white; else, as on real machines, shares of the multi-step error.
+    white; else, as on real machines, shares of the multi-step error, and touches from outside are left out before.
     Raises FitError when no sequence can be followed.
     """
     data = Dataset(*map(jnp.asarray, data))
@@ -204,7 +205,10 @@ def close_the_loop(
 
     if len(data.t) < 2:
         say("one sequence: only pieces of it can be left out, so that little will be believed; record at least two")
-    before = identify(rig, data, key=key, watch=watch)
+
+    def fitted(part: Dataset) -> Identified:
+        stages.clear()
+        return identify(rig, part, key=key, watch=watch)
 
     def closed(rule: AbstractRule) -> Closed:
         try:
@@ -213,6 +217,7 @@ def close_the_loop(
             say(f"  with what was added no sequence can be followed to its end ({lost}); nothing is kept of it")
             return Closed(before, before, (), ())
 
+    before = fitted(data)
     if rule is not None:
         return closed(rule)
     if white_readings(data):
@@ -220,4 +225,7 @@ def close_the_loop(
         if white_innovations(outcome.after, data):
             return outcome
         say("one-step errors follow each other, so that their likelihood proves nothing: multi-step errors decide")
-    return closed(ShareRule())
+    before, data, touches, pieces = untouched(fitted, before, data)
+    if touches:
+        say(f"{len(touches)} touches from outside: their rows are left out")
+    return closed(ShareRule())._replace(interventions=touches, pieces=pieces)

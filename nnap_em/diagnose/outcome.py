@@ -37,6 +37,26 @@ class Step(NamedTuple):
     """Laws of other causes that explain the same, so that none of them was added."""
 
 
+class Intervention(NamedTuple):
+    """A push on one joint that no law explains."""
+
+    sequence: int
+    joint: int
+    """Counted from 1."""
+    first: int
+    """First row."""
+    last: int
+    """Last row."""
+    from_s: float
+    to_s: float
+    """On the clock of the log [s]."""
+    size: float
+    """Largest mean over a bell [N m, or N]."""
+    std: float
+    """How large such means are where nothing touches."""
+    unit: str
+
+
 class Closed(NamedTuple):
     """The outcome."""
 
@@ -44,3 +64,7 @@ class Closed(NamedTuple):
     after: Identified
     found: tuple[Found, ...]
     steps: tuple[Step, ...]
+    interventions: tuple[Intervention, ...] = ()
+    """Touches from outside, which no fit saw."""
+    pieces: tuple[int, ...] = ()
+    """Of which recording every sequence of the fits is a piece; empty: each is one."""

@@ -1,6 +1,6 @@
 """Everything that `nnap-em diagnose` leaves behind: report.json, report.html and tables."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..data.logs import Logs
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
-from ..diagnose.outcome import Closed, Step
+from ..diagnose.outcome import Closed, Intervention, Step
 from ..diagnose.residual import Names, Residual, names_of, residual, tests
 from ..em.identify import FrictionTable, friction_table
 from ..em.predict import GIVEN, Prediction
@@ -62,6 +62,7 @@ def write_diagnosis(
     document = shared(closed.before, train, test, seed=seed, began=began) | {
         "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"]), rivals),
         "effects": [entry(f) for f in found],
+        "interventions": [_touch(touch, train.files) for touch in closed.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
         "friction_change": friction_change(closed, visited),
@@ -160,6 +161,11 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
         "refitted": [_told(*each) for each in step.refitted],
         "accepted": words(step.accepted) if step.accepted else None,
     }
+
+
+def _touch(touch: Intervention, files: Sequence[str]) -> dict[str, Any]:
+    kept = ("joint", "from_s", "to_s", "size", "std", "unit")
+    return {"file": files[touch.sequence], **{name: getattr(touch, name) for name in kept}}
 
 
 def _told(key: Key, gain: float) -> dict[str, Any]:

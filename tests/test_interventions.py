@@ -1,0 +1,116 @@
+"""Touches from outside: found where something pushed once, and nowhere else."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import read_rig
+from nnap_em.diagnose.interventions import Intervention, touches, without
+from nnap_em.diagnose.residual import Names, Residual
+from nnap_em.report.diagnosis import _touch
+from nnap_em.report.page import page
+from nnap_em.report.tables import write_json
+from nnap_em.systems import specs
+
+DT = 0.01
+NAMES = Names(("x",), ("dx",), (False,), ("u",), (1,), ("x", "dx"))
+LEAST = np.asarray([0.01])
+TOUCH = Intervention(1, 1, 120, 150, 1.2, 1.5, -0.6, 0.1, "N m")
+
+
+def _left(law=lambda x, v: 0.0 * x, push=0.0, seed=0, sequences=5, rows=501, noise=0.3):
+    """What is left of a swing that all recordings repeat, pushed once: 1.5 to 1.8 s of the third."""
+    rng = np.random.default_rng(seed)
+    t = np.tile(DT * np.arange(rows), (sequences, 1))
+    phase = rng.uniform(0, 6, (sequences, 1))
+    x, v = np.sin(2 * t + phase), 2 * np.cos(2 * t + phase)
+    bump = np.where((t > 1.5) & (t < 1.8) & (np.arange(sequences)[:, None] == 2), push, 0.0)
+    force = law(x, v) + bump + noise * rng.standard_normal(t.shape)
+    force[:, -1] = np.nan
+    state, one = np.stack([x, v], axis=-1), np.ones((sequences, rows, 2))
+    valid = np.ones(t.shape, bool)
+    u = np.sin(2 * t + phase)[..., None]
+    return Residual(0 * one, force[..., None], one[..., :1], state, state, u, t, valid, valid.all(axis=1))
+
+
+@pytest.mark.parametrize("push", [1.0, -1.0])
+def test_a_push_is_found_with_its_time_sign_and_size(push):
+    (found,) = touches(_left(push=push), NAMES, DT, LEAST)
+    assert (found.sequence, found.joint, found.unit) == (2, 1, "N")
+    assert abs(found.from_s - 1.5) < 0.1 and abs(found.to_s - 1.8) < 0.1
+    assert abs(found.size - push) < 0.3 and 0 < found.std < 0.25
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda x, v: 0.0 * x,
+        lambda x, v: -2.0 * x,
+        lambda x, v: 3.0 * np.exp(-(((x - 0.6) / 0.15) ** 2)),
+        lambda x, v: np.sign(v) * (np.abs(x) > 0.9),
+    ],
+    ids=["nothing", "spring", "bump", "friction near the ends"],
+)
+def test_what_all_recordings_repeat_is_no_touch(law):
+    """100 s of each: a false one in 300 s would be seen once in three runs, and none is."""
+    for seed in range(4):
+        assert touches(_left(law, seed=seed), NAMES, DT, LEAST) == ()
+
+
+def test_a_push_beside_a_law_is_found():
+    (found,) = touches(_left(lambda x, v: -1.0 * x, push=3.0), NAMES, DT, LEAST)
+    assert found.sequence == 2 and abs(found.from_s - 1.5) < 0.1 and found.size > 0
+
+
+def test_a_recording_that_differs_all_the_time_is_no_touch():
+    left = _left()
+    force = left.force.copy()
+    force[3] += 2.0
+    assert touches(left._replace(force=force), NAMES, DT, LEAST) == ()
+
+
+def test_padding_and_what_is_too_small_to_matter():
+    left = _left(push=1.0)
+    padded = [np.pad(a, [(0, 0), (0, 40), *[(0, 0)] * (a.ndim - 2)], constant_values=9.0) for a in left[:-2]]
+    valid = np.pad(left.valid, [(0, 0), (0, 40)])
+    assert touches(Residual(*padded, valid, left.used), NAMES, DT, LEAST) == touches(left, NAMES, DT, LEAST)
+    assert touches(left, NAMES, DT, np.asarray([5.0])) == ()
+
+
+def _data():
+    t = np.tile(DT * np.arange(301), (2, 1))
+    return Dataset(t, t[..., None], np.stack([t, -t], axis=-1), t < 9)
+
+
+@pytest.mark.parametrize("restart", [True, False])
+def test_a_recording_is_cut_at_a_touch(restart):
+    """Rows of the touch and .1 s about it are in no sequence; all others are where their readings say."""
+    cut, pieces = without(_data(), (TOUCH,), DT, restart=restart)
+    assert pieces == ((0, 1, 1) if restart else (0, 1))
+    lengths = np.asarray(cut.valid).sum(axis=1).tolist()
+    assert lengths == ([301, 110, 140] if restart else [301, 110])
+    kept = [np.round(t[v] / DT).astype(int).tolist() for t, v in zip(cut.t, cut.valid, strict=True)]
+    assert kept[:2] == [list(range(301)), list(range(110))]
+    assert kept[2:] == ([list(range(161, 301))] if restart else [])
+    y, t, valid = (np.asarray(a) for a in (cut.y, cut.t, cut.valid))
+    np.testing.assert_array_equal(y[valid], np.stack([t, -t], axis=-1)[valid])
+    assert np.isnan(y[~valid]).all() and (np.asarray(cut.u)[~valid] == 0).all()
+
+
+def test_report_and_page_name_the_file(tmp_path):
+    entry = _touch(TOUCH, ("a.csv", "b.csv"))
+    write_json(tmp_path / "report.json", {"interventions": [entry]})
+    (read,) = json.loads((tmp_path / "report.json").read_text())["interventions"]
+    told = {"file": "b.csv", "joint": 1, "from_s": 1.2, "to_s": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
+    assert read == told
+    text = page({"effects": [], "interventions": [entry]})
+    assert all(word in text for word in ("Touches from outside", "train/b.csv", "−0.60 ± 0.10 N m"))
+    assert "Touches from outside" not in page({"effects": [], "interventions": []})
+
+
+def test_the_shared_rig_declares_what_a_touch_needs(shared):
+    """Every coordinate is measured, and no start is declared: recordings can be cut."""
+    rig = read_rig(shared / "data/measured/dfki_c1_hidden_pert/rig.toml", specs)
+    assert {"theta1", "theta2"} <= set(rig.measured) and not rig.start

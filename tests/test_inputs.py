@@ -175,3 +175,14 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
         "friction_drift": ("dtheta2", "time"),
         "periodic_force": ("time",),
     }
+
+
+def test_a_cogging_of_less_than_a_period_is_a_spring(plain):
+    """Of the range of 2 rad that was visited, four periods a turn show more than one, three do not."""
+    around = plain[-1]._replace(low=-np.ones(2), high=np.ones(2))
+    coggings = {
+        float(c.start.near): c.start.visible(around)
+        for c in catalogue["cogging"].candidates(around)
+        if c.start.joint == 2
+    }
+    assert coggings[4.0] and not coggings[3.0] and coggings[24.0]

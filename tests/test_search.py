@@ -158,8 +158,7 @@ def test_the_best_of_every_kind_stands_for_it():
         _screened(_law(name, 1.0), gain)
         for name, gain in (("air_drag", 20.0), ("air_drag", 50.0), ("motor_gain", 30.0))
     )
-    screen = Screen((strong, other, weak), Projected(np.zeros(3), np.eye(3)))
-    ranked = _best_of_kind(screen, LikelihoodRule(), 100)
+    ranked = _best_of_kind((strong, other, weak), LikelihoodRule(), 100)
     assert [s.gain for _, s in ranked] == [50.0, 30.0]
 
 
@@ -328,6 +327,7 @@ def test_likelihood_is_believed_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(loop, "close", close)
     monkeypatch.setattr(loop, "white_readings", lambda data: readings)
     monkeypatch.setattr(loop, "white_innovations", lambda fitted, data: innovations)
+    monkeypatch.setattr(loop, "untouched", lambda fit, fitted, data: (fitted, data, (), ()))
     loop.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert rules == asked
     rules.clear()

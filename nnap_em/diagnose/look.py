@@ -141,10 +141,10 @@ def held_out_gain(null: Trial, full: Trial, data: Dataset, used, passes: int = 3
     return trimmed(np.concatenate(gains))
 
 
-def _best_of_kind(screen: Screen, rule: AbstractRule, readings: int) -> list[tuple[float, Screened]]:
+def _best_of_kind(every: Sequence[Screened], rule: AbstractRule, readings: int) -> list[tuple[float, Screened]]:
     """The most promising member of every kind, best first."""
     best: dict[Key, tuple[float, Screened]] = {}
-    for screened in screen.screened:
+    for screened in every:
         if not seeded(screened.candidate, screened.coefficients).possible():
             continue
         promise, key = rule.promise(screened, readings), key_of(screened.candidate.start)
@@ -210,12 +210,13 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     around = surroundings(rig, now.model, data, question.path, question.rows)
     candidates = proposals(around, now.model.effects)
     screen = rule.screen(question, candidates)
-    ranked = _best_of_kind(screen, rule, readings)
+    seen = tuple(s for s in screen.screened if s.candidate.start.visible(around))
+    ranked = _best_of_kind(seen, rule, readings)
     worthy = functools.partial(rule.worth_a_refit, readings=readings)
     entries = _shortlist(ranked, now.model, worthy, effort)
     length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    seen = tuple((key_of(s.candidate.start), promise) for promise, s in ranked)
-    step = Step(length, seen, (), None, len(candidates), rule.promises, _disputed(screen, rule))
+    told = tuple((key_of(s.candidate.start), promise) for promise, s in ranked)
+    step = Step(length, told, (), None, len(candidates), rule.promises, _disputed(screen, rule))
     if not entries:
         return Look(step, screen, [], [])
     null = _refitted(now, question.path, question, rule, effort)

@@ -190,6 +190,10 @@ class AbstractEffect(eqx.Module):
         """Whether a fitted value makes physical sense."""
         return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
+    def visible(self, around: Around) -> bool:
+        """Whether what was visited can tell it from simpler laws."""
+        return True
+
     def inputs_named(self) -> tuple[str, ...]:
         """Of what it is a function, for laws that the vocabulary has no name for."""
         return ()

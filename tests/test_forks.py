@@ -16,7 +16,7 @@ from nnap_em.diagnose.evidence import Question
 from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.look import open_loop_error
 from nnap_em.diagnose.propose import surroundings
-from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, motions, project, share
+from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, motions, project, share, times
 from nnap_em.effects import catalogue
 from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, weighed
 from nnap_em.em.noise import third_differences, white_readings
@@ -172,7 +172,9 @@ def test_the_nuisance_is_projected_out_by_ridge_regression(monkeypatch):
     precision = np.diag(rng.uniform(1, 9, size))
     monkeypatch.setattr(shares, "friction_prior", lambda *_: (precision, precision @ value))
     found, used = Forks(error, columns, np.array([1.0, 2.0])), np.array([True, False, True])
-    rows = project(found, model, weights, used, fold_of(used, np.arange(3), 20))
+    rows = project(
+        found, model, weights, used, fold_of(used, np.arange(3), np.zeros((3, 20), int)), np.zeros((3, 20), int)
+    )
     weight = np.sqrt(weighed(found, used))[used]
     wide = lambda a: (weight[..., None] * a[used]).reshape(-1, a.shape[-1])  # noqa: E731
     nuisance, own = np.split(wide(columns), [size], axis=1)
@@ -199,10 +201,21 @@ def test_friction_is_free_in_the_span_of_known_laws(bench):
 
 
 def test_folds_are_neighbours_and_pieces_where_there_are_few():
-    assert fold_of(np.ones(10, bool), np.arange(10), 3)[:, 0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert fold_of(np.ones(10, bool), np.arange(10), np.zeros((10, 3), int))[:, 0].tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+        3,
+        3,
+        4,
+        4,
+    ]
     used = np.array([True, False, True, True])
-    assert fold_of(used, np.arange(4), 2)[used][:, 0].tolist() == [0, 1, 2]
-    assert fold_of(np.ones(1, bool), np.zeros(1, int), 8)[0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert fold_of(used, np.arange(4), np.zeros((4, 2), int))[used][:, 0].tolist() == [0, 1, 2]
+    assert fold_of(np.ones(1, bool), np.zeros(1, int), np.arange(8)[None] // 2)[0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_recordings_of_one_motion_are_left_out_together():
@@ -213,13 +226,33 @@ def test_recordings_of_one_motion_are_left_out_together():
     late = again(one)
     late[150:] = np.nan
     state, used = np.stack([one, two, again(one), three, late, two]), np.array([True] * 5 + [False])
-    motion = motions(state, used)
+    motion = motions(state, used, np.arange(6))
     assert motion[:5].tolist() == [0, 1, 0, 3, 0]
-    assert fold_of(used, motion, 1)[used, 0].tolist() == [0, 1, 0, 2, 0]
+    assert fold_of(used, motion, np.zeros((6, 1), int))[used, 0].tolist() == [0, 1, 0, 2, 0]
     used[3] = False
-    part = fold_of(used, motions(state, used), 8)
+    part = fold_of(used, motions(state, used, np.arange(6)), np.tile(np.arange(8) // 2, (6, 1)))
     assert part[0].tolist() == part[2].tolist() == part[4].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
+
+
+def test_the_pieces_of_a_recording_are_one_motion_and_lie_at_their_times():
+    rng = np.random.default_rng(0)
+    state, used = rng.normal(size=(3, 50, 2)), np.ones(3, bool)
+    assert motions(state, used, np.array([0, 0, 1])).tolist() == [0, 0, 1]
+    t = np.stack([np.arange(50) * 0.1, 5.0 + np.arange(50) * 0.1, np.arange(50) * 0.1])
+    data = Dataset(t, t[..., None], t[..., None], np.ones(t.shape, bool))
+    assert times(t[:, ::10], data, np.array([0, 0, 1]), 2).tolist() == [[0] * 5, [1] * 5, [0, 0, 0, 1, 1]]
+
+
+def test_what_happens_at_one_moment_of_every_recording_is_no_law():
+    """A force in the second fifth of each of six recordings: seen on recordings left out, not on times left out."""
+    rng = np.random.default_rng(0)
+    fold, block = np.repeat(np.arange(6), 100), np.tile(np.repeat(np.arange(5), 20), 6)
+    x = np.where(block == 1, 1.0, 0.0)[:, None] * rng.normal(size=(600, 1))
+    e = 3.0 * x[:, 0] + 0.1 * rng.normal(size=600)
+    rows = Rows(e, x, fold, block, 1.0, np.zeros(0))
+    told = [share(rows, slice(0, 1), np.ones(1), at_any_time=any_time)[1] for any_time in (False, True)]
+    assert told[0] > 0.9 and abs(told[1]) < 1e-6
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

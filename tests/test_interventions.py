@@ -103,7 +103,7 @@ def test_report_and_page_name_the_file(tmp_path):
     entry = _touch(TOUCH, ("a.csv", "b.csv"))
     write_json(tmp_path / "report.json", {"interventions": [entry]})
     (read,) = json.loads((tmp_path / "report.json").read_text())["interventions"]
-    told = {"file": "b.csv", "joint": 1, "from_s": 1.2, "to_s": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
+    told = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
     assert read == told
     text = page({"effects": [], "interventions": [entry]})
     assert all(word in text for word in ("Touches from outside", "train/b.csv", "−0.60 ± 0.10 N m"))

@@ -15,6 +15,7 @@ from planted_table import score, table
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnose.outcome import Intervention
 from nnap_em.effects import AbstractEffect
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss
 from nnap_em.effects.base import JointEffect, a
@@ -26,6 +27,7 @@ from nnap_em.effects.sensor import SensorBias, SensorDelay, SensorScale
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.report.diagnosis import _touch
 from nnap_em.systems import specs
 from nnap_em.systems.arm import TwoLinkArm
 
@@ -347,6 +349,9 @@ def test_the_log_ratio_is_1_where_the_effect_is_gone_and_worse_is_told():
 def test_touches_are_held_against_the_truth():
     one = {"file": "a.csv", "joint": 1, "from": 1.0, "to": 1.4, "size": 0.7}
     shifted = one | {"from": 1.05, "to": 1.45, "size": 0.5}
+    assert set(_touch(Intervention(0, 1, 0, 9, 1.0, 1.4, 0.7, 0.1, "N m"), ("a.csv",))) >= set(
+        one
+    )  # as a report has them
     record = _record([], [], interventions=[shifted, one | {"size": -0.7}, one | {"joint": 2}])
     record["truth"]["touches"] = [one, one | {"file": "b.csv"}]
     assert score(record, {}).touches == (2, 1, 2)

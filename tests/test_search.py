@@ -211,10 +211,9 @@ def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it():
     law, other = _screened(_law("motor_gain")), _screened(_law("dead_zone"))
     law = law._replace(share=Share(0.8, 0.5, (0.8, 0.8, -0.6)))
     members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
-    screen = Screen((law, other), Projected(np.zeros(2), np.eye(2)), members)
-    (told,) = _disputed(screen, ShareRule())
+    (told,) = _disputed((law, other), members, ShareRule())
     assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
-    assert not _disputed(screen, LikelihoodRule())
+    assert not _disputed((law, other), members, LikelihoodRule())
 
 
 @pytest.mark.parametrize(("rest", "tried"), [(0.4, ["rest"]), (0.2, ["others"])])

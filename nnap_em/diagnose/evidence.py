@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..data.dataset import Dataset
 from ..effects import Candidate
@@ -40,6 +40,8 @@ class Question(NamedTuple):
     """Sequences that are followed."""
     rows: int
     """Of the whole recording, of which `data` may be a part."""
+    pieces: tuple[int, ...] = ()
+    """Of which recording every sequence is a piece; empty: each is one."""
     left: float = 1.0
     """Squared open-loop error of the model over that of the declared one."""
 
@@ -57,6 +59,11 @@ class Question(NamedTuple):
     def readings(self) -> int:
         """Number of readings."""
         return readings(self.data)
+
+    @property
+    def recording(self) -> Int[np.ndarray, " seq"]:
+        """Number of the recording of every sequence."""
+        return np.asarray(self.pieces) if self.pieces else np.arange(len(self.data.t))
 
 
 class Share(NamedTuple):

@@ -71,6 +71,8 @@ class Finding(NamedTuple):
     """What was learned of its form: the function itself, or what is left beside a law."""
     shape: Shape | None = None
     """What the curve looks like."""
+    left: bool = False
+    """Whether the curve is what is left beside the law."""
 
 
 def findings(closed: Closed) -> list[Finding]:
@@ -90,12 +92,10 @@ def findings(closed: Closed) -> list[Finding]:
             f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
         )
         rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
-        learned = drawn or rest
-        form = shape(learned) if learned else None
-        formed = form.words if drawn and form else ""
-        sentence = ": ".join(filter(None, (words(key_of(effect)), numbers_told, formed)))
-        if rest is not None and form is not None:
-            left = f"{np.ptp(rest.mean):.2g} {rest.unit}: {form.words}"
+        form, remains = (shape(one) if one else None for one in (drawn, rest))
+        sentence = ": ".join(filter(None, (words(key_of(effect)), numbers_told, form.words if form else "")))
+        if rest is not None and remains is not None:
+            left = f"{np.ptp(rest.mean):.2g} {rest.unit}: {remains.words}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
         evidence = {
             "log_likelihood_gain": found.gain,
@@ -103,7 +103,9 @@ def findings(closed: Closed) -> list[Finding]:
             "held_out_gain": found.held_out,
             "share_of_error": found.share,
         }
-        out.append(Finding(effect, parameters, evidence, found.equivalent, sentence, learned, form))
+        beside = drawn is None and rest is not None
+        told = Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest, form or remains, beside)
+        out.append(told)
     return out
 
 

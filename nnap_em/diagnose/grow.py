@@ -33,6 +33,8 @@ class Loop(NamedTuple):
     rule: AbstractRule
     effort: Effort
     say: Say
+    pieces: tuple[int, ...] = ()
+    """Of which recording every sequence is a piece; empty: each is one."""
 
     @property
     def longest(self) -> int:
@@ -60,7 +62,7 @@ def asked(loop: Loop, now: Hypothesis, every: Dataset) -> tuple[Question, Bool[n
     smoother = before.smoother
     posterior = e_step(now.model, every, smoother, key=before.state.key)
     whole = np.asarray(kept(posterior, every))
-    question = Question(loop.bare, now, posterior.state, every, whole, rows)
+    question = Question(loop.bare, now, posterior.state, every, whole, rows, loop.pieces)
     if whole.all():
         return question, whole
     dof = len(now.model.system.coordinates)
@@ -100,6 +102,12 @@ def grow(loop: Loop, now: Hypothesis, first: int, length: int, state: EMState | 
         state = run(now.model)
     except FitError:  # a looser filter keeps a track that a tight one loses
         state = run(eqx.tree_at(lambda m: m.log_q, now.model, now.model.log_q + LOOSER))
+    if length == loop.longest and np.isfinite(before.state.top).sum() > np.isfinite(state.top).sum():
+        try:  # tracks that the model without it keeps are lost: from looser noise, as above
+            other = run(eqx.tree_at(lambda m: m.log_q, state.best, cast(StateSpaceModel, state.best).log_q + LOOSER))
+            state = other if ahead(other, state) > 0 else state
+        except FitError:
+            pass
     reach = f"{length * before.rig.dt:.2f} s"
     loop.say(f"  fitted over {reach} in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
     return state

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from ..data.dataset import Dataset
 from ..em.build import measure_scales
 from ..em.identify import Identified
+from ..em.loop import FitError
 from .outcome import Intervention
 from .residual import Names, Residual, names_of, residual
 
@@ -60,6 +61,8 @@ class Bell(NamedTuple):
 
 def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.ndarray, "seq time column"]:
     """Means over bells of `rows` rows; NaN where one does not fit."""
+    if not a.size:
+        return a
     kernel = np.hanning(rows + 2)[1:-1]
     over = lambda a: np.apply_along_axis(np.convolve, 1, a, kernel / kernel.sum(), "same")  # noqa: E731
     known = np.isfinite(a)
@@ -168,7 +171,7 @@ def touches(
     felt in the same state at other moments, is at least `bar` standard deviations.  `least`: sizes [N m, or N] below
     which nothing is told.
     """
-    known = found.valid & np.isfinite(found.state).all(axis=-1)
+    known = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
     force = np.where(known[..., None], found.force, np.nan)
     force[:, 0] = np.nan  # of the start, which nothing before it tells
     here, apart = places(found._replace(valid=known), names, dt), max(1, round(APART / dt))
@@ -191,11 +194,18 @@ def touches(
             reach = np.asarray(lengths)[:, None] // 2  # of a bell: what stands beside it feels the same push
             sure = np.where((here.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(found.t[i, first]), float(found.t[i, last])
-            touch = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j))
+            touch = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
             again = any(_overlap(touch, other) for other in out)
             if not again and repeated(means[k], here, int(at), apart) < REPEATED:
                 out.append(touch)
-    return tuple(sorted(out, key=_order))
+    return tuple(sorted((t for t in out if not any(_again(t, other, apart) for other in out)), key=_order))
+
+
+def _again(touch: Intervention, other: Intervention, apart: int) -> bool:
+    """Whether another push on the same joint is so near that both are a swing of the machine."""
+    if (touch.sequence, touch.joint) != (other.sequence, other.joint) or touch is other:
+        return False
+    return max(touch.first - other.last, other.first - touch.last) < apart
 
 
 def _order(touch: Intervention) -> tuple[int, int, int]:
@@ -254,7 +264,9 @@ def without(
         if not restart:
             runs = [run for run in runs if run[1] == 0]
         pieces += [run for run in runs if run[2] - run[1] >= min(least, valid.sum())]
-    rows = max((b - a for _, a, b in pieces), default=0)
+    if not pieces:
+        return data, ()
+    rows = max(b - a for _, a, b in pieces)
     t, u, y, _ = (np.asarray(part) for part in data)
 
     def cut(values: Float[np.ndarray, "seq time *column"], filler: float | None) -> np.ndarray:
@@ -275,8 +287,12 @@ def untouched(
     """
     used, found, pieces = data, interventions(fitted, data), tuple(range(len(data.t)))
     for _ in range(ROUNDS if found else 0):
-        used, pieces = without(data, found, fitted.rig.dt, restart=not fitted.rig.start)
-        fitted = fit(used)
+        cut, of = without(data, found, fitted.rig.dt, restart=not fitted.rig.start)
+        try:
+            fitted = fit(cut) if of else fitted
+        except FitError:  # what is left is too little: the fit that saw the touches stays
+            break
+        used, pieces = (cut, of) if of else (used, pieces)
         more = [t for t in interventions(fitted, data, MORE * LEVEL) if not any(_overlap(t, old) for old in found)]
         if not more:
             break

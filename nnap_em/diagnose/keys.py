@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, flat
 from ..model.state_space import StateSpaceModel
 
 Key = tuple[str, int | None, str | None, tuple[str, ...]]
@@ -40,6 +40,8 @@ def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
 def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the law whose place `effect` takes: of the same key in another form, as one that repeats each turn."""
     alike = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
+    if effect.named:  # of a law with a form the richer one alone
+        alike = (i for i in alike if flat(effect).size > flat(model.effects[i]).size)
     return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
 
 

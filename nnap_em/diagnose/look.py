@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Candidate, fields, flat
@@ -168,7 +169,7 @@ def _shortlist(
     unnamed = [entry for entry in fresh if not law(entry).named and entry[0] > top][:2]
     beside = other + [e for e in fresh if rest_of(law(e), model) is not None and not any(e is o for o in other)]
     unnamed = (beside + [entry for entry in unnamed if not any(entry is b for b in beside)])[:2]
-    close = [entry for entry in named if entry[0] > effort.close * top]
+    close = [e for e in named if e[0] > effort.close * top and not any(e is other for other in unnamed)]
     return [screened for _, screened in unnamed + close[: effort.shortlist - len(unnamed)]]
 
 
@@ -210,13 +211,16 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     around = surroundings(rig, now.model, data, question.path, question.rows)
     candidates = proposals(around, now.model.effects)
     screen = rule.screen(question, candidates)
-    seen = tuple(s for s in screen.screened if s.candidate.start.visible(around))
-    ranked = _best_of_kind(seen, rule, readings)
+    present = {key_of(effect) for effect in now.model.effects}
+    law = lambda one: one.candidate.start  # noqa: E731
+    seen = [s for s in screen.screened if law(s).visible(around)]
+    fresh = [s for s in seen if key_of(law(s)) not in present or replaced(law(s), now.model) is not None]
+    ranked = _best_of_kind(fresh, rule, readings)
     worthy = functools.partial(rule.worth_a_refit, readings=readings)
     entries = _shortlist(ranked, now.model, worthy, effort)
     length = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     told = tuple((key_of(s.candidate.start), promise) for promise, s in ranked)
-    step = Step(length, told, (), None, len(candidates), rule.promises, _disputed(screen, rule))
+    step = Step(length, told, (), None, len(candidates), rule.promises, _disputed(seen, screen.members, rule))
     if not entries:
         return Look(step, screen, [], [])
     null = _refitted(now, question.path, question, rule, effort)
@@ -224,9 +228,8 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
         entries += _more_starts(entries, screen, effort)
     # what is left of a law is not to be explained by another cause: its own rest comes first
     bar = rule.near * ranked[0][0]
-    first = [
-        s for s in entries if rest_of(s.candidate.start, now.model) is not None and rule.promise(s, readings) > bar
-    ]
+    forms = [s for s in entries if any(of(law(s), now.model) is not None for of in (rest_of, replaced))]
+    first = [s for s in forms if rule.promise(s, readings) > bar]
     tried, sound = [], []
     for group in (first, [s for s in entries if not any(s is f for f in first)]):
         if not sound:
@@ -260,15 +263,17 @@ def _is_sound(case: Case, rule: AbstractRule, say: Say) -> bool:
     return False
 
 
-def _disputed(screen: Screen, rule: AbstractRule) -> tuple[Disputed, ...]:
+def _disputed(
+    every: Sequence[Screened], members: Bool[np.ndarray, "fold seq"], rule: AbstractRule
+) -> tuple[Disputed, ...]:
     """The best of every kind on which a few recordings disagree with the others."""
     best: dict[Key, Disputed] = {}
-    for one in filter(rule.disputed, screen.screened):
+    for one in filter(rule.disputed, every):
         if not seeded(one.candidate, one.coefficients).possible():
             continue
         key, folds = key_of(one.candidate.start), np.asarray(one.share.folds if one.share else ())
-        against = screen.members[folds < 0].any(axis=0)
-        if 2 * against.sum() >= screen.members.any(axis=0).sum():
+        against = members[folds < 0].any(axis=0)
+        if 2 * against.sum() >= members.any(axis=0).sum():
             continue  # no odd ones: it is no law
         told = Disputed(
             key, one.share.least if one.share else 0.0, tuple(map(int, np.flatnonzero(against))), -float(folds.min())

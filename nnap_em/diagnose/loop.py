@@ -5,8 +5,9 @@ The search measures and proposes; whether something is believed is asked of a ru
 
 import functools
 import math
-from typing import cast
+from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
@@ -95,14 +96,16 @@ def _rivals(sound: list[Case], rule: AbstractRule, system: AbstractSystem) -> li
     def unlike(case: Case) -> bool:
         """A law of another kind, and of other signals."""
         its = set(case.effect.signals(system))
-        return case.effect.name != best.effect.name and bool(own and its) and own.isdisjoint(its)
+        alike = case.effect.named and case.effect.name == best.effect.name
+        return not alike and bool(own and its) and own.isdisjoint(its)
 
     rivals = [case for case in others if unlike(case) and rule.multistep and rule.even(best, case)]
     return [best, *rivals] if rivals else []
 
 
-def _names(now: Hypothesis) -> frozenset[Key]:
-    return frozenset(key_of(effect) for effect in now.model.effects)
+def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
+    """The laws and their forms."""
+    return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
 
 
 def _found(rule: AbstractRule, winner: Case, seen: Look, behind: dict[Key, float], length: int) -> Found:
@@ -212,12 +215,12 @@ def close_the_loop(
 
     def closed(rule: AbstractRule) -> Closed:
         try:
-            return close(Loop(before, stages, data, rule, effort, say))
+            return close(Loop(before, stages, data, rule, effort, say, pieces))
         except FitError as lost:
             say(f"  with what was added no sequence can be followed to its end ({lost}); nothing is kept of it")
             return Closed(before, before, (), ())
 
-    before = fitted(data)
+    before, pieces = fitted(data), ()
     if rule is not None:
         return closed(rule)
     if white_readings(data):

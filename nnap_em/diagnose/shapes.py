@@ -159,6 +159,9 @@ def _polished(
         place[free] = part
         return place
 
+    free = [i for i in free if low[i] < high[i]]
+    if not free:
+        return start
     found = least_squares(lambda part: left(moved(part)), start[free], bounds=(low[free], high[free]), max_nfev=15)
     return moved(found.x)
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..data.dataset import Dataset
 from ..effects import Candidate, flat
-from ..em.multistep import Forks, forks, weighed
+from ..em.multistep import Forks, forks, starts, weighed
 from ..em.weights import Weights
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -76,11 +76,15 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
     return precision, pull
 
 
-def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"]) -> Int[np.ndarray, " seq"]:
-    """A number for every motion: recordings that repeat it are no evidence of each other, and share it."""
+def motions(
+    state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"], recording: Int[np.ndarray, " seq"]
+) -> Int[np.ndarray, " seq"]:
+    """A number for every motion: recordings that repeat it are no evidence of each other, and share it; so do the
+    pieces of a recording.
+    """
     size = np.nanmean(state[used] ** 2, axis=(0, 1)) + 1e-12
     scaled = state / np.sqrt(size)
-    motion = np.arange(len(state))
+    motion = recording.copy()
     for i, j in itertools.combinations(np.flatnonzero(used), 2):
         apart, own = np.nanmean((scaled[i] - scaled[j]) ** 2), np.nanmean(scaled[[i, j]] ** 2)
         if apart < REPEATS * own:
@@ -88,19 +92,27 @@ def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, "
     return motion
 
 
-def fold_of(
-    used: Bool[np.ndarray, " seq"], motion: Int[np.ndarray, " seq"], starts: int
+def times(
+    clock: Float[np.ndarray, "seq start"], data: Dataset, recording: Int[np.ndarray, " seq"], count: int
 ) -> Int[np.ndarray, "seq start"]:
-    """The part that every fork belongs to: neighbouring motions together, or pieces of the only ones."""
+    """Which of `count` equal times of its recording every fork belongs to."""
+    t = np.where(np.asarray(data.valid), np.asarray(data.t), np.nan)
+    low, high = (np.array([of(t[recording == r]) for r in recording])[:, None] for of in (np.nanmin, np.nanmax))
+    return np.clip((count * (clock - low) / (high - low + 1e-12)).astype(int), 0, count - 1)
+
+
+def fold_of(
+    used: Bool[np.ndarray, " seq"], motion: Int[np.ndarray, " seq"], quarter: Int[np.ndarray, "seq start"]
+) -> Int[np.ndarray, "seq start"]:
+    """The part that every fork belongs to: neighbouring motions together, or quarters of the only ones."""
     different, first = np.unique(motion[used], return_index=True)
     order = np.zeros(used.size, int)
     for rank, i in enumerate(np.argsort(first)):
         order[motion == different[i]] = rank
     count = different.size
     if count >= 3:
-        return np.repeat((order * min(FOLDS, count) // count)[:, None], starts, axis=1)
-    pieces = np.arange(starts) * 4 // starts
-    return order[:, None] * 4 + pieces[None, :]
+        return np.repeat((order * min(FOLDS, count) // count)[:, None], quarter.shape[1], axis=1)
+    return order[:, None] * 4 + quarter
 
 
 def project(
@@ -109,15 +121,16 @@ def project(
     weights: Weights,
     used: Bool[np.ndarray, " seq"],
     part: Int[np.ndarray, "seq start"],
+    time: Int[np.ndarray, "seq start"],
 ) -> Rows:
     """Errors and candidates without what friction, parameters and the effects in the model can say of them.
 
-    `part` is that which every fork belongs to.
+    `part` and `time` are those which every fork belongs to.
     """
     weight = weighed(found, used)
     keep = weight > 0
     fold = np.broadcast_to(part[:, :, None, None], keep.shape)[keep]
-    block = np.broadcast_to((np.arange(keep.shape[1]) * BLOCKS // keep.shape[1])[None, :, None, None], keep.shape)[keep]
+    block = np.broadcast_to(time[:, :, None, None], keep.shape)[keep]
     root = np.sqrt(weight[keep])
     error, columns = root * found.error[keep], root[:, None] * found.columns[keep]
     count = weights.nodes.size + weights.prior.size
@@ -157,14 +170,17 @@ def removed(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
+    recording: Int[np.ndarray, " seq"],
 ) -> Removed:
     """What every candidate removes of the multi-step errors of `model`, which is `base` and its effects."""
     track = tracks(model, path, each(_inputs, model, data))
     extra = candidate_columns(eqx.tree_at(lambda m: m.unknown, base, model.unknown), candidates, track)
     found = forks(model, weights, path, data, extra)
     state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
-    part = fold_of(used, motions(state[..., : 2 * len(model.system.coordinates)], used), found.error.shape[1])
-    rows = project(found, model, weights, used, part)
+    motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
+    clock = np.asarray(data.t)[:, starts(model, data)]
+    part = fold_of(used, motion, times(clock, data, recording, 4))
+    rows = project(found, model, weights, used, part, times(clock, data, recording, BLOCKS))
     timed = ["time" in c.start.signals(model.system) for c in candidates]
     told = [
         share(rows, here, _ridge(c), at_any_time=not clock)
@@ -187,7 +203,16 @@ def share_test(question: Question, candidates: Sequence[Candidate]) -> Screen:
     """The share of the multi-step error that every candidate removes."""
     now = question.now
     weights = now.m_step.weights(now.model)
-    told = removed(question.bare.model, now.model, weights, candidates, question.path, question.data, question.used)
+    told = removed(
+        question.bare.model,
+        now.model,
+        weights,
+        candidates,
+        question.path,
+        question.data,
+        question.used,
+        question.recording,
+    )
     screened = tuple(
         Screened(
             candidate,

@@ -30,8 +30,8 @@ class Difference(Worth):
     @lazy
     def error(self) -> float:
         """Squared open-loop error of the one over that of the other."""
-        (a, _), (b, _) = (asked(self.loop, each, self.loop.data) for each in (self.less, self.full))
-        return open_loop_error(a, b, self.loop.data, a.used & b.used)
+        (a, one), (b, other) = (asked(self.loop, each, self.loop.data) for each in (self.less, self.full))
+        return open_loop_error(a, b, self.loop.data, one & other)
 
 
 def needed(loop: Loop, now: Hypothesis, state: EMState | None) -> tuple[Hypothesis, EMState | None]:

@@ -180,10 +180,10 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     kept = untold(rig, system, data)
     if kept:
-        declared, unit = rig.parameters[kept], parameter_unit(kept)
+        told = ", ".join(f"{name} = {rig.parameters[name]} {parameter_unit(name)}" for name in kept)
         text = (
-            "nothing drives the machine, so that its motion cannot tell the scale of all masses and friction: "
-            f"{kept} is kept as declared ({declared} {unit}), and all else is relative to it"
+            "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
+            f"kept as declared is {told}, and all else is relative to that"
         )
         yield Finding(_mark(True, False), "scale", text)
 

@@ -73,6 +73,11 @@ def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Gri
     return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
 
 
+def starts(model: StateSpaceModel, data: Dataset) -> Int[np.ndarray, " start"]:
+    """Rows at which all sequences are forked."""
+    return _grid(model, data).starts(data.t.shape[1])
+
+
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
     """Places in y of what is looked at: measured coordinates, or where there are none whatever is measured."""
     dof = len(model.system.coordinates)
@@ -119,7 +124,8 @@ def _wide(
 ) -> tuple[Local, Float[Array, "seq time state"]]:
     """The model along its paths, with slopes as wide as predictions err, through the exact transition; and that."""
     dof = len(model.system.coordinates)
-    rms = jnp.sqrt(jnp.nanmean(path.mean[..., dof : 2 * dof] ** 2, axis=(0, 1)))
+    rates = jnp.where(data.valid[..., None], path.mean[..., dof : 2 * dof], jnp.nan)
+    rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
     spread = jnp.concatenate([WIDE * HORIZONS[0] * rms, WIDE * rms, jnp.full(path.mean.shape[-1] - 2 * dof, 1e-6)])
     wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
     here = locals_along(model, prior, wide, data, CUBATURE)

@@ -13,6 +13,7 @@ from ..diagnose.findings import Finding, advice, disputes, entry, friction_chang
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.outcome import Closed, Intervention, Step
 from ..diagnose.residual import Names, Residual, names_of, residual, tests
+from ..effects import catalogue
 from ..em.identify import FrictionTable, friction_table
 from ..em.predict import GIVEN, Prediction
 from ..storage.files import replace_text
@@ -71,7 +72,7 @@ def write_diagnosis(
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
         "disagreements": [d._asdict() for d in disputed],
-        "cannot_tell": [_place(key) for key in rivals],
+        "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
         "next": advice(found, disputed, rivals),
     }
     write_json(out / "report.json", document)
@@ -136,7 +137,7 @@ def _found_pictures(found: list[Finding]) -> list[Picture]:
         if finding.curve is not None:
             name = words(key_of(finding.effect))
             rest = f"What is left of {name}, a function of {finding.curve.signal}"
-            title = rest if finding.effect.named else f"The learned {name}"
+            title = rest if finding.left else f"The learned {name}"
             caption = "With its 90 % band, without its mean."
             out.append(picture("found", title, caption, effect_figure(finding.curve)))
     return out
@@ -164,8 +165,8 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
 
 
 def _touch(touch: Intervention, files: Sequence[str]) -> dict[str, Any]:
-    kept = ("joint", "from_s", "to_s", "size", "std", "unit")
-    return {"file": files[touch.sequence], **{name: getattr(touch, name) for name in kept}}
+    told = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
+    return {"file": files[touch.sequence], **told, "size": touch.size, "std": touch.std, "unit": touch.unit}
 
 
 def _told(key: Key, gain: float) -> dict[str, Any]:

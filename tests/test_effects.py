@@ -115,7 +115,7 @@ MAKE = {
 """The catalogue's effect of a simulator's one."""
 CRUDE = {
     **{"payload_step": 0.02, "presliding_friction": 0.03, "sensor_delay": 0.02},
-    **{"joint_flexibility": 0.03, "backlash": 0.03, "hard_stop": 0.02},
+    **{"joint_flexibility": 0.03, "backlash": 0.03, "hard_stop": 0.05},
 }
 """Share of the effect that may be missed where the model is approximate on purpose; .01 elsewhere."""
 CASES = plant.STRONG | plant.UNNAMED

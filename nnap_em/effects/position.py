@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import Candidate, JointEffect, Scalar, a, contact, known, one, pair
+from .base import Candidate, JointEffect, Scalar, a, known, one, pair
 
 
 class PlaceEffect(JointEffect):
@@ -47,7 +47,9 @@ class TorsionalSpring(PlaceEffect):
             make = partial(cls.of, joint=j)
             bend = 0.3 * size / reach
             spread = make(size, size * reach, bend, bend / reach)
-            out.append(Candidate(make(0.0, 0.0, 0.0, 0.0), (make(0.1 * size, 0.0, 0.0, 0.0),), spread))
+            # its moment at zero too: where friction may not be even, nothing else would hold a rest that is far off
+            probes = make(0.1 * size, 0.0, 0.0, 0.0), make(0.0, 0.1 * size * reach, 0.0, 0.0)
+            out.append(Candidate(make(0.0, 0.0, 0.0, 0.0), probes, spread))
         return out
 
     def values(self):
@@ -170,8 +172,10 @@ class HardStop(PlaceEffect):
 
     def force(self, scene, memory):
         q, v = self.own(scene.q), self.own(scene.v)
+        # the damper holds back too while the joint leaves: one that lets go has no slope there, and a fit is lost
         deep = jnp.maximum(q - self.upper, 0.0) - jnp.maximum(self.lower - q, 0.0)
-        return self.at(scene, -contact(deep, v, jnp.exp(self.stiffness), jnp.exp(self.damping), 0.01))
+        touch = jnp.tanh(jnp.abs(deep) / 0.01)
+        return self.at(scene, -jnp.exp(self.stiffness) * deep - jnp.exp(self.damping) * touch * v)
 
 
 class EddyBrake(JointEffect):

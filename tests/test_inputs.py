@@ -186,3 +186,17 @@ def test_a_cogging_of_less_than_a_period_is_a_spring(plain):
         if c.start.joint == 2
     }
     assert coggings[4.0] and not coggings[3.0] and coggings[24.0]
+
+
+def test_a_spring_is_straight_beyond_what_was_seen():
+    """A cubic that bends down would push outward there without end."""
+    model = build(RIG, _recorded_blank(), key=jax.random.key(0)).model
+    spring = catalogue["torsional_spring"].of(1.0, 0.1, 0.2, -0.8, 1.0, joint=2)
+    free = catalogue["torsional_spring"].of(1.0, 0.1, 0.2, -0.8, joint=2)
+
+    def pull(effect, angle):
+        full = with_effects(model, (effect,))
+        return float(effect.force(full.scene(jnp.asarray([0.0, angle, 0.0, 0.0]), Inputs.held(jnp.zeros(2))), None)[1])
+
+    assert pull(spring, 0.9) == pytest.approx(pull(free, 0.9)) and pull(spring, -0.9) == pytest.approx(pull(free, -0.9))
+    assert pull(spring, 1.0) == pull(spring, 5.0) and pull(free, 5.0) > 50.0

@@ -37,6 +37,8 @@ class TorsionalSpring(PlaceEffect):
     """[N m/rad^2]"""
     cube: Scalar
     """[N m/rad^3]"""
+    reach: Scalar = known(default=1e3)
+    """Angle [rad] beyond which it was never seen: from there on it is straight, and never pushes outward more."""
 
     @classmethod
     def candidates(cls, around):
@@ -44,7 +46,7 @@ class TorsionalSpring(PlaceEffect):
         for j in around.joints:
             reach = max(abs(around.low[j - 1]), abs(around.high[j - 1]), 1e-3)
             size = float(around.torque[j - 1]) / reach
-            make = partial(cls.of, joint=j)
+            make = lambda *numbers, j=j, reach=reach: cls.of(*numbers, 1.2 * reach, joint=j)  # noqa: E731
             bend = 0.3 * size / reach
             spread = make(size, size * reach, bend, bend / reach)
             # its moment at zero too: where friction may not be even, nothing else would hold a rest that is far off
@@ -69,7 +71,9 @@ class TorsionalSpring(PlaceEffect):
         return self.slope + angle * (2 * self.square + 3 * angle * self.cube)
 
     def force(self, scene, memory):
-        return self.at(scene, self._pull(self.own(scene.q)))
+        angle = self.own(scene.q)
+        inside = jnp.clip(angle, -self.reach, self.reach)
+        return self.at(scene, self._pull(inside) - jnp.maximum(self._slope(inside), 0.0) * (angle - inside))
 
 
 class Cogging(PlaceEffect):

@@ -19,6 +19,15 @@ jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # the many small programs are what takes the time
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs():
+    """After each file, programs are let go where they hold many memory maps: a worker runs hundreds of tests."""
+    yield
+    from nnap_em.numerics.programs import let_go
+
+    let_go(20_000)
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder `shared` beside the checkout: logs and the paper, which are not part of the repository."""

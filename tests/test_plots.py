@@ -60,9 +60,10 @@ def drawn(request):
     values = {name: [0.1, 1.0] for name in names.measured}
     error = {"horizons_s": [0.1, 1.0], "before": values, "after": values}
     both = {"before": pair, "after": pair}
+    lost = _found(dof, used=np.arange(SEQUENCES) > 0)
     return dof, {
-        "residual": residual_figure(found, names, _found(dof, 1)),
-        "innovation": innovation_figure(found, names, found),
+        "residual": residual_figure(lost, names, _found(dof, 1)),
+        "innovation": innovation_figure(lost, names, found),  # the two may follow different sequences
         "error": error_figure(error, names),
         "friction": friction_figure({"before": table, "after": table}, names, visited),
         "prediction": prediction_figure(found.t[0], found.state[0], names, both, 1.0),

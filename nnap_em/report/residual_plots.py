@@ -239,7 +239,7 @@ def innovation_figure(before: Residual, names: Names, after: Residual | None = N
     return figure
 
 
-_Errors = Sequence[tuple[Float[np.ndarray, "seq time"], str, str]]
+_Errors = Sequence[tuple[Float[np.ndarray, "_ _"], str, str]]  # the two fits may follow different sequences
 """Of one channel: innovations, colour and name of every side."""
 
 

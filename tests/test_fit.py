@@ -1,6 +1,7 @@
 """What a fit accepts, refuses and goes back from, by numbers: nothing is smoothed here."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -152,6 +153,31 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
     assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(("apart", "slope"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.1), (2.0, 30.0)])
+def test_recordings_that_disagree_widen_a_posterior_but_not_its_prior(monkeypatch, apart, slope):
+    """One parameter of prior precision 1 and likelihood precision L: H = 1 + 1 / (1 / L + V), in closed form."""
+    errors = apart * np.array([1.0, -1.0, 2.0, -2.0])[:, None, None, None] * np.ones((4, 3, 2, 1))
+    nodes = RULE.weights(MODEL).nodes.size
+    columns = slope * np.concatenate([np.zeros((*errors.shape, nodes)), np.ones((*errors.shape, 1))], axis=-1)
+    told, every, likelihood = Forks(errors, columns, np.ones(2)), np.ones(4, bool), 50.0
+    monkeypatch.setattr(multistep, "forks", lambda *_: told)
+    found = multistep.robust_hessian(MODEL, RULE, PATH, DATA, every, jnp.full((1, 1), 1.0 + likelihood))
+    weight = multistep.weighed(told, every)
+    scores = slope * np.sum(weight * errors, axis=(1, 2, 3))
+    spread = np.sum((scores - scores.mean()) ** 2) * 4 / 3 / (1.0 + slope**2 * weight.sum()) ** 2
+    assert float(found[0, 0]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
+    assert 1.0 <= float(found[0, 0]) <= 1.0 + likelihood + 1e-9
+
+
+class _CurvatureRule(NamedTuple):
+    """An M-step whose curvature is the mass of the model that it was given."""
+
+    prior: object
+
+    def __call__(self, model, posterior, data):
+        return None, SimpleNamespace(hessian=jnp.full((1, 1), _mass(model)))
+
+
 def _finished(monkeypatch, error):
     """The outcome, `error` being that of a sequence by whether its model was fitted to it; the last one is lost."""
     used, masks = np.array([True, True, True, False]), []
@@ -167,22 +193,24 @@ def _finished(monkeypatch, error):
 
     fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
     fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
-    fakes["robust_hessian"] = lambda model, *_: jnp.full((1, 1), _mass(model))
+    fakes["robust_hessian"] = lambda *args: 2 * args[-1]
     for name, value in fakes.items():
         monkeypatch.setattr(identify, name, value)
     smoother = SimpleNamespace(tolerant=lambda: None)
-    fitted = Identified(None, _state([0.0]), RULE, None, smoother)
+    rule = _CurvatureRule(RULE.prior)
+    fitted = Identified(None, _state([0.0])._replace(hessian=jnp.ones((1, 1))), rule, None, smoother)
     return fitted, identify.finished(fitted, DATA), masks
 
 
 def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch):
     fitted, after, masks = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2)
     assert after.model is fitted.model
-    assert float(after.state.hessian[0, 0]) == _mass(fitted.model)
+    assert float(after.state.hessian[0, 0]) == 2.0
     np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
 
 
 def test_a_finish_that_helps_what_is_left_out_is_done_on_all(monkeypatch):
     _, after, masks = _finished(monkeypatch, lambda fitted: 0.5)
     np.testing.assert_array_equal(masks[-1], [True, True, True, False])
-    assert _mass(after.model) == float(after.state.hessian[0, 0]) == 10.0 + len(masks)
+    assert _mass(after.model) == 10.0 + len(masks)
+    assert float(after.state.hessian[0, 0]) == 2 * _mass(after.model), "the curvature is that of other weights"

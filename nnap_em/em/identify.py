@@ -138,10 +138,13 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     for out in range(PARTS):
         trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out))
         falls.append(ratio(before, errors(trial, fitted.m_step.prior, path, data), part == out))
-    better = np.mean(falls) < 1 - FALLS
-    model = finish(fitted.model, fitted.m_step, path, data, used) if better else fitted.model
-    hessian = robust_hessian(model, fitted.m_step, path, data, used, fitted.state.hessian)
-    return fitted._replace(state=fitted.state._replace(best=model, hessian=hessian))
+    if np.mean(falls) < 1 - FALLS:
+        model = finish(fitted.model, fitted.m_step, path, data, used)
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
+        _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
+        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
+    hessian = robust_hessian(fitted.model, fitted.m_step, path, data, used, fitted.state.hessian)
+    return fitted._replace(state=fitted.state._replace(hessian=hessian))
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

@@ -11,10 +11,10 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnose import shares
+from nnap_em.diagnose.case import open_loop_error
 from nnap_em.diagnose.columns import candidate_columns, tracks
 from nnap_em.diagnose.evidence import Question
 from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.look import open_loop_error
 from nnap_em.diagnose.propose import surroundings
 from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, motions, project, share, times
 from nnap_em.effects import catalogue

@@ -7,8 +7,8 @@ import plant
 import pytest
 from helpers import around, declared_model
 
+from nnap_em.diagnose.case import held_out_gain
 from nnap_em.diagnose.keys import key_of, replaced
-from nnap_em.diagnose.look import held_out_gain
 from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
 from nnap_em.model.state_space import with_effects
@@ -51,7 +51,7 @@ def test_one_sequence_has_nothing_to_be_held_out(bench, monkeypatch):
     def refit(*_, **__):
         raise AssertionError("refitted to the very sequence that should judge")
 
-    monkeypatch.setattr("nnap_em.diagnose.look.refit", refit)
+    monkeypatch.setattr("nnap_em.diagnose.case.refit", refit)
     null, full = (Trial(model, rule, path, gain * np.ones(4), np.eye(rule.prior.size)) for gain in (0.0, 100.0))
     assert held_out_gain(null, full, data, np.array([False, True, False, False])) == 0.0
     with pytest.raises(AssertionError, match="very sequence"):

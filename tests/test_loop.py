@@ -12,7 +12,7 @@ import pytest
 from nnap_em import close_the_loop, findings, load, read_logs, read_rig, specs
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnose import look
+from nnap_em.diagnose.case import held_out_gain
 from nnap_em.diagnose.findings import Finding, verdict
 from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
@@ -132,7 +132,7 @@ def test_held_out_gain_counts_what_was_left_out_of_the_fit(monkeypatch):
         gain = 0.0 if model == "null" else 1.0
         return Trial(model, m_step, path, 50.0 + gain * np.where(mask, 100.0, 2.0), None)
 
-    monkeypatch.setattr(look, "refit", refit)
+    monkeypatch.setattr("nnap_em.diagnose.case.refit", refit)
     null, full = (Trial(name, None, None, None, None) for name in ("null", "full"))
-    assert look.held_out_gain(null, full, data, USED) == pytest.approx(2.0 * USED.sum(), rel=1e-12)
+    assert held_out_gain(null, full, data, USED) == pytest.approx(2.0 * USED.sum(), rel=1e-12)
     np.testing.assert_array_equal(np.sum(left_out, axis=0), 2 * USED)  # each once, in either fit

@@ -52,8 +52,8 @@ from nnap_em.commands import common
 from nnap_em.numerics import parallel
 common.set_up()
 seen = []
-run = parallel._run
-parallel._run = lambda function, mesh, *rest: seen.append(mesh.size) or run(function, mesh, *rest)
+program = parallel._program
+parallel._program = lambda function: lambda mesh, *rest: seen.append(mesh.size) or program(function)(mesh, *rest)
 for count in (1, 3, 5, 8):
     out = parallel.each(lambda common, one: common * one, jnp.asarray(2.0), jnp.arange(float(count)))
     assert jnp.array_equal(out, 2.0 * jnp.arange(float(count)))

@@ -87,10 +87,12 @@ def test_without_noise_the_prediction_is_the_integral():
 def test_groups_of_sequences_change_nothing(monkeypatch):
     """Smoothed and predicted one at a time where there is no room for more."""
     case, groups = _case(q=1e-2, information=1.0), []
-    run = parallel._run
-    monkeypatch.setattr(
-        parallel, "_run", lambda f, mesh, group, *rest: groups.append(group) or run(f, mesh, group, *rest)
-    )
+    program = parallel._program
+
+    def counted(function):
+        return lambda mesh, group, *rest: groups.append(group) or program(function)(mesh, group, *rest)
+
+    monkeypatch.setattr(parallel, "_program", counted)
 
     def found():
         groups.clear()

@@ -14,22 +14,12 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnose import grow, loop, undo
 from nnap_em.diagnose import look as search
 from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
+from nnap_em.diagnose.case import Case, significance, trimmed
 from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Share
 from nnap_em.diagnose.grow import Loop
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import covered, key_of, rest_of
-from nnap_em.diagnose.look import (
-    EFFORT,
-    Case,
-    Look,
-    _best_of_kind,
-    _disputed,
-    _named_first,
-    _shortlist,
-    look,
-    significance,
-    trimmed,
-)
+from nnap_em.diagnose.look import EFFORT, Look, _best_of_kind, _disputed, _named_first, _shortlist, look
 from nnap_em.diagnose.outcome import Closed, Step
 from nnap_em.diagnose.propose import seeded
 from nnap_em.diagnose.refit import Trial
@@ -235,7 +225,7 @@ def test_the_rest_of_a_law_comes_before_other_causes(monkeypatch, rest, tried):
     monkeypatch.setattr(search, "_is_sound", lambda *_: True)
     monkeypatch.setattr(search, "surroundings", lambda *_: None)
     monkeypatch.setattr(search, "proposals", lambda *_: [])
-    monkeypatch.setattr(search, "_refitted", lambda *_: None)
+    monkeypatch.setattr(search, "refitted", lambda *_, **__: None)
     now = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
     question = Question(BARE, now, None, DATA, np.ones(6, bool), 9)
     monkeypatch.setattr(ShareRule, "screen", lambda *_: Screen((), Projected(np.zeros(0), np.eye(0))))

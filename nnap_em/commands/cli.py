@@ -149,6 +149,7 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
         fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
+        fits.add_argument("--profile", action="store_true", help="print a table of the programs that were compiled")
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)
@@ -186,7 +187,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()
-            return importlib.import_module(f".{args.command}", __package__).run(args, say) or 0
+            run = importlib.import_module(f".{args.command}", __package__).run
+            with common.profiled(getattr(args, "profile", False)):
+                return run(args, say) or 0
     except KeyboardInterrupt as stopped:
         _say(str(stopped) or "stopped; the files that were written are whole")
         return 130

@@ -25,6 +25,7 @@ from ..em.loop import FitError
 from ..em.predict import GIVEN
 from ..em.store import fingerprint
 from ..numerics.parallel import use_every_device
+from ..numerics.profile import profiling
 from ..portable.export import ExportError
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
@@ -65,6 +66,17 @@ def set_up() -> None:
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
+
+
+@contextmanager
+def profiled(wanted: bool) -> Iterator[None]:
+    """Print what was compiled inside, also of a run that was stopped."""
+    with profiling() as profile:
+        try:
+            yield
+        finally:
+            if wanted:
+                print(profile)
 
 
 class Bench(NamedTuple):

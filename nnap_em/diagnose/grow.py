@@ -15,10 +15,11 @@ from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
 from ..em.mstep import kept
 from ..model.state_space import StateSpaceModel
 from .accept import SHORT, AbstractRule
+from .case import Case, trimmed
 from .evidence import Question
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of
-from .look import Case, Effort, Say, trimmed
+from .look import Effort, Say
 
 Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 """State of a fit at the end of each of its horizons, and the sequences used."""

@@ -7,18 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..data.dataset import Dataset
-from ..effects import AbstractEffect, Candidate, fields, flat
-from ..em.multistep import JUDGED, errors, finish, ratio
 from ..model.state_space import StateSpaceModel
-from ..numerics.gaussian import Gaussian
 from .accept import AbstractRule
-from .evidence import Evidence, Question, Screen, Screened, lazy
-from .hypothesis import Hypothesis, blocks
+from .case import Case, Fit, refitted
+from .evidence import Question, Screen, Screened
 from .keys import Key, covered, key_of, replaced, rest_of, words
 from .outcome import Disputed, Step
 from .propose import extended, proposals, seeded, surroundings
-from .refit import Trial, refit
+from .refit import Trial
 from .screen import unlike
 
 Say = Callable[[str], None]
@@ -46,46 +42,6 @@ class Effort(NamedTuple):
 EFFORT = Effort()
 
 
-def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:
-    """Squared open-loop error of one model over that of another, each along its own smoothed paths."""
-    before, after = (errors(one.model, one.m_step.prior, one.path, data, JUDGED) for one in (null, full))
-    return ratio(before, after, used)
-
-
-class Case(Evidence):
-    """A candidate after its refit, and all that a rule may ask of it."""
-
-    def __init__(self, screened: Screened, trial: Trial, null: Trial, after: Hypothesis, question: Question):
-        self.screened, self.trial, self.null, self.question = screened, trial, null, question
-        self.after = after.refitted(trial.model)
-        """The model with it."""
-        self.readings = question.readings
-        used = question.used
-        self.gain = float(np.sum((np.nan_to_num(trial.loglik, nan=-1e9) - null.loglik)[used]))
-        named = screened.candidate.start.named
-        self.directions = len(fields(screened.candidate.start)) if named else screened.directions
-
-    @property
-    def effect(self) -> AbstractEffect:
-        """The effect with its fitted parameters."""
-        return self.trial.model.effects[-1]
-
-    @lazy
-    def certainty(self) -> float:
-        """Standard deviations from none."""
-        return significance(self.screened.candidate, self.after, self.trial.hessian)
-
-    @lazy
-    def held_out(self) -> float:
-        """Gain on sequences left out [nat]."""
-        return held_out_gain(self.null, self.trial, self.question.data, self.question.used)
-
-    @lazy
-    def error(self) -> float:
-        """Squared open-loop error over that without it."""
-        return open_loop_error(self.null, self.trial, self.question.data, self.question.used)
-
-
 class Look(NamedTuple):
     """The outcome."""
 
@@ -94,52 +50,6 @@ class Look(NamedTuple):
     sound: list[Case]
     """What may be believed, best first."""
     tried: list[Case]
-
-
-def significance(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
-    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
-
-    Half its square is the log-likelihood that would be lost without the effect, to second order.
-    """
-    model, prior = now.model, now.m_step.prior
-    here = blocks(model, now.m_step)[place]
-    none = np.asarray(flat(candidate.start))
-    strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
-    std, cov = np.asarray(prior.std)[here], np.linalg.inv(np.asarray(hessian))
-    cut = cov.shape[0] - prior.size
-    cov = (cov[cut:, cut:][here, here] * np.outer(std, std))[np.ix_(strong, strong)]
-    away = (np.asarray(flat(model.effects[place])) - none)[strong]
-    return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
-
-
-def trimmed(gain) -> float:
-    """Sum of gains with a sixth at either end replaced by the mean of the others."""
-    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
-    cut = gain.size // 6
-    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
-
-
-def held_out_gain(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) -> float:
-    """Gain on sequences after a fit to others, halves or quarters in turn; a sixth at either end is trimmed.
-
-    A track that is lost in one of the two fits says nothing of the effect, and would say it loudest.  The noise stays
-    that of the whole fit: a few sequences can be followed more closely than they deserve.  From one sequence nothing
-    can be held out, and the gain is 0.
-    """
-    index = np.flatnonzero(used)
-    if index.size < 2:
-        return 0.0
-    gains = []
-    folds = 2 if index.size >= 16 else min(4, index.size)
-    for fold in range(folds):
-        mask = used.copy()
-        mask[index[fold::folds]] = False
-        logliks = [
-            refit(t.model, t.m_step, t.path, data, mask, passes=passes, noise=False).loglik[used & ~mask]
-            for t in (null, full)
-        ]
-        gains.append(logliks[1] - logliks[0])
-    return trimmed(np.concatenate(gains))
 
 
 def _best_of_kind(every: Sequence[Screened], rule: AbstractRule, readings: int) -> list[tuple[float, Screened]]:
@@ -188,21 +98,13 @@ def _more_starts(chosen: Sequence[Screened], screen: Screen, effort: Effort) -> 
     return more
 
 
-def _try(question: Question, screened: Screened, null: Trial, rule: AbstractRule, effort: Effort) -> Case:
+def _try(question: Question, screened: Screened, null: Trial, fit: Fit) -> Case:
     """A candidate in the model, refitted."""
     effect, now = seeded(screened.candidate, screened.coefficients), question.now
     place = replaced(effect, now.model)
     full = (now if place is None else now.without(place)).plus(effect, screened.candidate)
     path = extended(full.model, question.path, question.data)
-    return Case(screened, _refitted(full, path, question, rule, effort), null, full, question)
-
-
-def _refitted(now: Hypothesis, path: Gaussian, question: Question, rule: AbstractRule, effort: Effort) -> Trial:
-    """Some passes from a path; where the rule looks at multi-step errors, these are fitted before and after."""
-    fit = functools.partial(finish, data=question.data, used=question.used)
-    model = fit(now.model, now.m_step, path) if rule.multistep else now.model
-    trial = refit(model, now.m_step.early(), path, question.data, question.used, passes=effort.passes)
-    return trial._replace(model=fit(trial.model, trial.m_step, trial.path)) if rule.multistep else trial
+    return Case(screened, full, path, null, question, fit)
 
 
 def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) -> Look:
@@ -223,7 +125,8 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     step = Step(length, told, (), None, len(candidates), rule.promises, _disputed(seen, screen.members, rule))
     if not entries:
         return Look(step, screen, [], [])
-    null = _refitted(now, question.path, question, rule, effort)
+    fit = functools.partial(refitted, passes=effort.passes, multistep=rule.multistep)
+    null = fit(now, question.path, question)
     if data.t.shape[1] < question.rows:  # over a long horizon a start that is far off loses every track
         entries += _more_starts(entries, screen, effort)
     # what is left of a law is not to be explained by another cause: its own rest comes first
@@ -233,18 +136,18 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     tried, sound = [], []
     for group in (first, [s for s in entries if not any(s is f for f in first)]):
         if not sound:
-            cases = _refits(question, group, null, rule, effort, say)
+            cases = _refits(question, group, null, rule, fit, say)
             tried, sound = tried + cases, [case for case in cases if _is_sound(case, rule, say)]
     by_worth = functools.partial(sorted, key=lambda case: -rule.worth(case))
     step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in by_worth(tried)))
     return Look(step, screen, _named_first(by_worth(sound), rule), by_worth(tried))
 
 
-def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, effort: Effort, say: Say) -> list[Case]:
+def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, fit: Fit, say: Say) -> list[Case]:
     """Some candidates refitted, the best of every kind."""
     best: dict[Key, Case] = {}
     for screened in group:
-        case = _try(question, screened, null, rule, effort)
+        case = _try(question, screened, null, fit)
         key = key_of(case.effect)
         values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
         promise = rule.promise(screened, question.readings)

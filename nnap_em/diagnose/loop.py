@@ -23,12 +23,13 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
 from ..systems import AbstractSystem
 from .accept import AbstractRule, LikelihoodRule, ShareRule
+from .case import Case, trimmed
 from .evidence import Question
 from .grow import Loop, Stages, asked, beginning, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
 from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
-from .look import EFFORT, Case, Effort, Look, Say, alike, look, trimmed
+from .look import EFFORT, Effort, Look, Say, alike, look
 from .outcome import Closed, Step
 from .quantised import quantised
 from .refit import refit
@@ -114,7 +115,7 @@ def _found(rule: AbstractRule, winner: Case, seen: Look, behind: dict[Key, float
     rivals = {key_of(case.effect): case for case in seen.sound if case is not winner}
     far = {key for key, case in rivals.items() if not rule.even(winner, case)}
     far |= {key for key, lost in behind.items() if lost > EVEN}
-    told = [key for key, part in alike(winner, seen.screen) if part < SAME or part * winner.gain < EVEN]
+    told = [key for key, part in alike(winner, seen.screen) if part < SAME or 0.0 < part * winner.gain < EVEN]
     same = dict.fromkeys(key for key in (*told, *rivals) if key not in far)
     share = winner.screened.share
     return Found(

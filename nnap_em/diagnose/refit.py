@@ -23,6 +23,9 @@ from ..smoother.kalman import CUBATURE, kalman_filter, rts
 from ..smoother.posterior import Posterior
 from ..storage.journal import HERE, step
 
+HELD = 3
+"""Passes with the noise as it is."""
+
 
 class Trial(NamedTuple):
     """A model after some passes."""
@@ -59,20 +62,22 @@ def refit(
 ) -> Trial:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
 
-    Without `noise` the process and reading noise stay as they are.
+    The process and reading noise stay as they are in the first passes, while the path finds its place: what they would
+    then be taught is the way there, and they are slow to forget. Without `noise` they stay in all.
     """
-    rule = eqx.tree_at(lambda r: r.stride, m_step, m_step.stride if noise else jnp.zeros_like(m_step.stride))
-    core = rule.core(model)
+    still = eqx.tree_at(lambda r: r.stride, m_step, jnp.zeros_like(m_step.stride))
+    core = m_step.core(model)
 
-    def program(core: Core, path: Gaussian):
+    def program(rule: ScoringMStep, core: Core, path: Gaussian):
         here = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
         posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (here, path))
         following, hessian, _ = rule.advance(core, here, posterior, read, jnp.asarray(used))
         return following, steady, posterior.loglik, hessian
 
     best, stride, here, goal = None, 1.0, core, core
-    for _ in range(passes):
-        proposal, smoothed, loglik, hessian = program(core, path)
+    for count in range(passes):
+        rule = m_step if noise and count >= HELD else still
+        proposal, smoothed, loglik, hessian = program(rule, core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:
             if best is None or total > best[0]:
@@ -85,4 +90,4 @@ def refit(
         core = jax.tree.map(way, here, goal)
     assert best is not None
     _, core, loglik, hessian, path = best
-    return Trial(rule.whole(model, core), m_step, path, loglik, hessian)
+    return Trial(m_step.whole(model, core), m_step, path, loglik, hessian)

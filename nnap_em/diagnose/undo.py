@@ -8,11 +8,11 @@ import numpy as np
 from ..em.identify import finished
 from ..em.loop import EMState
 from ..model.state_space import StateSpaceModel
+from .case import open_loop_error, significance, trimmed
 from .evidence import Worth, lazy, readings
 from .grow import Loop, ahead, asked, grow
 from .hypothesis import Found, Hypothesis
 from .keys import key_of, words
-from .look import open_loop_error, significance, trimmed
 from .outcome import Closed, Step
 from .refit import refit
 

@@ -9,6 +9,7 @@ gathered after it, within a machine by a copy, among processes (`jax.distributed
 
 import contextlib
 import contextvars
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -78,30 +79,37 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         index = np.minimum(np.arange(whole), count - 1)
         batch = jax.tree.map(lambda a: a[index], batch)
     if mesh is None:
-        out = _run(function, None, group, common, batch)
+        out = _program(function)(None, group, common, batch)
     else:
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
-        out = _gather(_run(function, mesh, group, common, batch))
+        out = _gather(_program(function)(mesh, group, common, batch))
     return jax.tree.map(lambda a: a[:count], out) if whole > count else out
 
 
-@eqx.filter_jit
-def _run(function: Callable, mesh: Mesh | None, group: int, common, batch):
-    numbers, rest = eqx.partition(common, eqx.is_array)
+@functools.cache
+def _program(function: Callable) -> Callable:
+    """A program under the name of what it does."""
 
-    def share(numbers, batch):
-        """What one device does."""
-        one = jax.vmap(lambda one: function(eqx.combine(numbers, rest), one))
-        size = jax.tree.leaves(batch)[0].shape[0]
-        if size == group:
-            return one(batch)
-        out = jax.lax.map(one, jax.tree.map(lambda a: a.reshape(size // group, group, *a.shape[1:]), batch))
-        return jax.tree.map(lambda a: a.reshape(size, *a.shape[2:]), out)
+    def run(mesh: Mesh | None, group: int, common, batch):
+        numbers, rest = eqx.partition(common, eqx.is_array)
 
-    if mesh is None:
-        return share(numbers, batch)
-    # check_vma is about scans that begin with what all devices share and go on with their own: all of ours do
-    return jax.shard_map(share, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)(numbers, batch)
+        def share(numbers, batch):
+            """What one device does."""
+            one = jax.vmap(lambda one: function(eqx.combine(numbers, rest), one))
+            size = jax.tree.leaves(batch)[0].shape[0]
+            if size == group:
+                return one(batch)
+            out = jax.lax.map(one, jax.tree.map(lambda a: a.reshape(size // group, group, *a.shape[1:]), batch))
+            return jax.tree.map(lambda a: a.reshape(size, *a.shape[2:]), out)
+
+        if mesh is None:
+            return share(numbers, batch)
+        # check_vma is about scans that begin with what all devices share and go on with their own: all of ours do
+        specs = {"in_specs": (P(), P(AXIS)), "out_specs": P(AXIS)}
+        return jax.shard_map(share, mesh=mesh, check_vma=False, **specs)(numbers, batch)
+
+    run.__name__ = run.__qualname__ = f"each{function.__name__}"
+    return eqx.filter_jit(run)
 
 
 def _place(tree, sharding: NamedSharding):

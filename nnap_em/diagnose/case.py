@@ -1,0 +1,121 @@
+"""A candidate after its refit: what was measured of it, and what a rule may still ask to be measured."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..data.dataset import Dataset
+from ..effects import AbstractEffect, Candidate, fields, flat
+from ..em.multistep import JUDGED, errors, finish, ratio
+from ..numerics.gaussian import Gaussian
+from .evidence import Evidence, Question, Screened, lazy
+from .hypothesis import Hypothesis, blocks
+from .refit import Trial, refit
+
+Fit = Callable[[Hypothesis, Gaussian, Question], Trial]
+"""Some passes from a path, on the sequences of a question."""
+
+
+def refitted(now: Hypothesis, path: Gaussian, question: Question, *, passes: int, multistep: bool) -> Trial:
+    """Some passes from a path; with `multistep`, the errors of many steps are fitted before and after."""
+
+    def finished(model, m_step, path):
+        return finish(model, m_step, path, question.data, question.used) if multistep else model
+
+    model = finished(now.model, now.m_step, path)
+    trial = refit(model, now.m_step.early(), path, question.data, question.used, passes=passes)
+    return trial._replace(model=finished(trial.model, trial.m_step, trial.path))
+
+
+def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:
+    """Squared open-loop error of one model over that of another, each along its own smoothed paths."""
+    before, after = (errors(one.model, one.m_step.prior, one.path, data, JUDGED) for one in (null, full))
+    return ratio(before, after, used)
+
+
+class Case(Evidence):
+    """A candidate, refitted from `path`, beside `null`: the model without it after as many passes."""
+
+    def __init__(
+        self,
+        screened: Screened,
+        begun: Hypothesis,
+        path: Gaussian,
+        null: Trial,
+        question: Question,
+        fit: Fit,
+    ):
+        self.screened, self.null, self.question = screened, null, question
+        self.trial = fit(begun, path, question)
+        self.after = begun.refitted(self.trial.model)
+        """The model with it."""
+        self.readings = question.readings
+        self.gain = float(np.sum((np.nan_to_num(self.trial.loglik, nan=-1e9) - null.loglik)[question.used]))
+        named = screened.candidate.start.named
+        self.directions = len(fields(screened.candidate.start)) if named else screened.directions
+
+    @property
+    def effect(self) -> AbstractEffect:
+        """The effect with its fitted parameters."""
+        return self.trial.model.effects[-1]
+
+    @lazy
+    def certainty(self) -> float:
+        """Standard deviations from none."""
+        return significance(self.screened.candidate, self.after, self.trial.hessian)
+
+    @lazy
+    def held_out(self) -> float:
+        """Gain on sequences left out [nat]."""
+        return held_out_gain(self.null, self.trial, self.question.data, self.question.used)
+
+    @lazy
+    def error(self) -> float:
+        """Squared open-loop error over that without it."""
+        return open_loop_error(self.null, self.trial, self.question.data, self.question.used)
+
+
+def significance(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
+    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
+
+    Half its square is the log-likelihood that would be lost without the effect, to second order.
+    """
+    model, prior = now.model, now.m_step.prior
+    here = blocks(model, now.m_step)[place]
+    none = np.asarray(flat(candidate.start))
+    strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
+    std, cov = np.asarray(prior.std)[here], np.linalg.inv(np.asarray(hessian))
+    cut = cov.shape[0] - prior.size
+    cov = (cov[cut:, cut:][here, here] * np.outer(std, std))[np.ix_(strong, strong)]
+    away = (np.asarray(flat(model.effects[place])) - none)[strong]
+    return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
+
+
+def trimmed(gain) -> float:
+    """Sum of gains with a sixth at either end replaced by the mean of the others."""
+    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
+    cut = gain.size // 6
+    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+
+
+def held_out_gain(null: Trial, full: Trial, data: Dataset, used, passes: int = 3) -> float:
+    """Gain on sequences after a fit to others, halves or quarters in turn; a sixth at either end is trimmed.
+
+    A track that is lost in one of the two fits says nothing of the effect, and would say it loudest.  The noise stays
+    that of the whole fit: a few sequences can be followed more closely than they deserve.  From one sequence nothing
+    can be held out, and the gain is 0.
+    """
+    index = np.flatnonzero(used)
+    if index.size < 2:
+        return 0.0
+    gains = []
+    folds = 2 if index.size >= 16 else min(4, index.size)
+    for fold in range(folds):
+        mask = used.copy()
+        mask[index[fold::folds]] = False
+        logliks = [
+            refit(t.model, t.m_step, t.path, data, mask, passes=passes, noise=False).loglik[used & ~mask]
+            for t in (null, full)
+        ]
+        gains.append(logliks[1] - logliks[0])
+    return trimmed(np.concatenate(gains))

@@ -1,0 +1,56 @@
+"""Where the time of a run goes: the programs that were traced, lowered and compiled or loaded."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+
+STAGES = {
+    "/jax/core/compile/jaxpr_trace_duration": "trace",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
+    "/jax/core/compile/backend_compile_duration": "compile",
+}
+"""What JAX tells of a program; to load one that was kept counts as compiling it."""
+
+
+class Profile:
+    """The count and the seconds of every stage of every program so far."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        self._began = time.perf_counter()
+
+    def __call__(self, event: str, seconds: float, **told: object) -> None:
+        """One event, as `jax.monitoring` tells it."""
+        if event in STAGES:
+            name = str(told.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
+            self.spent[name][STAGES[event]].append(seconds)
+
+    def __str__(self) -> str:
+        whole = time.perf_counter() - self._began
+        row = lambda *cells: "{:32.32} {:>8} {:>9} {:>9} {:>9}".format(*cells)  # noqa: E731
+        tell = lambda stages: [f"{sum(stages[stage]):.2f}" for stage in STAGES.values()]  # noqa: E731
+        order = sorted(self.spent.items(), key=lambda one: -sum(map(sum, one[1].values())))
+        programs = [(name, stages) for name, stages in order if stages["compile"]]
+        every = {stage: [s for _, stages in order for s in stages[stage]] for stage in STAGES.values()}
+        return "\n".join(
+            [
+                row("program", "count", "trace s", "lower s", "compile s"),
+                *(row(name, len(stages["compile"]), *tell(stages)) for name, stages in programs),
+                row(f"all of {len(programs)} names", len(every["compile"]), *tell(every)),
+                f"{whole:.1f} s in all; a program within another is traced with it, and counts in both",
+            ]
+        )
+
+
+@contextmanager
+def profiling() -> Iterator[Profile]:
+    """The programs that this process makes inside."""
+    profile = Profile()
+    jax.monitoring.register_event_duration_secs_listener(profile)
+    try:
+        yield profile
+    finally:
+        jax.monitoring.unregister_event_duration_listener(profile)

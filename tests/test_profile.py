@@ -1,0 +1,26 @@
+"""The table of compiled programs."""
+
+import jax
+import jax.numpy as jnp
+
+from nnap_em.numerics.profile import profiling
+
+
+def test_programs_are_counted_once_for_every_shape_and_by_name():
+    @jax.jit
+    def cube(x):
+        return x**3
+
+    with profiling() as profile:
+        for size in (3, 4, 3):
+            cube(jnp.ones(size))
+    assert len(profile.spent["cube"]["compile"]) == 2
+    assert any(line.split()[:2] == ["cube", "2"] for line in str(profile).splitlines())
+    assert all(seconds >= 0 for stages in profile.spent.values() for spent in stages.values() for seconds in spent)
+
+
+def test_what_is_compiled_afterwards_is_not_counted():
+    with profiling() as profile:
+        pass
+    jax.jit(lambda x: x + 1)(jnp.arange(7))
+    assert not profile.spent

@@ -28,6 +28,7 @@ class Numbers(Evidence):
     certainty: float = 12.0
     held_out: float = 50.0
     error: float = 0.6
+    unseen: float = 0.7
 
 
 def _screened(
@@ -111,6 +112,11 @@ def test_a_share_is_the_smaller_one_where_recordings_agree(screened, promise):
 )
 def test_a_refit_keeps_what_the_share_promised(numbers, believed):
     assert ShareRule().sound(Numbers(_screened(), **numbers)).believed == believed
+
+
+@pytest.mark.parametrize(("unseen", "believed"), [(0.7, True), (0.92, False), (9.7, False)])
+def test_what_the_refit_gains_has_to_be_there_on_motions_that_it_left_out(unseen, believed):
+    assert ShareRule().believes(Numbers(_screened(), error=0.2, unseen=unseen)).believed == believed
 
 
 def test_recordings_disagree_where_what_would_be_enough_harms_some():

@@ -92,6 +92,38 @@ def test_certainty_is_the_marginal_of_the_posterior():
         assert significance(_candidate(name), now, hessian, place) == pytest.approx(expected, rel=1e-9)
 
 
+def test_halves_share_no_motion():
+    """Two motions in quarters of their times, three apart, and one that runs through all."""
+    quarters = np.repeat(np.array([[1, 0, 1, 0], [0, 1, 0, 0]], bool), 4, axis=0)  # the last sequence is not used
+    apart = np.eye(3, dtype=bool)
+    screen = Screen((), Projected(np.zeros(0), np.eye(0)))
+    for members, halves in ((quarters, [[0, 2], [1]]), (apart, [[0, 2], [1]]), (np.ones((4, 3), bool), [])):
+        assert [np.flatnonzero(half).tolist() for half in screen._replace(members=members).halves] == halves
+
+
+def test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other(monkeypatch):
+    """The error of a half is that of a fit which knows its sequences over one which does not: 1 and 3."""
+    fitted, used = [], np.array([True, True, True, True, True, False])
+
+    def fit(now, path, question):
+        fitted.append((now, tuple(np.flatnonzero(question.used))))
+        return Trial(now.model, RULE, fitted[-1], np.zeros(6), None)
+
+    def error(null, full, data, out):
+        assert (null.path[0], full.path[0]) == (BARE, now)
+        assert null.path[1] == full.path[1] == tuple(np.flatnonzero(used & ~out))
+        return float(np.flatnonzero(out)[0] + 1)
+
+    monkeypatch.setattr("nnap_em.diagnose.case.open_loop_error", error)
+    now = _with("motor_gain")
+    question = Question(BARE, BARE, None, DATA, used, 9)
+    halves = (np.array([1, 1, 0, 0, 0, 1], bool), np.array([0, 0, 1, 1, 1, 0], bool))
+    null = Trial(MODEL, RULE, None, np.zeros(6), None)
+    found = Case(_screened(_law("motor_gain", 1.0)), now, None, null, question, fit, halves)
+    assert found.unseen == 2.0
+    assert len(fitted) == 5  # once on all, twice on either half
+
+
 def test_a_sixth_is_trimmed_at_either_end():
     gains = np.array([np.nan, 1e9, 1.0, 2.0, 3.0, 4.0])
     assert trimmed(gains) == pytest.approx(6 * 2.5)

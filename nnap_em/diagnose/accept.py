@@ -219,8 +219,8 @@ class ShareRule(AbstractRule):
         return self._falls(evidence.error)
 
     def believes(self, evidence: Evidence) -> Verdict:
-        """Whether the error falls."""
-        return self._falls(evidence.error)
+        """Whether the error falls on what was left out of the refit, too."""
+        return self._falls(evidence.unseen, " of motions left out")
 
     def even(self, winner: Evidence, rival: Evidence) -> bool:
         """Nearly the same share."""
@@ -230,6 +230,7 @@ class ShareRule(AbstractRule):
         """Whether the error falls."""
         return self._falls(worth.error)
 
-    def _falls(self, error: float) -> Verdict:
+    def _falls(self, error: float, where: str = "") -> Verdict:
         """Of the refitted model, which is not linear and has to say it all, most of the share."""
-        return Verdict(1.0 - error >= self.near * self.least, f"removes {1.0 - error:.0%} of the open-loop error")
+        gone = 1.0 - error
+        return Verdict(gone >= self.near * self.least, f"removes {gone:.0%} of the open-loop error{where}")

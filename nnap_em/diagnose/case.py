@@ -1,8 +1,9 @@
 """A candidate after its refit: what was measured of it, and what a rule may still ask to be measured."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Candidate, fields, flat
@@ -44,8 +45,11 @@ class Case(Evidence):
         null: Trial,
         question: Question,
         fit: Fit,
+        halves: Sequence[Bool[np.ndarray, " seq"]] = (),
     ):
         self.screened, self.null, self.question = screened, null, question
+        self._refits = lambda question: (fit(question.now, question.path, question), fit(begun, path, question))
+        self._halves = halves
         self.trial = fit(begun, path, question)
         self.after = begun.refitted(self.trial.model)
         """The model with it."""
@@ -73,6 +77,16 @@ class Case(Evidence):
     def error(self) -> float:
         """Squared open-loop error over that without it."""
         return open_loop_error(self.null, self.trial, self.question.data, self.question.used)
+
+    @lazy
+    def unseen(self) -> float:
+        """The same on either half of the motions after fits to the other, their mean."""
+        data, used = self.question.data, self.question.used
+        parts = [(used & half, used & ~half) for half in self._halves]
+        if not parts or not all(part.any() for pair in parts for part in pair):
+            return self.error
+        fits = [(out, self._refits(self.question._replace(used=rest))) for out, rest in parts]
+        return float(np.mean([open_loop_error(*both, data, out) for out, both in fits]))
 
 
 def significance(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:

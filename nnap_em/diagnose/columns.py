@@ -80,6 +80,10 @@ def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
     return numbers._replace(system=base.system, map=base.unknown)
 
 
+BUNCH = 4
+"""Stacks are filled up to a multiple of this, so that one more probe is no other program."""
+
+
 def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractEffect]]:
     """Probes of one structure stacked, so that each structure is compiled once."""
     places: dict = {}
@@ -87,19 +91,21 @@ def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractE
         places.setdefault(jax.tree.structure(probe), []).append(i)
 
     def stack(*leaves):  # by NumPy: a stack of many small arrays would be one program for every number of them
-        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+        more = (0, -len(leaves) % BUNCH)
+        whole = np.stack([np.asarray(leaf) for leaf in leaves])
+        return jnp.asarray(np.pad(whole, [more] + [(0, 0)] * (whole.ndim - 1), mode="edge"))
 
     return [(index, jax.tree.map(stack, *(probes[i] for i in index))) for index in places.values()]
 
 
-def _all_columns(common, track: Track) -> list[Columns]:
-    """Columns of all probes: the same program whatever the model has learned meanwhile."""
-    base, stacks = common
+def _stack_columns(common, track: Track) -> Columns:
+    """Columns of a stack of probes: the same program whatever the model has learned meanwhile, and beside what."""
+    base, stack = common
     dof = len(base.system.coordinates)
     q, v = track.middle[:, :dof], track.middle[:, dof:]
     drive, friction = jax.vmap(base.system.drive)(track.inputs.u), jax.vmap(base.unknown)(v)
     scenes = Scene(None, q, v, drive, track.inputs.time, friction, None)  # type: ignore[arg-type]
-    return [jax.vmap(lambda e: _columns(base, e, track, scenes))(stack) for stack in stacks]
+    return jax.vmap(lambda e: _columns(base, e, track, scenes))(stack)
 
 
 def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], track: Track, rows: int = 0) -> Columns:
@@ -110,6 +116,11 @@ def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], tr
     groups, length = _groups([probe for candidate in candidates for probe in candidate.probes]), track.x.shape[1]
     more = [(0, 0), (0, max(0, rows - length))]
     longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
-    found = each(_all_columns, (base, [g for _, g in groups]), jax.tree.map(longer, track))
-    order = np.argsort([i for index, _ in groups for i in index])
-    return jax.tree.map(lambda *a: jnp.concatenate(a, axis=1)[:, order, :length], *found)
+    track, size = jax.tree.map(longer, track), sum(len(index) for index, _ in groups)
+    last = track.acceleration.shape[-1], len(base.measured)
+    force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
+    for index, stack in groups:
+        found = each(_stack_columns, (base, stack), track)
+        for whole, own in ((force, found.force), (reading, found.reading)):
+            whole[:, index] = np.asarray(own)[:, : len(index), :length]
+    return Columns(jnp.asarray(force), jnp.asarray(reading))

@@ -74,7 +74,7 @@ class Share(NamedTuple):
     left_out: float
     """Of that on recordings which its strengths were not fitted to."""
     folds: tuple[float, ...]
-    """Of that on each part of them."""
+    """Of that on each part of them; where it rises, of that on an average part, if that is more."""
     left: float = 1.0
     """Squared error of the model that is asked of, over that of the declared one."""
 
@@ -110,8 +110,16 @@ class Screen(NamedTuple):
 
     screened: tuple[Screened, ...]
     projected: Projected
-    members: Bool[np.ndarray, "fold seq"] = np.zeros((0, 0), bool)
+    members: Bool[np.ndarray, "fold seq"] = np.zeros((1, 0), bool)
     """Sequences that each part left out holds, or pieces of."""
+
+    @property
+    def halves(self) -> tuple[Bool[np.ndarray, " seq"], ...]:
+        """The sequences in two halves that share no part; empty where one part runs through all of them."""
+        first = self.members.argmax(axis=0)
+        order = np.unique(first[self.members.any(axis=0)])
+        halves = tuple(np.isin(first, order[i::2]) & self.members.any(axis=0) for i in range(2))
+        return halves if len(order) > 1 else ()
 
 
 class Worth:
@@ -134,6 +142,9 @@ class Evidence(Worth):
     """Standard deviations of its strengths from none, jointly."""
     held_out: float
     """Gain on sequences that had no part in the fit [nat]."""
+    unseen: float
+    """Squared open-loop error over that without it, on motions that had no part in either fit; on the only one, if
+    there are no others."""
 
 
 def readings(data: Dataset) -> int:

@@ -98,13 +98,13 @@ def _more_starts(chosen: Sequence[Screened], screen: Screen, effort: Effort) -> 
     return more
 
 
-def _try(question: Question, screened: Screened, null: Trial, fit: Fit) -> Case:
+def _try(question: Question, screened: Screened, null: Trial, fit: Fit, halves) -> Case:
     """A candidate in the model, refitted."""
     effect, now = seeded(screened.candidate, screened.coefficients), question.now
     place = replaced(effect, now.model)
     full = (now if place is None else now.without(place)).plus(effect, screened.candidate)
     path = extended(full.model, question.path, question.data)
-    return Case(screened, full, path, null, question, fit)
+    return Case(screened, full, path, null, question, fit, halves)
 
 
 def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) -> Look:
@@ -136,18 +136,18 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
     tried, sound = [], []
     for group in (first, [s for s in entries if not any(s is f for f in first)]):
         if not sound:
-            cases = _refits(question, group, null, rule, fit, say)
+            cases = _refits(question, group, null, rule, fit, screen.halves, say)
             tried, sound = tried + cases, [case for case in cases if _is_sound(case, rule, say)]
     by_worth = functools.partial(sorted, key=lambda case: -rule.worth(case))
     step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in by_worth(tried)))
     return Look(step, screen, _named_first(by_worth(sound), rule), by_worth(tried))
 
 
-def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, fit: Fit, say: Say) -> list[Case]:
+def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, fit: Fit, halves, say: Say) -> list[Case]:
     """Some candidates refitted, the best of every kind."""
     best: dict[Key, Case] = {}
     for screened in group:
-        case = _try(question, screened, null, fit)
+        case = _try(question, screened, null, fit, halves)
         key = key_of(case.effect)
         values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
         promise = rule.promise(screened, question.readings)

@@ -236,6 +236,7 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
 def share(rows: Rows, here: slice, ridge: Float[np.ndarray, " probe"], *, at_any_time: bool = True):
     """Share inside, on what is left out, on every fold, directions and coefficients of some columns together.
 
+    Where the error of a fold rises, it is by a share of what it holds, or of what folds hold on average.
     With `at_any_time`, what is left out is every block of time as well, and the smaller share counts.
     """
     e, x = rows.error, rows.columns[:, here].astype(float)
@@ -266,5 +267,6 @@ def share(rows: Rows, here: slice, ridge: Float[np.ndarray, " probe"], *, at_any
     sums = [out.sum()]
     if at_any_time:
         sums.append(sum(without(rows.block == b) for b in np.unique(rows.block)))
-    folds = out / np.array([np.sum(e[p] ** 2) for p in parts])
+    held = np.array([np.sum(e[p] ** 2) for p in parts])  # a part with hardly any error has little to say against a law
+    folds = out / np.where(out < 0, np.maximum(held, held.mean()), held)
     return float(inside), float(min(sums) / total), folds, directions, c

@@ -28,6 +28,7 @@ from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
 from nnap_em.model.state_space import with_effects
+from nnap_em.numerics.gaussian import Gaussian
 
 MODEL, RULE = slide()
 BARE = Hypothesis(MODEL, RULE)
@@ -119,7 +120,8 @@ def test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other(monkeypatch):
     question = Question(BARE, BARE, None, DATA, used, 9)
     halves = (np.array([1, 1, 0, 0, 0, 1], bool), np.array([0, 0, 1, 1, 1, 0], bool))
     null = Trial(MODEL, RULE, None, np.zeros(6), None)
-    found = Case(_screened(_law("motor_gain", 1.0)), now, None, null, question, fit, halves)
+    path = Gaussian(jnp.zeros((6, 9, 2)), jnp.zeros((6, 9, 2, 2)))
+    found = Case(_screened(_law("motor_gain", 1.0)), now, path, null, question, fit, halves)
     assert found.unseen == 2.0
     assert len(fitted) == 5  # once on all, twice on either half
 

@@ -200,6 +200,16 @@ def test_friction_is_free_in_the_span_of_known_laws(bench):
     assert even @ own @ even > 1e-3 * np.trace(own) / count
 
 
+def test_a_part_with_hardly_any_error_is_harmed_by_what_that_is_of_an_average_one():
+    """A step of 1 that two parts have and the third has not: it would do 2.4 there, where parts hold 1.34 on average."""
+    error, fold = np.array([1.0, 1.0, 1.0, 1.0, -0.1, -0.1]), np.repeat(np.arange(3), 2)
+    rows = Rows(error, np.ones((6, 1)), fold, fold, 1.0, np.zeros(0))
+    folds = share(rows, slice(0, 1), np.zeros(1))[2]
+    assert folds[2] == pytest.approx(-2.4 / (4.02 / 3))
+    own = 2 * 0.45 - 0.45**2  # of one of the full parts, from the mean 0.45 of the others
+    assert folds[0] == pytest.approx(own)
+
+
 def test_folds_are_neighbours_and_pieces_where_there_are_few():
     assert fold_of(np.ones(10, bool), np.arange(10), np.zeros((10, 3), int))[:, 0].tolist() == [
         0,

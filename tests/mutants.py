@@ -528,7 +528,7 @@ MUTANTS = (
     ),
     Mutant(
         "prior of friction on its size",
-        "diagnose/shares.py",
+        "em/shape.py",
         "(np.eye(count) - basis @ basis.T) /",
         "np.eye(count) /",
         "test_forks.py::test_friction_is_free_in_the_span_of_known_laws",

@@ -16,11 +16,12 @@ from nnap_em.diagnose.columns import candidate_columns, tracks
 from nnap_em.diagnose.evidence import Question
 from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.propose import surroundings
-from nnap_em.diagnose.shares import Rows, fold_of, friction_prior, motions, project, share, times
+from nnap_em.diagnose.shares import Rows, fold_of, motions, project, share, times
 from nnap_em.effects import catalogue
 from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, weighed
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
+from nnap_em.em.shape import friction_prior
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 
@@ -201,7 +202,7 @@ def test_friction_is_free_in_the_span_of_known_laws(bench):
 
 
 def test_a_part_with_hardly_any_error_is_harmed_by_what_that_is_of_an_average_one():
-    """A step of 1 that two parts have and the third has not: it would do 2.4 there, where parts hold 1.34 on average."""
+    """A step of 1 that two parts have and the third has not: it harms that by 2.4, where parts hold 1.34 on average."""
     error, fold = np.array([1.0, 1.0, 1.0, 1.0, -0.1, -0.1]), np.repeat(np.arange(3), 2)
     rows = Rows(error, np.ones((6, 1)), fold, fold, 1.0, np.zeros(0))
     folds = share(rows, slice(0, 1), np.zeros(1))[2]

@@ -312,6 +312,24 @@ def test_what_is_not_worth_it_over_the_whole_length_goes_from_the_last_on(monkey
     assert not undo.concluded(_loop([]), now, _emstate(now.model, tops[2]), []).found
 
 
+@pytest.mark.parametrize(
+    ("unseen", "rule", "taken"),
+    [
+        ((0.5, 0.5, 0.5), ShareRule(), "motor_gain"),
+        ((1.5, 0.5, 0.5), ShareRule(), "dead_zone"),
+        ((1.5, 1.5, 0.5), ShareRule(), None),  # the third is worth half of the first
+        ((1.5, 0.5, 0.5), LikelihoodRule(), "motor_gain"),  # looks at nats
+    ],
+)
+def test_one_nearly_as_good_is_believed_where_the_best_is_not(unseen, rule, taken):
+    laws = (_law("motor_gain"), _law("dead_zone"), _spring())
+    cases = [_case(law, gain) for law, gain in zip(laws, (200.0, 190.0, 100.0), strict=True)]
+    for case, own, error in zip(cases, unseen, (0.4, 0.45, 0.7), strict=True):
+        case.__dict__ |= {"_unseen": own, "_error": error, "_held_out": 1e3}
+    found = loop._believed(cases[0], cases, rule, lambda text: None)
+    assert (found and found.effect.name) == taken
+
+
 @pytest.mark.parametrize(("held_out", "added"), [(50.0, ["motor_gain"]), (20.0, [])])
 def test_only_what_the_rule_believes_is_added(monkeypatch, held_out, added):
     """A gain of 100 nats, of which a third must be seen on sequences left out."""

@@ -65,11 +65,11 @@ def _search(
             steps[-1] = seen.step._replace(rivals=tuple(key_of(case.effect) for case in rivals))
             say(f"  cannot tell: {', '.join(map(words, steps[-1].rivals))} explain the same; none is added")
             break
-        winner, further, behind = settle(loop, now, length, seen.sound)
-        key, verdict = key_of(winner.effect), rule.believes(winner)
-        say(f"  best: {words(key)}, worth {rule.worth(winner):.3g}, {verdict.reason}")
-        if not verdict.believed:
+        best, further, behind = settle(loop, now, length, seen.sound)
+        winner = _believed(best, seen.sound, rule, say)
+        if winner is None:
             break
+        key = key_of(winner.effect)
         found = _found(rule, winner, seen, behind, length)
         plain = _plain(question, winner, rule, loop.effort)
         if plain is not None:
@@ -102,6 +102,19 @@ def _rivals(sound: list[Case], rule: AbstractRule, system: AbstractSystem) -> li
 
     rivals = [case for case in others if unlike(case) and rule.multistep and rule.even(best, case)]
     return [best, *rivals] if rivals else []
+
+
+def _believed(best: Case, sound: list[Case], rule: AbstractRule, say: Say) -> Case | None:
+    """The best; where what is left out of its refit speaks against it, the first of those nearly as good for which it
+    speaks: an alias may promise more inside than the truth.
+    """
+    near = [case for case in sound if case is not best and rule.worth(case) > rule.near * rule.worth(best)]
+    for case in (best, *near) if rule.multistep else (best,):
+        verdict = rule.believes(case)
+        say(f"  best: {words(key_of(case.effect))}, worth {rule.worth(case):.3g}, {verdict.reason}")
+        if verdict.believed:
+            return case
+    return None
 
 
 def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:

@@ -480,8 +480,8 @@ MUTANTS = (
     Mutant(
         "added unless believed",
         "diagnose/loop.py",
-        "if not verdict.believed:\n            break",
-        "if verdict.believed:\n            break",
+        "if verdict.believed:\n            return case",
+        "if not verdict.believed:\n            return case",
         "test_search.py::test_only_what_the_rule_believes_is_added",
     ),
     Mutant(

@@ -182,7 +182,7 @@ def _finished(monkeypatch, error):
     """The outcome, `error` being that of a sequence by whether its model was fitted to it; the last one is lost."""
     used, masks = np.array([True, True, True, False]), []
 
-    def finish(model, m_step, path, data, mask):
+    def finish(model, m_step, path, data, mask, shaped):
         masks.append(mask)
         return _heavy(10.0 + len(masks))
 

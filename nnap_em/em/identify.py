@@ -136,10 +136,10 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     part = np.where(used, np.cumsum(used) % PARTS, -1)
     before, falls = errors(fitted.model, fitted.m_step.prior, path, data), []
     for out in range(PARTS):
-        trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out))
+        trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out), shaped=True)
         falls.append(ratio(before, errors(trial, fitted.m_step.prior, path, data), part == out))
     if np.mean(falls) < 1 - FALLS:
-        model = finish(fitted.model, fitted.m_step, path, data, used)
+        model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True)
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))

@@ -253,11 +253,13 @@ def finish(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
+    *,
+    shaped: bool = False,
 ) -> StateSpaceModel:
     """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until they fall.
 
-    Friction, parameters and effects move, friction under the prior of its shape; noise and start stay.  [Bohlin 2006,
-    "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
+    Friction, parameters and effects move, where it is `shaped` friction under the prior of its shape; noise and start
+    stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
     """
     for _ in range(STEPS):
         weights = m_step.weights(model)
@@ -267,9 +269,10 @@ def finish(
         jac, e, w = now.columns[keep].astype(float), now.error[keep], weight[keep]
         score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
         start, nodes = weights.read(model), slice(weights.nodes.size)
-        precision, pull = friction_prior(model, weights)  # parameters have theirs in the fit
-        information = information.at[nodes, nodes].add(precision[nodes, nodes])
-        score = score.at[nodes].add(-pull[nodes])
+        if shaped:
+            precision, pull = friction_prior(model, weights)  # parameters have theirs in the fit
+            information = information.at[nodes, nodes].add(precision[nodes, nodes])
+            score = score.at[nodes].add(-pull[nodes])
         goal = _goal(weights, model.unknown, start, score, information)
         for share in (1.0, 0.5, 0.25):
             trial = weights.write(model, start + share * (goal - start))

@@ -57,6 +57,7 @@ GROUP_COLUMNS = (
 CASE_COLUMNS = (
     "case",
     "split",
+    "commit",
     "truth (share of the typical torque)",
     "found",
     "right",
@@ -326,5 +327,15 @@ def _line(record: Entry, s: Score) -> str:
     sides = zip(*(side or nothing for side in (s.before, s.after, s.unplanted)), strict=True)
     error = ", ".join(" / ".join(f"{e:.3g}" for e in three) for three in sides)
     ratio = f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-"
-    cells = (s.case, s.split, truth or "-", s.failed or found or "nothing", mark, error, ratio, f"{s.seconds:.0f}")
+    cells = (
+        s.case,
+        s.split,
+        record["code"],
+        truth or "-",
+        s.failed or found or "nothing",
+        mark,
+        error,
+        ratio,
+        f"{s.seconds:.0f}",
+    )
     return _row(cells)

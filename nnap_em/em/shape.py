@@ -12,7 +12,7 @@ KNEES = (0.003, 0.01, 0.03, 0.1, 0.3)
 
 
 def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and pull of the nuisance: the total map free in the span of known laws, the rest small.
+    """Precision and pull of phi: the total map free in the span of known laws, the rest small, parameters as declared.
 
     A prior on its size would bind strong Coulomb friction; one on its change would leave half an effect inside the map.
     """

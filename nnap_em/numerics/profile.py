@@ -22,11 +22,11 @@ class Profile:
         self.spent: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
         self._began = time.perf_counter()
 
-    def __call__(self, event: str, seconds: float, **told: object) -> None:
+    def __call__(self, event: str, duration_secs: float, **told: str | int) -> None:
         """One event, as `jax.monitoring` tells it."""
         if event in STAGES:
             name = str(told.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
-            self.spent[name][STAGES[event]].append(seconds)
+            self.spent[name][STAGES[event]].append(duration_secs)
 
     def __str__(self) -> str:
         whole = time.perf_counter() - self._began

@@ -737,6 +737,13 @@ MUTANTS = (
         "test_fit.py::test_recordings_that_disagree_widen_a_posterior_but_not_its_prior",
     ),
     Mutant(
+        "shape of friction pushed away from",
+        "em/multistep.py",
+        "score.at[nodes].add(-pull[nodes])",
+        "score.at[nodes].add(pull[nodes])",
+        "test_fit.py::test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters",
+    ),
+    Mutant(
         "innovations not masked",
         "diagnose/residual.py",
         "jnp.where(prepared.observed, filtered.innovation, jnp.nan)",

@@ -153,6 +153,25 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
     assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("shaped", [False, True])
+def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
+    nodes, asked = RULE.weights(MODEL).nodes.size, []
+    columns = np.ones((4, 3, 2, 1, nodes + 1))
+    told = Forks(np.ones((4, 3, 2, 1)), columns, np.ones(2))
+    monkeypatch.setattr(multistep, "forks", lambda *_: told)
+    monkeypatch.setattr(multistep, "errors", lambda *_: told.error)
+    monkeypatch.setattr(
+        multistep, "friction_prior", lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
+    )
+    monkeypatch.setattr(multistep, "_goal", lambda *given: asked.append(given[-2:]) or given[2])
+    multistep.finish(MODEL, RULE, PATH, DATA, np.ones(4, bool), shaped=shaped)
+    ((score, information),) = asked
+    weight = multistep.weighed(told, np.ones(4, bool)).sum()
+    friction = np.arange(nodes + 1) < nodes
+    np.testing.assert_allclose(score, weight - 3.0 * shaped * friction)
+    np.testing.assert_allclose(information, weight + 7.0 * shaped * np.outer(friction, friction))
+
+
 @pytest.mark.parametrize(("apart", "slope"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.1), (2.0, 30.0)])
 def test_recordings_that_disagree_widen_a_posterior_but_not_its_prior(monkeypatch, apart, slope):
     """One parameter of prior precision 1 and likelihood precision L: H = 1 + 1 / (1 / L + V), in closed form."""

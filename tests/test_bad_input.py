@@ -146,6 +146,12 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 rows", "2 rows or more"),
     "no header": (lambda s: s.split("\n", 1)[1], "line 1, column 'time'", "missing", "possible here: 0, 0, 0, 6"),
     "column missing": (lambda s: s.replace("dtheta1", "speed"), "column 'dtheta1'", "missing", "possible here: speed"),
+    "column cut off": (
+        lambda s: "\n".join(line.rpartition(",")[0] for line in s.splitlines()),
+        "column 'dtheta1'",
+        "missing",
+        "log it, or correct the columns of rig.toml",
+    ),
     "column misspelt": (lambda s: s.replace("dtheta1", "dteta1"), "'dtheta1'", "missing", "did you mean 'dteta1'?"),
     "column in capitals": (lambda s: s.replace("u,", "U,"), "column 'u'", "missing", "did you mean 'U'?"),
     "column twice": (lambda s: s.replace("dtheta1", "theta1"), "column 'theta1'", "2 times", "keep one"),

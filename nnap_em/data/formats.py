@@ -196,7 +196,8 @@ def _check_names(
     spare = [name for name in names if name not in wanted]
     for name in wanted:
         if name not in names:
-            refuse(path, f"{line}column {name!r}", "missing", mend or nearest(name, spare))
+            alone = "no other column is free for it: log it, or correct the columns of rig.toml"
+            refuse(path, f"{line}column {name!r}", "missing", mend or (nearest(name, spare) if spare else alone))
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 

@@ -118,7 +118,7 @@ def particle_cloud(smoother: ParticleSmoother):
     def run(model, seq: Dataset, key):
         history = smoother.history(model, prepare(model, seq), key=key)
         x = history.origin[:, None] + history.scale[None, None] * jnp.swapaxes(history.x, 1, 2)
-        weight = jnp.exp(history.log_w)[..., None]
+        weight = jax.nn.softmax(history.log_w, axis=1)[..., None]  # they are up to a constant of each time
         mean = jnp.sum(weight * x, axis=1)
         return mean, jnp.sqrt(jnp.sum(weight * (x - mean[:, None]) ** 2, axis=1))
 

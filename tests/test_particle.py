@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from acrobot_em import particle_cloud
 from jax.extend.random import threefry_2x32
 from jaxtyping import Array, Float
 
@@ -384,6 +385,18 @@ def test_acrobot_agrees_with_the_kalman_smoother():
     assert abs(np.mean(np.log(x.std(axis=1) / std))) < 0.1
     assert np.min(ess) > 150
     assert abs(float(loglik - loglik_kalman)) < 0.5
+
+
+def test_the_filtered_cloud_of_the_example_is_the_kalman_filters():
+    """Weights that look ahead are up to a constant of each time; 0.1 standard deviations are six of 4,000 particles."""
+    model = _oscillator()
+    seq = _linear_data(model)
+    guide = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=0)
+    mean, std = particle_cloud(ParticleSmoother(guide, Guided(), num_particles=4000))(model, seq, jax.random.key(0))
+    exact = guide.path(model, prepare(model, seq))[0].state
+    spread = np.sqrt(np.diagonal(np.asarray(exact.cov), axis1=1, axis2=2))
+    assert np.abs((np.asarray(mean) - exact.mean) / spread).max() < 0.1
+    np.testing.assert_allclose(std, spread, rtol=0.1)
 
 
 def test_exact_and_metropolis_paths_agree():

@@ -113,12 +113,13 @@ def gaussian_filter(smoother: GaussianSmoother):
 
 
 def particle_cloud(smoother: ParticleSmoother):
-    """Weighted mean and standard deviation of the particles."""
+    """Weighted mean and standard deviation of the particles; their log weights are up to a constant of each time."""
 
     def run(model, seq: Dataset, key):
         history = smoother.history(model, prepare(model, seq), key=key)
-        x = history.origin[:, None] + history.scale[None, None] * jnp.swapaxes(history.x, 1, 2)
-        weight = jax.nn.softmax(history.log_w, axis=1)[..., None]  # they are up to a constant of each time
+        x = jnp.swapaxes(history.x, 1, 2).astype(history.scale.dtype)
+        x = history.origin[:, None] + history.scale[None, None] * x
+        weight = jax.nn.softmax(history.log_w, axis=1)[..., None].astype(x.dtype)
         mean = jnp.sum(weight * x, axis=1)
         return mean, jnp.sqrt(jnp.sum(weight * (x - mean[:, None]) ** 2, axis=1))
 

@@ -388,11 +388,11 @@ def test_acrobot_agrees_with_the_kalman_smoother():
 
 
 def test_the_filtered_cloud_of_the_example_is_the_kalman_filters():
-    """Weights that look ahead are up to a constant of each time; 0.1 standard deviations are six of 4,000 particles."""
+    """Weights that look ahead are up to a constant of each time; the rest is that of 40,000 particles."""
     model = _oscillator()
     seq = _linear_data(model)
     guide = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=0)
-    mean, std = particle_cloud(ParticleSmoother(guide, Guided(), num_particles=4000))(model, seq, jax.random.key(0))
+    mean, std = particle_cloud(ParticleSmoother(guide, Guided(), num_particles=40_000))(model, seq, jax.random.key(0))
     exact = guide.path(model, prepare(model, seq))[0].state
     spread = np.sqrt(np.diagonal(np.asarray(exact.cov), axis1=1, axis2=2))
     assert np.abs((np.asarray(mean) - exact.mean) / spread).max() < 0.1

@@ -1,5 +1,6 @@
 """What candidates would add along the smoothed motion: force and reading of each of their probes."""
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,10 @@ class Track(NamedTuple):
     """State (q, v) in the middle of every step."""
     acceleration: Float[Array, "*time dof"]
     """In the middle of every step [rad/s^2]."""
+    drive: Float[Array, "*time dof"]
+    """Generalised force of the inputs over every step [N m]."""
+    friction: Float[Array, "*time dof"]
+    """Torque of the learned map in the middle of every step [N m]."""
     rate: Float[Array, "*time state"]
     """Time derivative of (q, v) in every row."""
     inputs: Inputs
@@ -46,7 +51,8 @@ def _track(null: StateSpaceModel, one) -> Track:
     middle = mean + 0.5 * null.dt * now
     acceleration = rate(middle, inputs)[:, dof : 2 * dof]
     past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
-    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, past, inputs)
+    drive, friction = jax.vmap(null.system.drive)(inputs.u), jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
+    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, drive, friction, past, inputs)
 
 
 def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
@@ -84,8 +90,18 @@ BUNCH = 4
 """Stacks are filled up to a multiple of this, so that one more probe is no other program."""
 
 
-def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractEffect]]:
-    """Probes of one structure stacked, so that each structure is compiled once."""
+class Stack(NamedTuple):
+    """Probes of one structure."""
+
+    places: list[int]
+    """Theirs among all."""
+    probes: AbstractEffect
+    axes: AbstractEffect
+    """Axis of the stack in every leaf; None where all are the same: what a basis shares is then computed once."""
+
+
+def _stacks(probes: Sequence[AbstractEffect]) -> list[Stack]:
+    """Probes of one structure stacked, those of a class behind each other."""
     places: dict = {}
     for i, probe in enumerate(probes):
         places.setdefault(jax.tree.structure(probe), []).append(i)
@@ -93,19 +109,27 @@ def _groups(probes: Sequence[AbstractEffect]) -> list[tuple[list[int], AbstractE
     def stack(*leaves):  # by NumPy: a stack of many small arrays would be one program for every number of them
         more = (0, -len(leaves) % BUNCH)
         whole = np.stack([np.asarray(leaf) for leaf in leaves])
-        return jnp.asarray(np.pad(whole, [more] + [(0, 0)] * (whole.ndim - 1), mode="edge"))
+        if len(whole) > 1 and (whole == whole[0]).all():
+            return leaves[0], None
+        return jnp.asarray(np.pad(whole, [more] + [(0, 0)] * (whole.ndim - 1), mode="edge")), 0
 
-    return [(index, jax.tree.map(stack, *(probes[i] for i in index))) for index in places.values()]
+    def stacked(index):
+        leaves, structure = zip(*(jax.tree.flatten(probes[i]) for i in index), strict=True)
+        whole, axes = zip(*map(stack, *leaves), strict=True)
+        return jax.tree.unflatten(structure[0], whole), jax.tree.unflatten(structure[0], axes)
+
+    stacks = (Stack(index, *stacked(index)) for index in places.values())
+    return sorted(stacks, key=lambda stack: type(stack.probes).__qualname__)
 
 
-def _stack_columns(common, track: Track) -> Columns:
-    """Columns of a stack of probes: the same program whatever the model has learned meanwhile, and beside what."""
-    base, stack = common
+def _stack_columns(common, track: Track) -> list[Columns]:
+    """Columns of some stacks of probes: the same program whatever the model has learned meanwhile, and beside what."""
+    base, stacks = common
     dof = len(base.system.coordinates)
     q, v = track.middle[:, :dof], track.middle[:, dof:]
-    drive, friction = jax.vmap(base.system.drive)(track.inputs.u), jax.vmap(base.unknown)(v)
-    scenes = Scene(None, q, v, drive, track.inputs.time, friction, None)  # type: ignore[arg-type]
-    return jax.vmap(lambda e: _columns(base, e, track, scenes))(stack)
+    scenes = Scene(None, q, v, track.drive, track.inputs.time, track.friction, None)  # type: ignore[arg-type]
+    one = lambda e: _columns(base, e, track, scenes)  # noqa: E731
+    return [jax.vmap(one, in_axes=(axes,))(stack) for stack, axes in stacks]
 
 
 def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], track: Track, rows: int = 0) -> Columns:
@@ -113,14 +137,16 @@ def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], tr
 
     Tracks are padded to `rows`, so that horizons share the largest program.
     """
-    groups, length = _groups([probe for candidate in candidates for probe in candidate.probes]), track.x.shape[1]
+    groups, length = _stacks([probe for candidate in candidates for probe in candidate.probes]), track.x.shape[1]
     more = [(0, 0), (0, max(0, rows - length))]
     longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
-    track, size = jax.tree.map(longer, track), sum(len(index) for index, _ in groups)
+    track, size = jax.tree.map(longer, track), sum(len(stack.places) for stack in groups)
     last = track.acceleration.shape[-1], len(base.measured)
     force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
-    for index, stack in groups:
-        found = each(_stack_columns, (base, stack), track)
-        for whole, own in ((force, found.force), (reading, found.reading)):
-            whole[:, index] = np.asarray(own)[:, : len(index), :length]
+    for _, group in itertools.groupby(groups, key=lambda stack: type(stack.probes)):  # a program for every class
+        stacks = list(group)
+        every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in stacks]), track)
+        for stack, found in zip(stacks, every, strict=True):
+            for whole, own in ((force, found.force), (reading, found.reading)):
+                whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
     return Columns(jnp.asarray(force), jnp.asarray(reading))

@@ -42,13 +42,19 @@ def estimates(
 ) -> dict[str, Estimate]:
     """The reported parameters of an effect; standard deviations by the delta method from those of its own numbers."""
 
+    (values, slopes), unit = _reported(effect), effect.units_on(system)
+    variance = {name: float(np.asarray(slope) @ cov @ np.asarray(slope)) for name, slope in slopes.items()}
+    return {n: Estimate(float(value), math.sqrt(max(0.0, variance[n])), unit[n]) for n, value in values.items()}
+
+
+@eqx.filter_jit
+def _reported(effect: AbstractEffect):
+    """The reported parameters, and how they move with the effect's own numbers."""
+
     def reported(numbers: Float[Array, " param"]) -> dict[str, Float[Array, ""]]:
         return _filled(effect, numbers).values()
 
-    now = flat(effect)
-    values, slopes, unit = reported(now), jax.jacfwd(reported)(now), effect.units_on(system)
-    variance = {name: float(np.asarray(slope) @ cov @ np.asarray(slope)) for name, slope in slopes.items()}
-    return {n: Estimate(float(value), math.sqrt(max(0.0, variance[n])), unit[n]) for n, value in values.items()}
+    return reported(flat(effect)), jax.jacfwd(reported)(flat(effect))
 
 
 def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> AbstractEffect:

@@ -175,7 +175,9 @@ def close(loop: Loop) -> Closed:
     # steps in a reading come first: they spoil the noise that all else leans on
     now, state = quantised(loop, loop.bare)
     last = longest if state else 0
-    for length in [longest] if state else loop.rule.horizons(list(loop.stages), longest):
+    ahead = [longest] if state else loop.rule.horizons(list(loop.stages), longest)
+    while ahead:
+        length = ahead.pop(0)
         if now.found and (state is None or last < length):
             state = grow(loop, now, last, length, state)
         own = loop.stages[length][0].best if length < longest else before.model
@@ -183,7 +185,7 @@ def close(loop: Loop) -> Closed:
         last, known = length, now.found
         now, further = _search(loop, now, beginning(loop.data, length), length, steps)
         if now.found is not known:  # one more, or one in the place of another
-            state = further
+            state, ahead = further, ahead[-1:]  # the rest is seen best over the whole, which is followed now
             last = playoff(length, longest) if further is not None else length
     if now.found and state is None:
         state = grow(loop, now, longest, longest)

@@ -66,7 +66,9 @@ def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> A
         return candidate.probes[0]
 
     def combine(start, *probes):
-        return start + sum(float(c) * (p - start) for c, p in zip(coefficients, probes, strict=True))
+        start, *probes = map(np.asarray, (start, *probes))
+        far = sum(float(c) * (p - start) for c, p in zip(coefficients, probes, strict=True))
+        return jnp.asarray(start + far, start.dtype)
 
     return jax.tree.map(combine, candidate.start, *candidate.probes)
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
 from ..em.local import locals_along
-from ..em.mstep import Core, ScoringMStep
+from ..em.mstep import Core, ScoringMStep, between
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
@@ -86,8 +86,7 @@ def refit(
             path = smoothed
         else:
             stride, path = stride / 3, best[4]
-        way = lambda a, b, s=stride: a + s * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
-        core = jax.tree.map(way, here, goal)
+        core = between(here, goal, stride)
     assert best is not None
     _, core, loglik, hessian, path = best
     return Trial(m_step.whole(model, core), m_step, path, loglik, hessian)

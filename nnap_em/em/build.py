@@ -73,9 +73,14 @@ def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
 
 def loads(system: AbstractSystem) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
     """Inertia of every joint at zero, and gravity with the first at a quarter turn [kg m^2 and N m, or kg and N]."""
+    inertia, gravity = map(np.asarray, _loads(system))
+    return inertia, np.abs(gravity)
+
+
+@eqx.filter_jit
+def _loads(system: AbstractSystem):
     still = jnp.zeros(len(system.coordinates))
-    gravity = system.bias(still.at[0].set(jnp.pi / 2), still)
-    return np.diag(np.asarray(system.mass(still))), np.abs(np.asarray(gravity))
+    return jnp.diag(system.mass(still)), system.bias(still.at[0].set(jnp.pi / 2), still)
 
 
 LAG = 5
@@ -131,7 +136,7 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
         means.append(mean)
         stds.append(std)
         open_.append(free)
-    return Gaussian(jnp.asarray(means), jnp.diag(jnp.asarray(stds) ** 2)), tuple(open_)
+    return Gaussian(jnp.asarray(means), jnp.asarray(np.diag(np.square(stds)))), tuple(open_)
 
 
 def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
@@ -154,8 +159,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         system=system,
         unknown=unknown,
         start=start,
-        log_q=2 * jnp.log(jnp.concatenate([jnp.asarray(kick * rig.dt), jnp.asarray(kick)])),
-        log_r=2 * jnp.log(jnp.asarray(noise)),
+        log_q=jnp.asarray(2 * np.log(np.concatenate([kick * rig.dt, kick]))),
+        log_r=jnp.asarray(2 * np.log(noise)),
         measured=tuple(states.index(n) for n in rig.measured),
         dt=rig.dt,
     )

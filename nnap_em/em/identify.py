@@ -23,6 +23,7 @@ from .mstep import ScoringMStep, kept
 from .multistep import FALLS, errors, finish, ratio, robust_hessian
 from .noise import white_readings
 from .scale import holding, untold
+from .weights import Weights
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
@@ -154,27 +155,33 @@ def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[A
     [Immer, Korzepa & Bauer 2021, AISTATS].
     """
     weights = fitted.m_step.weights(fitted.model)
-    jac = weights.jacobian(fitted.model.unknown, weights.read(fitted.model))
+    return _drawn(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian, count, key)
+
+
+@eqx.filter_jit
+def _drawn(weights: Weights, unknown, w, hessian, count: int, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    jac = weights.jacobian(unknown, w)
     unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
-    factor = jnp.linalg.cholesky(fitted.state.hessian)
-    return (jac @ jax.scipy.linalg.solve_triangular(factor.T, unit, lower=False)).T
+    return (jac @ jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, unit, lower=False)).T
 
 
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
     """The learned map at `velocity` [rad/s], its covariance linearised in the weights (Laplace)."""
     weights = fitted.m_step.weights(fitted.model)
-    w = weights.read(fitted.model)
-
-    def torque(w):
-        return jax.vmap(weights.write(fitted.model, w).unknown)(velocity.T).T
-
-    jac = jax.jacfwd(torque)(w)
-    half = jax.scipy.linalg.solve_triangular(
-        jnp.linalg.cholesky(fitted.state.hessian), jac.reshape(-1, w.shape[0]).T, lower=True
-    ).T.reshape(jac.shape)
-    system = fitted.model.system
+    w, system = weights.read(fitted.model), fitted.model.system
     units = tuple((system.unit(rate), system.force_unit(j)) for j, rate in enumerate(system.rates, 1))
-    return FrictionTable(velocity, torque(w), jnp.einsum("jaw,jbw->jab", half, half), units)
+    return FrictionTable(velocity, *_friction(weights, fitted.model.unknown, w, fitted.state.hessian, velocity), units)
+
+
+@eqx.filter_jit
+def _friction(weights: Weights, unknown, w, hessian, velocity):
+    """Torque at `velocity`, and its covariance."""
+    here = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
+    jac = here.jacobian(unknown, w)[: velocity.size]
+    half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True).T
+    half = half.reshape(*velocity.shape, -1)
+    torque = here.phi(unknown, w)[: velocity.size].reshape(velocity.shape)
+    return torque, jnp.einsum("jaw,jbw->jab", half, half)
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:

@@ -18,7 +18,7 @@ from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother, Posterior
 from ..storage.journal import HERE, step
-from .mstep import AbstractMStep, MStepInfo
+from .mstep import AbstractMStep, MStepInfo, between
 
 
 class EMState(NamedTuple):
@@ -147,8 +147,7 @@ def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EM
         state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=top, stride=stride)
     else:
         state = state._replace(stride=state.stride / 3)
-    way = lambda a, b: a + state.stride * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
-    model = jax.tree.map(way, state.best, state.proposal)
+    model = between(state.best, state.proposal, state.stride)
     return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
 
 

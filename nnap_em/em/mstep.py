@@ -52,6 +52,17 @@ class Core(NamedTuple):
     start: Gaussian
 
 
+def between(here: Any, there: Any, share: float) -> Any:
+    """A model, or a part of one, a share of the way from `here` to `there`."""
+    return _between(here, there, jnp.asarray(share, jnp.result_type(float)))
+
+
+@eqx.filter_jit
+def _between(here, there, share):
+    way = lambda a, b: a + share.astype(a.dtype) * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
+    return jax.tree.map(way, here, there)
+
+
 class AbstractMStep(eqx.Module):
     """A rule for the next model, given the posterior of every sequence."""
 
@@ -90,17 +101,29 @@ def _quadratic(common, one) -> Quadratic:
 
 
 @eqx.filter_jit
-def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian, loglik, used):
+def _widened(prior: ParameterPrior, w, by_parameter, reading_by_parameter, pad: int):
+    """Parameters, and sensitivities to them, with `pad` more that do nothing; they are nameless here."""
+    widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
+    mean, std = widen(prior.mean), jnp.pad(prior.std, (0, pad), constant_values=1.0)
+    wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), mean, std)
+    return wide, widen(w), widen(by_parameter), widen(reading_by_parameter)
+
+
+@eqx.filter_jit
+def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, path: Gaussian, loglik, used, pad: int):
+    """The step; the last `pad` parameters do nothing and are not in the outcome."""
     weights = rule.weights(core)
     used = used & jnp.isfinite(loglik) & jnp.all(jnp.isfinite(terms.information), axis=(1, 2))
     used = used & jnp.all(jnp.isfinite(terms.score), axis=1) & jnp.all(jnp.isfinite(terms.noise_score), axis=1)
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
-    first = jax.tree.map(pick, first)
+    first = jax.tree.map(lambda a: pick(a[:, 0]), path)
     w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
     hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
     log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
-    return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
+    size = w.shape[0] - pad
+    after = Core(core.unknown, w[:size], log_q, log_r, rule.first(core.start, first, used))
+    return after, hessian[:size, :size], used
 
 
 class ScoringMStep(AbstractMStep):
@@ -167,22 +190,13 @@ class ScoringMStep(AbstractMStep):
 
         With it the posterior precision where it began, and which of the sequences `used` could be.
         """
-        count = self.prior.size
-        pad = -count % BLOCK
-        names = tuple(map(str, range(count + pad)))
-        mean, std = jnp.pad(self.prior.mean, (0, pad)), jnp.pad(self.prior.std, (0, pad), constant_values=1.0)
-        rule = eqx.tree_at(lambda r: r.prior, self, ParameterPrior(names, mean, std))
-        widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
-        here = here._replace(
-            by_parameter=widen(here.by_parameter), reading_by_parameter=widen(here.reading_by_parameter)
-        )
+        pad = -self.prior.size % BLOCK
+        prior, w, of_state, of_reading = _widened(self.prior, core.w, here.by_parameter, here.reading_by_parameter, pad)
+        rule = eqx.tree_at(lambda r: r.prior, self, prior)
+        here = here._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (here, posterior, read))
-        first = jax.tree.map(lambda a: a[:, 0], posterior.state)
-        wide_core = core._replace(w=widen(core.w))
-        core, hessian, used = _advance(rule, wide_core, terms, first, posterior.loglik, used)
-        wide = core.w.shape[0] - pad
-        return core._replace(w=core.w[:wide]), hessian[:wide, :wide], used
+        return _advance(rule, core._replace(w=w), terms, posterior.state, posterior.loglik, used, pad)
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
         """Log variances of process and reading noise after the step."""

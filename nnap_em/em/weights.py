@@ -32,6 +32,7 @@ class Weights(eqx.Module):
         unknown = model.unknown.with_weights(w[:cut])
         return self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
 
+    @eqx.filter_jit
     def phi(self, unknown, w: Float[Array, " weight"]) -> Float[Array, " phi"]:
         """The vector in which the likelihood is quadratic."""
         cut = w.shape[0] - self.prior.size
@@ -46,6 +47,7 @@ class Weights(eqx.Module):
         """Prior mean of the weights."""
         return jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
 
+    @eqx.filter_jit
     def symmetry(self) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
         dof, count = self.nodes.shape
@@ -53,6 +55,7 @@ class Weights(eqx.Module):
         blocks = [even.T @ even / self.asymmetry[j] ** 2 for j in range(dof)]
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
+    @eqx.filter_jit
     def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
         """Sensitivity of phi to the weights."""
         return jax.jacfwd(lambda w: self.phi(unknown, w))(w)

@@ -67,10 +67,7 @@ class FrictionNetwork(AbstractJointMap):
         depth: int = 2,
         resolution: float = 100.0,
     ):
-        def make(key):
-            return eqx.nn.MLP(2, "scalar", width, depth, jax.nn.tanh, dtype=speed.dtype, key=key)
-
-        self.mlp = eqx.filter_vmap(make)(jax.random.split(key, speed.shape[0]))
+        self.mlp = _networks(key, speed, width, depth)
         self.speed = speed
         self.knee = speed / resolution
         self.scale = scale
@@ -85,20 +82,30 @@ class FrictionNetwork(AbstractJointMap):
         features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)
         return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
 
+    @eqx.filter_jit
     def nodes(self, count: int) -> Float[Array, "dof count"]:
         """Velocities [rad/s], dense near rest, at which the map is tabulated in the M-step."""
         top = jnp.arcsinh(self.speed / self.knee)
         line = jnp.linspace(-1.0, 1.0, count, dtype=self.speed.dtype)
         return self.knee[:, None] * jnp.sinh(top[:, None] * line[None, :])
 
+    @eqx.filter_jit
     def weights(self) -> Float[Array, " weight"]:
         """All network weights as one vector."""
         return ravel_pytree(eqx.filter(self.mlp, eqx.is_inexact_array))[0]
 
+    @eqx.filter_jit
     def with_weights(self, flat: Float[Array, " weight"]) -> "FrictionNetwork":
         """This map with the weights replaced."""
         arrays, static = eqx.partition(self.mlp, eqx.is_inexact_array)
         return eqx.tree_at(lambda f: f.mlp, self, eqx.combine(ravel_pytree(arrays)[1](flat), static))
+
+
+@eqx.filter_jit
+def _networks(key: PRNGKeyArray, speed: Float[Array, " dof"], width: int, depth: int) -> eqx.nn.MLP:
+    """One for every joint, at random."""
+    make = lambda key: eqx.nn.MLP(2, "scalar", width, depth, jax.nn.tanh, dtype=speed.dtype, key=key)  # noqa: E731
+    return eqx.filter_vmap(make)(jax.random.split(key, speed.shape[0]))
 
 
 class FixedFriction(eqx.Module):

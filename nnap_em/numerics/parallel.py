@@ -119,6 +119,8 @@ def _place(tree, sharding: NamedSharding):
     kinds = [jax.random.key_impl(a) if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else None for a in leaves]
     plain = [a if kind is None else jax.random.key_data(a) for a, kind in zip(leaves, kinds, strict=True)]
     if jax.process_count() == 1:
+        if jax.default_backend() == "cpu":  # NumPy cuts by views, JAX by a program for every shape
+            plain = [np.asarray(a) for a in plain]
         placed = jax.device_put(plain, sharding)  # all in one call: each takes its time
     else:
         whole = [np.asarray(a) for a in plain]

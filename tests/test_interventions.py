@@ -32,7 +32,8 @@ def _left(law=lambda x, v: 0.0 * x, push=0.0, seed=0, sequences=5, rows=501, noi
     state, one = np.stack([x, v], axis=-1), np.ones((sequences, rows, 2))
     valid = np.ones(t.shape, bool)
     u = np.sin(2 * t + phase)[..., None]
-    return Residual(0 * one, force[..., None], one[..., :1], state, state, u, t, valid, valid.all(axis=1))
+    forces = 2 * (force[..., None], one[..., :1])
+    return Residual(0 * one, *forces, state, state, u, t, valid, valid.all(axis=1))
 
 
 @pytest.mark.parametrize("push", [1.0, -1.0])

@@ -36,6 +36,8 @@ def _found(dof: int, seed: int = 0, **changes) -> Residual:
         innovation=rng.normal(size=(*shape, 2 * dof)),
         force=force,
         force_std=np.ones((*shape, dof)),
+        lacked=force,
+        lacked_std=np.ones((*shape, dof)),
         state=walk,
         predicted=walk,
         u=np.sin(0.1 * np.arange(ROWS) + rng.uniform(0, 6, size=(SEQUENCES, 1)))[..., None],

@@ -37,6 +37,8 @@ def _found(seed, **changes):
         innovation=rng.normal(size=(*shape, 2)),
         force=np.concatenate([rng.normal(size=(10, 299, 2)), np.full((10, 1, 2), np.nan)], axis=1),
         force_std=np.ones((*shape, 2)),
+        lacked=np.zeros((*shape, 2)),
+        lacked_std=np.ones((*shape, 2)),
         state=walk,
         predicted=walk,
         u=np.sin(0.1 * np.arange(300) + rng.uniform(0, 6, size=(10, 1)))[..., None],
@@ -238,7 +240,7 @@ def test_adding_an_effect_back_gives_its_force():
     fitted = fitted._replace(state=fitted.state._replace(best=model))
     left = residual(fitted, data)
     assert np.sqrt(np.nanmean(left.force**2)) < 0.05 * np.std(truth)
-    found = residual(fitted, data, add_back=True)
+    found = left.without_effects()
     np.testing.assert_allclose(np.nanmean(found.force[:, :-1, 0] - truth[:, :-1], axis=1), 0, atol=0.01)
     np.testing.assert_allclose(found.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
 

@@ -1,7 +1,7 @@
 """Asking and fitting at longer and longer horizons: what the search and its undoing both do."""
 
 import math
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -20,6 +20,8 @@ from .evidence import Question
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of
 from .look import Effort, Say
+
+_Tree = TypeVar("_Tree")
 
 Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 """State of a fit at the end of each of its horizons, and the sequences used."""
@@ -50,20 +52,25 @@ class Loop(NamedTuple):
 
 def beginning(data: Dataset, length: int) -> Dataset:
     """The first `length` rows."""
-    part = horizon(data, length)
-    return jax.tree.map(lambda a: a[:, :SHORT], part) if length <= SHORT else part
+    return _cut(horizon(data, length), length)
 
 
-def asked(loop: Loop, now: Hypothesis, every: Dataset) -> tuple[Question, Bool[np.ndarray, " seq"]]:
-    """The question along the smoothed paths of `now`, and the sequences that are followed whole.
+def _cut(tree: _Tree, length: int) -> _Tree:
+    """All of it, over no more rows than a short horizon needs."""
+    return jax.tree.map(lambda a: a[:, :SHORT], tree) if length <= SHORT else tree
+
+
+def asked(loop: Loop, now: Hypothesis, length: int) -> tuple[Question, Bool[np.ndarray, " seq"]]:
+    """The question along the smoothed paths of `now` over `length` rows, and the sequences that are followed whole.
 
     A sequence that is lost tells most where it is being lost: it is used until a little later, as late as it can be.
     """
     before, rows = loop.before, loop.data.t.shape[1]
-    smoother = before.smoother
+    smoother, every = before.smoother, horizon(loop.data, length)  # uncut: the program of the fit serves
     posterior = e_step(now.model, every, smoother, key=before.state.key)
     whole = np.asarray(kept(posterior, every))
-    question = Question(loop.bare, now, posterior.state, every, whole, rows, loop.pieces)
+    told = _cut(posterior.state, length), _cut(every, length)
+    question = Question(loop.bare, now, *told, whole, rows, loop.pieces)
     if whole.all():
         return question, whole
     dof = len(now.model.system.coordinates)
@@ -78,7 +85,7 @@ def asked(loop: Loop, now: Hypothesis, every: Dataset) -> tuple[Question, Bool[n
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
-    return question._replace(path=posterior.state, data=cut, used=used), whole
+    return question._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
 LOOSER = 3.0

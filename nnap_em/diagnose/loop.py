@@ -25,7 +25,7 @@ from ..systems import AbstractSystem
 from .accept import AbstractRule, LikelihoodRule, ShareRule
 from .case import Case, trimmed
 from .evidence import Question
-from .grow import Loop, Stages, asked, beginning, grow, playoff, settle, taken
+from .grow import Loop, Stages, asked, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
 from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
@@ -42,14 +42,12 @@ SAME = 0.01
 """Share of an effect's information that an equivalent one may leave unexplained."""
 
 
-def _search(
-    loop: Loop, now: Hypothesis, every: Dataset, length: int, steps: list[Step]
-) -> tuple[Hypothesis, EMState | None]:
+def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tuple[Hypothesis, EMState | None]:
     """Look at one horizon until nothing more is found; a fit to a longer one, where a playoff made it."""
     rule, say, been = loop.rule, loop.say, {_names(now)}
     while len(now.found) < loop.effort.most:
         let_go()
-        question, whole = asked(loop, now, every)
+        question, whole = asked(loop, now, length)
         say(f"horizon {length * loop.before.rig.dt:.2f} s: {whole.sum()} of {whole.size} sequences followed")
         if not question.used.any():
             break
@@ -183,7 +181,7 @@ def close(loop: Loop) -> Closed:
         own = loop.stages[length][0].best if length < longest else before.model
         now = now.refitted(cast(StateSpaceModel, state.best if state else own))
         last, known = length, now.found
-        now, further = _search(loop, now, beginning(loop.data, length), length, steps)
+        now, further = _search(loop, now, length, steps)
         if now.found is not known:  # one more, or one in the place of another
             state, ahead = further, ahead[-1:]  # the rest is seen best over the whole, which is followed now
             last = playoff(length, longest) if further is not None else length
@@ -193,7 +191,7 @@ def close(loop: Loop) -> Closed:
     now, state = needed(loop, now, state)
     if len(now.found) < count:  # what the dropped one stood for may now be seen for what it is
         now = now.refitted(cast(StateSpaceModel, state.best if state else before.model))
-        more, further = _search(loop, now, beginning(loop.data, longest), longest, steps)
+        more, further = _search(loop, now, longest, steps)
         if more.found is not now.found:
             now, state = more, further or grow(loop, more, longest, longest)
             now, state = needed(loop, now, state)

@@ -67,6 +67,11 @@ class Residual(NamedTuple):
     """Generalised force that the model lacks between a row and the next [N m, or N]; NaN behind the last row."""
     force_std: Float[np.ndarray, "seq time dof"]
     """Standard deviation of it given all readings."""
+    lacked: Float[np.ndarray, "seq time dof"]
+    """The same beside the model without its effects, on the paths that it finds with them: the component-plus-residual
+    of a regression.  Paths of a model that lacks much are wrong themselves; these show what it lacked.
+    [Larsen & McCleary 1972, Technometrics 14, 781]"""
+    lacked_std: Float[np.ndarray, "seq time dof"]
     state: Float[np.ndarray, "seq time state"]
     """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
@@ -78,6 +83,10 @@ class Residual(NamedTuple):
     valid: Bool[np.ndarray, "seq time"]
     used: Bool[np.ndarray, " seq"]
     """False where the track was lost; such a sequence takes part in no test and no figure."""
+
+    def without_effects(self) -> "Residual":
+        """With `lacked` as the force."""
+        return self._replace(force=self.lacked, force_std=self.lacked_std)
 
     def followed(self) -> "Residual":
         """Of the sequences that were."""
@@ -111,29 +120,32 @@ def names_of(fitted: Identified) -> Names:
 
 def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
     """The fields of a `Residual` that come from smoothing, of one sequence."""
-    (model, add_back), (seq, posterior) = common, one
+    model, (seq, posterior) = common, one
     dof, plain, prepared = len(model.system.coordinates), with_effects(model, ()), prepare(model, seq)
     filtered = relinearised(model, posterior.state, prepared, CUBATURE)
 
-    def force(x, kick, u, command):
-        system, change = hooks.machine(model.effects, model.system, u.time), kick[:, dof : 2 * dof]
-        if add_back:  # what the effects do to the rates over one sample
-            system = model.system
-            given = model.transition(x, u)[: 2 * dof] - plain.transition(x[: 2 * dof], command)
-            change = change + given[dof:][None]
+    def force(system, x, change):
         nodes = change @ system.mass(x[:dof]).T / model.dt
         return jnp.mean(nodes, axis=0), jnp.std(nodes, axis=0)
 
+    def both(x, kick, u, command):
+        change = kick[:, dof : 2 * dof]
+        own = force(hooks.machine(model.effects, model.system, u.time), x, change)
+        if not model.effects:
+            return *own, *own
+        given = model.transition(x, u)[dof : 2 * dof] - plain.transition(x[: 2 * dof], command)[dof:]
+        return *own, *force(model.system, x, change + given[None])  # what the effects do to the rates over one sample
+
     steps = jax.tree.map(lambda a: a[:-1], (posterior.state.mean, prepared.inputs, plain.inputs(seq)))
-    mean, std = jax.vmap(force)(steps[0], posterior.kick, *steps[1:])
-    last = jnp.full((1, dof), jnp.nan, mean.dtype)
-    mean, std = (jnp.concatenate([jnp.where(seq.valid[1:, None], a, jnp.nan), last]) for a in (mean, std))
+    forces = jax.vmap(both)(steps[0], posterior.kick, *steps[1:])
+    last = jnp.full((1, dof), jnp.nan, seq.y.dtype)
+    forces = [jnp.concatenate([jnp.where(seq.valid[1:, None], a, jnp.nan), last]) for a in forces]
     innovation = jnp.where(prepared.observed, filtered.innovation, jnp.nan)
     state, predicted = (g.mean[:, : 2 * dof] for g in (posterior.state, filtered.predicted))
-    return innovation, mean, std, state, predicted, prepared.inputs.u
+    return innovation, *forces, state, predicted, prepared.inputs.u
 
 
-def residual(fitted: Identified, data: Dataset, *, add_back: bool = False) -> Residual:
+def residual(fitted: Identified, data: Dataset) -> Residual:
     """Innovations, and the generalised force that the model lacks, by the smoother of the fit.
 
         r_k = M(q_k) (v_{k+1} - v(x_k, u_k)) / dt,  its mean and standard deviation given all readings [N m, or N]
@@ -141,18 +153,14 @@ def residual(fitted: Identified, data: Dataset, *, add_back: bool = False) -> Re
     v(x, u) is the model's own rate one sample later.  The smoother draws r towards 0 as far as the process noise is
     small: a slow force comes out whole, single kicks do not.  Innovations are those of the Kalman filter of the model
     linearised about the smoothed distribution by cubature, whichever smoother gave that.
-
-    With `add_back`, v(x, u) is the rate without the effects of the model, on the paths that it finds with them: the
-    force of the effects and what is left beside it, the component-plus-residual of a regression.  Paths of a model
-    that lacks much are wrong themselves; these show what it lacked.  [Larsen & McCleary 1972, Technometrics 14, 781]
     """
     data = Dataset(*map(jnp.asarray, data))
     posterior = smooth(fitted, data)
-    outcome = each(_left, (fitted.model, add_back), (data, posterior))
-    innovation, force, std, state, predicted, u = map(np.asarray, outcome)
+    outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
+    innovation, force, std, lacked, lacked_std, state, predicted, u = outcome
     t, valid = np.asarray(data.t), np.asarray(data.valid)
     used = np.asarray(kept(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
-    return Residual(innovation, force, std, state, predicted, u, t, valid, used)
+    return Residual(innovation, force, std, lacked, lacked_std, state, predicted, u, t, valid, used)
 
 
 # --- tests

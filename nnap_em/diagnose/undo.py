@@ -30,7 +30,7 @@ class Difference(Worth):
     @lazy
     def error(self) -> float:
         """Squared open-loop error of the one over that of the other."""
-        (a, one), (b, other) = (asked(self.loop, each, self.loop.data) for each in (self.less, self.full))
+        (a, one), (b, other) = (asked(self.loop, each, self.loop.longest) for each in (self.less, self.full))
         return open_loop_error(a, b, self.loop.data, one & other)
 
 
@@ -47,7 +47,7 @@ def needed(loop: Loop, now: Hypothesis, state: EMState | None) -> tuple[Hypothes
         if losses[least] > CLEAR:
             break
         less = now.without(least)
-        path = asked(loop, less, loop.data)[0]
+        path = asked(loop, less, loop.longest)[0]
         trial = refit(less.model, less.m_step, path.path, loop.data, path.used, passes=loop.effort.passes)
         gain = trimmed((np.nan_to_num(state.top, nan=-1e3) - trial.loglik)[path.used])
         verdict = loop.rule.keeps(Difference(loop, less.refitted(trial.model), now, gain))

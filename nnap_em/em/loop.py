@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
-from ..smoother.posterior import AbstractSmoother, Posterior
+from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between
 
@@ -66,7 +67,19 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     sequences, rows = data.t.shape
     keys = jax.random.split(key, sequences)
     together = max(1, smoother.room // (rows * smoother.bytes_per_row))
-    return each(_smooth, (model, smoother), (data, keys), together=together)
+    outcomes = [each(_smooth, (model, one), (data, keys), together=together) for one in smoother.tries()]
+    return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+
+
+@eqx.filter_jit
+def _likeliest(outcomes: list[Posterior]) -> Posterior:
+    """Of every sequence."""
+
+    def one(*tries):
+        best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)
+
+    return jax.vmap(one)(*outcomes)
 
 
 def _smooth(common, one) -> Posterior:

@@ -47,7 +47,7 @@ def write_diagnosis(
     if error:
         error.setdefault("after", error["before"])
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
-    lacked = residual(closed.after, train.data, add_back=True) if found else left["before"]
+    lacked = left["after"].without_effects() if found else left["before"]
     told = {name: tests(each, names) for name, each in left.items()}
     visited = _visited(left["before"], len(names.rates))
     tables = {n: friction_table(f, jnp.asarray(visited)) for n, f in sides.items() if closed.before.rig.friction}

@@ -1,6 +1,7 @@
 """Gaussian smoothers: filter and RTS passes from the likeliest start, relinearised about their own path."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, cubature, lower, product
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, relinearised, rts
-from .posterior import AbstractSmoother, Posterior
+from .posterior import AbstractSmoother, Posterior, likeliest
 from .start import StartBank
 
 
@@ -35,24 +36,28 @@ class GaussianSmoother(AbstractSmoother):
         """With looser first passes."""
         return dataclasses.replace(self, inflations=(1.0, 10.0, 100.0))
 
+    def tries(self) -> "list[_Loosened]":
+        """One for each of the first passes."""
+        once = dataclasses.replace(self, inflations=(1.0,))
+        return [_Loosened(once, jnp.asarray(math.log(factor), float)) for factor in self.inflations]
+
     def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
         start = self.likeliest(model, seq)
-
-        def follow(inflation):
-            loose = eqx.tree_at(lambda m: m.log_q, model, model.log_q + inflation)
-            filtered = ekf(loose, start, seq, self.linearise)
-
-            def again(_, now):
-                filtered = relinearised(model, now[1].state, seq, self.linearise)
-                return filtered, rts(filtered)
-
-            return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-
-        tracks = jax.vmap(follow)(jnp.log(jnp.asarray(self.inflations, seq.y.dtype)))
-        loglik = tracks[0].loglik
-        best = jnp.argmax(jnp.where(jnp.isfinite(loglik), loglik, -jnp.inf))
+        looser = jnp.log(jnp.asarray(self.inflations, seq.y.dtype))
+        tracks = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
+        best = likeliest(tracks[0].loglik)
         return jax.tree.map(lambda a: a[best], tracks)
+
+    def follow(self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]) -> tuple[Filtered, Smoothed]:
+        """From one start, the log of the process noise of the first pass `looser` than that of the model."""
+        filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
+
+        def again(_, now):
+            filtered = relinearised(model, now[1].state, seq, self.linearise)
+            return filtered, rts(filtered)
+
+        return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples speak for."""
@@ -61,13 +66,29 @@ class GaussianSmoother(AbstractSmoother):
             return jax.tree.map(lambda a: a[0], starts)
         head = jax.tree.map(lambda a: a[: self.window], seq)
         loglik = jax.vmap(lambda start: ekf(model, start, head, self.linearise).loglik)
-        score = loglik(starts) + log_weight
-        best = jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))
+        best = likeliest(loglik(starts) + log_weight)
         return jax.tree.map(lambda a: a[best], starts)
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
         return linear_posterior(*self.path(model, seq))
+
+
+class _Loosened(AbstractSmoother):
+    """One try of a Gaussian smoother; how loose it is is no part of the program."""
+
+    smoother: GaussianSmoother
+    looser: Float[Array, ""]
+
+    @property
+    def bytes_per_row(self) -> int:
+        """Memory [B] that a row takes."""
+        return self.smoother.bytes_per_row
+
+    def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
+        """Smooth one sequence; it draws nothing."""
+        start = self.smoother.likeliest(model, seq)
+        return linear_posterior(*self.smoother.follow(model, seq, start, self.looser))
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:

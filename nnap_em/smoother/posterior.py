@@ -1,10 +1,12 @@
 """The one form in which every smoother gives p(x_{0:T} | y_{0:T}) of a sequence, and what a smoother is."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float, PRNGKeyArray
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian
@@ -43,3 +45,12 @@ class AbstractSmoother(eqx.Module):
     def tolerant(self) -> "AbstractSmoother":
         """The same for a finished model, where no next epoch mends a lost track: slower and more patient, if it can."""
         return self
+
+    def tries(self) -> Sequence["AbstractSmoother"]:
+        """Smoothers of one structure, one program for all, of which each sequence keeps the likeliest outcome."""
+        return (self,)
+
+
+def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:
+    """The place of the largest; what is no number is never it."""
+    return jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))

@@ -606,8 +606,8 @@ MUTANTS = (
     Mutant(
         "retreat to the model that was refused",
         "em/loop.py",
-        "jax.tree.map(way, state.best, state.proposal)",
-        "jax.tree.map(way, state.model, state.proposal)",
+        "between(state.best, state.proposal, state.stride)",
+        "between(state.model, state.proposal, state.stride)",
         "test_fit.py::test_a_worse_model_is_refused_and_the_way_from_the_best_is_shorter",
     ),
     Mutant(
@@ -651,6 +651,20 @@ MUTANTS = (
         "part == out)",
         "part != out)",
         "test_fit.py::test_a_finish_that_only_the_fitted_sequences_like_is_left_alone",
+    ),
+    Mutant(
+        "the tight try kept whatever is likelier",
+        "em/loop.py",
+        "best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))",
+        "best = 0 * likeliest(jnp.stack([posterior.loglik for posterior in tries]))",
+        "test_kalman.py::test_loosened_passes_one_by_one_give_what_they_give_together",
+    ),
+    Mutant(
+        "what differs in a stack taken for equal",
+        "diagnose/columns.py",
+        "(whole == whole[0]).all()",
+        "(whole == whole[0]).any()",
+        "test_forks.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone",
     ),
     Mutant(
         "all readings must be white",

@@ -15,9 +15,9 @@ from nnap_em.diagnose.case import open_loop_error
 from nnap_em.diagnose.columns import candidate_columns, tracks
 from nnap_em.diagnose.evidence import Question
 from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.propose import surroundings
+from nnap_em.diagnose.propose import proposals, surroundings
 from nnap_em.diagnose.shares import Rows, fold_of, motions, project, share, times
-from nnap_em.effects import catalogue
+from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, weighed
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
@@ -100,6 +100,24 @@ def test_columns_are_difference_quotients(question, known, name):
     column = before.columns[..., -len(candidates[0].probes)]
     # the force is held over a step, the slopes are as wide as predictions err: 2 % at most with this key
     assert np.linalg.norm(column - quotient) < 0.05 * np.linalg.norm(quotient)
+
+
+def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):
+    """Probes share a stack, what is equal in it, and a program with their class."""
+    rig, q = question
+    candidates = proposals(surroundings(rig, q.model, q.data, q.path, ROWS))
+    inputs = jax.vmap(q.model.inputs)(q.data)
+    track = tracks(q.model, q.path, inputs)
+    force, reading = map(np.asarray, candidate_columns(q.model, candidates, track))
+    probes = [probe for candidate in candidates for probe in candidate.probes]
+    assert force.shape[1] == reading.shape[1] == len(probes)
+    for kind in ("UnknownFunction", "Cogging", "SensorBias"):
+        places = [i for i, probe in enumerate(probes) if type(probe).__name__ == kind]
+        place = places[len(places) // 2]
+        alone = candidate_columns(q.model, [Candidate(probes[place], (probes[place],), probes[place])], track)
+        np.testing.assert_allclose(force[:, place], alone.force[:, 0], atol=1e-12)
+        np.testing.assert_allclose(reading[:, place], alone.reading[:, 0], atol=1e-12)
+        assert np.abs(force[:, place]).max() + np.abs(reading[:, place]).max() > 1e-3
 
 
 def test_a_fit_to_multi_step_errors_finds_the_parameter(known):

@@ -660,10 +660,10 @@ MUTANTS = (
         "test_kalman.py::test_loosened_passes_one_by_one_give_what_they_give_together",
     ),
     Mutant(
-        "what differs in a stack taken for equal",
+        "columns of a stack in the wrong places",
         "diagnose/columns.py",
-        "(whole == whole[0]).all()",
-        "(whole == whole[0]).any()",
+        "whole[:, stack.places] =",
+        "whole[:, stack.places[::-1]] =",
         "test_forks.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone",
     ),
     Mutant(

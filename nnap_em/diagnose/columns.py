@@ -106,20 +106,21 @@ def _stacks(probes: Sequence[AbstractEffect]) -> list[Stack]:
     for i, probe in enumerate(probes):
         places.setdefault(jax.tree.structure(probe), []).append(i)
 
-    def stack(*leaves):  # by NumPy: a stack of many small arrays would be one program for every number of them
-        more = (0, -len(leaves) % BUNCH)
-        whole = np.stack([np.asarray(leaf) for leaf in leaves])
-        if len(whole) > 1 and (whole == whole[0]).all():
-            return leaves[0], None
-        return jnp.asarray(np.pad(whole, [more] + [(0, 0)] * (whole.ndim - 1), mode="edge")), 0
-
-    def stacked(index):
-        leaves, structure = zip(*(jax.tree.flatten(probes[i]) for i in index), strict=True)
-        whole, axes = zip(*map(stack, *leaves), strict=True)
-        return jax.tree.unflatten(structure[0], whole), jax.tree.unflatten(structure[0], axes)
-
-    stacks = (Stack(index, *stacked(index)) for index in places.values())
+    stacks = [_stack(index, [probes[i] for i in index]) for index in places.values()]
     return sorted(stacks, key=lambda stack: type(stack.probes).__qualname__)
+
+
+def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
+    """By NumPy: a stack of many small arrays would be one program for every number of them."""
+    flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
+    whole = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
+    same = [bool((a == a[0]).all()) for a in whole]
+    if all(same):  # one probe, or one given twice
+        same = [False] * len(same)
+    pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
+    leaves = [jnp.asarray(a[0] if one else pad(a)) for a, one in zip(whole, same, strict=True)]
+    axes = [None if one else 0 for one in same]
+    return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
 
 
 def _stack_columns(common, track: Track) -> list[Columns]:

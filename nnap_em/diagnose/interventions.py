@@ -64,7 +64,8 @@ def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.nda
     if not a.size:
         return a
     kernel = np.hanning(rows + 2)[1:-1]
-    over = lambda a: np.apply_along_axis(np.convolve, 1, a, kernel / kernel.sum(), "same")  # noqa: E731
+    kernel = kernel / kernel.sum()
+    over = lambda a: np.apply_along_axis(lambda row: np.convolve(row, kernel, "same"), 1, a)  # noqa: E731
     known = np.isfinite(a)
     return np.where(over(known.astype(float)) > 0.99, over(np.where(known, a, 0.0)), np.nan)
 

@@ -91,8 +91,8 @@ def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
     return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
 
 
-BLOCK = 4
-"""The number of parameters is padded to a multiple of this, for fewer programs."""
+BLOCK = 8
+"""The number of parameters is padded to a multiple of this, and to one at least: one program for most models."""
 
 
 def _quadratic(common, one) -> Quadratic:
@@ -101,29 +101,34 @@ def _quadratic(common, one) -> Quadratic:
 
 
 @eqx.filter_jit
-def _widened(prior: ParameterPrior, w, by_parameter, reading_by_parameter, pad: int):
-    """Parameters, and sensitivities to them, with `pad` more that do nothing; they are nameless here."""
+def _widened(prior: ParameterPrior, w, here: Local, path: Gaussian, pad: int):
+    """Parameters, and sensitivities to them, with `pad` more that do nothing, nameless here; and the first states."""
     widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
     mean, std = widen(prior.mean), jnp.pad(prior.std, (0, pad), constant_values=1.0)
     wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), mean, std)
-    return wide, widen(w), widen(by_parameter), widen(reading_by_parameter)
+    moved = widen(here.by_parameter), widen(here.reading_by_parameter)
+    return wide, widen(w), moved, jax.tree.map(lambda a: a[:, 0], path)
 
 
 @eqx.filter_jit
-def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, path: Gaussian, loglik, used, pad: int):
-    """The step; the last `pad` parameters do nothing and are not in the outcome."""
+def _narrowed(core: Core, hessian, pad: int):
+    """Without the last `pad` parameters."""
+    size = core.w.shape[0] - pad
+    return core._replace(w=core.w[:size]), hessian[:size, :size]
+
+
+@eqx.filter_jit
+def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian, loglik, used):
     weights = rule.weights(core)
     used = used & jnp.isfinite(loglik) & jnp.all(jnp.isfinite(terms.information), axis=(1, 2))
     used = used & jnp.all(jnp.isfinite(terms.score), axis=1) & jnp.all(jnp.isfinite(terms.noise_score), axis=1)
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
-    first = jax.tree.map(lambda a: pick(a[:, 0]), path)
+    first = jax.tree.map(pick, first)
     w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
     hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
     log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
-    size = w.shape[0] - pad
-    after = Core(core.unknown, w[:size], log_q, log_r, rule.first(core.start, first, used))
-    return after, hessian[:size, :size], used
+    return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
 
 
 class ScoringMStep(AbstractMStep):
@@ -190,13 +195,14 @@ class ScoringMStep(AbstractMStep):
 
         With it the posterior precision where it began, and which of the sequences `used` could be.
         """
-        pad = -self.prior.size % BLOCK
-        prior, w, of_state, of_reading = _widened(self.prior, core.w, here.by_parameter, here.reading_by_parameter, pad)
+        pad = BLOCK * max(1, -(-self.prior.size // BLOCK)) - self.prior.size
+        prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, here, posterior.state, pad)
         rule = eqx.tree_at(lambda r: r.prior, self, prior)
         here = here._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (here, posterior, read))
-        return _advance(rule, core._replace(w=w), terms, posterior.state, posterior.loglik, used, pad)
+        core, hessian, used = _advance(rule, core._replace(w=w), terms, first, posterior.loglik, used)
+        return *_narrowed(core, hessian, pad), used
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
         """Log variances of process and reading noise after the step."""

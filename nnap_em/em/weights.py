@@ -58,7 +58,12 @@ class Weights(eqx.Module):
     @eqx.filter_jit
     def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
         """Sensitivity of phi to the weights."""
-        return jax.jacfwd(lambda w: self.phi(unknown, w))(w)
+        cut = w.shape[0] - self.prior.size
+        at = lambda v: jax.jacrev(lambda w: unknown.with_weights(w)(v))(w[:cut])  # noqa: E731
+        own = jnp.swapaxes(jax.vmap(at)(self.nodes.T), 0, 1).reshape(
+            self.nodes.size, cut
+        )  # a node knows nothing of the others
+        return jax.scipy.linalg.block_diag(own, jnp.eye(self.prior.size, dtype=w.dtype))
 
     def hessian(self, unknown, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
         """Posterior precision of the weights, and the sensitivity of phi to them."""
@@ -73,13 +78,19 @@ class Weights(eqx.Module):
         information: Float[Array, "phi phi"],
         iterations: int,
     ) -> Float[Array, " weight"]:
-        """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3]."""
+        """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3].
+
+        A step solves (A'A + D) step = gradient with A = root J, I = root' root, by the Woodbury identity: there are
+        fewer nodes than weights.
+        """
         phi0 = self.phi(unknown, w0)
         precision = self.precision(w0)
         middle = self.middle()
         symmetry = self.symmetry()
         score = score - symmetry @ phi0
         information = information + symmetry
+        values, vectors = jnp.linalg.eigh(information)
+        root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
 
         def loss(w):
             d = self.phi(unknown, w) - phi0
@@ -91,10 +102,12 @@ class Weights(eqx.Module):
 
         def body(carry):
             w, value, damping, count, gain = carry
-            hessian, jac = self.hessian(unknown, w, information)
+            jac = self.jacobian(unknown, w)
             gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
-            factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.diag(jnp.diag(hessian)))
-            trial = w - jax.scipy.linalg.cho_solve(factor, gradient)
+            a = root @ jac
+            d = precision + damping * (precision + jnp.sum(a * a, axis=0))
+            inner = jax.scipy.linalg.cho_factor(jnp.eye(a.shape[0], dtype=a.dtype) + (a / d) @ a.T)
+            trial = w - (gradient - a.T @ jax.scipy.linalg.cho_solve(inner, a @ (gradient / d))) / d
             new = loss(trial)
             better = new < value
             gain = jnp.where(better, 0.7 * gain + 0.3 * (value - new), gain)

@@ -343,7 +343,7 @@ def test_only_what_the_rule_believes_is_added(monkeypatch, held_out, added):
     monkeypatch.setattr(loop, "_found", lambda *_: _found("motor_gain"))
     monkeypatch.setattr(loop, "_plain", lambda *_: None)
     steps: list[Step] = []
-    now, _ = loop._search(_loop([]), BARE, DATA, 9, steps)
+    now, _ = loop._search(_loop([]), BARE, 9, steps)
     assert _names(now.model) == added
     assert [step.accepted for step in steps] == ([key_of(case.effect), None] if added else [None])
 

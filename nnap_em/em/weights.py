@@ -106,7 +106,7 @@ class Weights(eqx.Module):
             gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
             a = root @ jac
             d = precision + damping * (precision + jnp.sum(a * a, axis=0))
-            inner = jax.scipy.linalg.cho_factor(jnp.eye(a.shape[0], dtype=a.dtype) + (a / d) @ a.T)
+            inner = jax.scipy.linalg.cho_factor(jnp.eye(a.shape[0], dtype=a.dtype) + (a / d[None]) @ a.T)
             trial = w - (gradient - a.T @ jax.scipy.linalg.cho_solve(inner, a @ (gradient / d))) / d
             new = loss(trial)
             better = new < value

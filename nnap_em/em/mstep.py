@@ -22,7 +22,7 @@ from ..data.dataset import Dataset, fill_missing
 from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each
+from ..numerics.parallel import at_home, each
 from ..smoother.kalman import Cubature, Tangent
 from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
@@ -54,7 +54,7 @@ class Core(NamedTuple):
 
 def between(here: Any, there: Any, share: float) -> Any:
     """A model, or a part of one, a share of the way from `here` to `there`."""
-    return _between(here, there, jnp.asarray(share, jnp.result_type(float)))
+    return _between(*at_home((here, there, jnp.asarray(share, jnp.result_type(float)))))
 
 
 @eqx.filter_jit
@@ -201,7 +201,8 @@ class ScoringMStep(AbstractMStep):
         here = here._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (here, posterior, read))
-        core, hessian, used = _advance(rule, core._replace(w=w), terms, first, posterior.loglik, used)
+        asked = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
+        core, hessian, used = _advance(*asked)
         return *_narrowed(core, hessian, pad), used
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:

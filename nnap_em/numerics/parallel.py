@@ -112,6 +112,17 @@ def _program(function: Callable) -> Callable:
     return eqx.filter_jit(run)
 
 
+def at_home(tree: Any) -> Any:
+    """Arrays on this process's first device, where `each` leaves its results.
+
+    A program is compiled once for arrays that are bound to a device, and once more where one of them is not.
+    """
+    arrays, rest = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arrays)):
+        return tree
+    return eqx.combine(jax.device_put(arrays, jax.local_devices()[0]), rest)
+
+
 def _place(tree, sharding: NamedSharding):
     """Arrays that this process holds whole, where its devices' shares of them belong."""
     arrays, rest = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))

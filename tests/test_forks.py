@@ -115,7 +115,7 @@ def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):
         places = [i for i, probe in enumerate(probes) if type(probe).__name__ == kind]
         place = places[len(places) // 2]
         alone = candidate_columns(q.model, [Candidate(probes[place], 2 * (probes[place],), probes[place])], track)
-        for i in range(2):
+        for i in range(2):  # forces are up to some 100: rounding
             np.testing.assert_allclose(force[:, place], alone.force[:, i], atol=1e-12)
             np.testing.assert_allclose(reading[:, place], alone.reading[:, i], atol=1e-12)
         assert np.abs(force[:, place]).max() + np.abs(reading[:, place]).max() > 1e-3

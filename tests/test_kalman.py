@@ -242,10 +242,11 @@ def test_loosened_passes_one_by_one_give_what_they_give_together(bench):
     smoother = CubatureSmoother(StartBank((1, 5, 1, 1)), iterations=1, inflations=(1.0, 30.0, 1000.0))
     together = eqx.filter_jit(jax.vmap(lambda seq: smoother(model, prepare(model, seq))))(data)
     apart = e_step(model, data, smoother, key=jax.random.key(0))
+    # rounding, in other programs, over 60 rows of a chaotic motion
     np.testing.assert_allclose(apart.loglik, together.loglik, rtol=1e-8)
     np.testing.assert_allclose(apart.state.mean, together.state.mean, rtol=1e-6, atol=1e-6)
     first = e_step(model, data, CubatureSmoother(smoother.bank), key=jax.random.key(0))
-    assert np.max(np.asarray(apart.loglik - first.loglik)) > 0.01
+    assert np.max(np.asarray(apart.loglik - first.loglik)) > 0.01  # or there was nothing to choose
 
 
 def _cast(tree, dtype):

@@ -388,7 +388,10 @@ def test_acrobot_agrees_with_the_kalman_smoother():
 
 
 def test_the_filtered_cloud_of_the_example_is_the_kalman_filters():
-    """Weights that look ahead are up to a constant of each time; the rest is that of 40,000 particles."""
+    """Weights that look ahead are up to a constant of each time; what is left is sampling.
+
+    4,000 particles are off by up to 0.11 standard deviations, 40,000 by 0.04: one over the root of their number.
+    """
     model = _oscillator()
     seq = _linear_data(model)
     guide = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=0)

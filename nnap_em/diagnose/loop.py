@@ -183,7 +183,7 @@ def close(loop: Loop) -> Closed:
         last, known = length, now.found
         now, further = _search(loop, now, length, steps)
         if now.found is not known:  # one more, or one in the place of another
-            state, ahead = further, ahead[-1:]  # the rest is seen best over the whole, which is followed now
+            state, ahead = further, ahead[-1:]  # what is left is seen best over the whole
             last = playoff(length, longest) if further is not None else length
     if now.found and state is None:
         state = grow(loop, now, longest, longest)

@@ -57,13 +57,11 @@ class Weights(eqx.Module):
 
     @eqx.filter_jit
     def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
-        """Sensitivity of phi to the weights."""
+        """Sensitivity of phi to the weights; a node knows nothing of the others."""
         cut = w.shape[0] - self.prior.size
         at = lambda v: jax.jacrev(lambda w: unknown.with_weights(w)(v))(w[:cut])  # noqa: E731
-        own = jnp.swapaxes(jax.vmap(at)(self.nodes.T), 0, 1).reshape(
-            self.nodes.size, cut
-        )  # a node knows nothing of the others
-        return jax.scipy.linalg.block_diag(own, jnp.eye(self.prior.size, dtype=w.dtype))
+        torque = jnp.swapaxes(jax.vmap(at)(self.nodes.T), 0, 1).reshape(self.nodes.size, cut)
+        return jax.scipy.linalg.block_diag(torque, jnp.eye(self.prior.size, dtype=w.dtype))
 
     def hessian(self, unknown, w: Float[Array, " weight"], information: Float[Array, "phi phi"]):
         """Posterior precision of the weights, and the sensitivity of phi to them."""

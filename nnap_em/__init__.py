@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from .data.dataset import DataError, Dataset, pad
     from .data.logs import DataWarning, Logs, read_logs
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
+    from .design.experiment import Design, design_experiment
+    from .design.limits import DesignError
     from .diagnose.findings import findings
     from .diagnose.loop import close_the_loop
     from .diagnose.outcome import Closed
@@ -37,6 +39,8 @@ __all__ = [
     "DataError",
     "DataWarning",
     "Dataset",
+    "Design",
+    "DesignError",
     "EMState",
     "Experiment",
     "ExportError",
@@ -59,6 +63,7 @@ __all__ = [
     "all_devices",
     "check",
     "close_the_loop",
+    "design_experiment",
     "examples",
     "export",
     "findings",
@@ -85,6 +90,8 @@ _homes = {
     "em.check": ("Finding", "check"),
     "data.dataset": ("DataError", "Dataset", "pad"),
     "data.logs": ("DataWarning", "Logs", "read_logs"),
+    "design.experiment": ("Design", "design_experiment"),
+    "design.limits": ("DesignError",),
     "diagnose.findings": ("findings",),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),

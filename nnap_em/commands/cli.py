@@ -23,6 +23,7 @@ examples:
   nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
+  nnap-em design found --out next                   the inputs to play next, so that what is open is answered
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
   nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
@@ -70,6 +71,18 @@ examples:
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
 report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
 test/ serves for the reported errors only.
+"""
+_DESIGN = """\
+examples:
+  nnap-em design found --out next                   what the last report leaves open, all together
+  nnap-em design fit --out next --for friction --seconds 60 --sequences 12
+  nnap-em design found --out next --for apart --rival actuator_lag
+  nnap-em diagnose bench --more next/logs --out again
+
+FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inputs, ready to be played), motion/*.csv
+(what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
+where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, apart (laws
+that the logs cannot tell apart), or all.
 """
 _PREDICT = """\
 examples:
@@ -142,10 +155,23 @@ def parser() -> argparse.ArgumentParser:
         bench.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
     for fits in (identify, diagnose):
         fits.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+        fits.add_argument(
+            "--more", action="append", default=[], metavar="NEW", type=Path, help="a folder of further logs to train on"
+        )
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
-    for fits in (identify, diagnose):
+    design = command("design", "find the inputs to play next", _DESIGN)
+    design.add_argument("folder", metavar="FIT", type=Path, help="model.npz or after.npz, or the folder that holds it")
+    design.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be told (default: all)")
+    design.add_argument("--rival", action="append", default=[], metavar="LAW", help="NAME[:JOINT]: tell it too")
+    design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
+    design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
+    design.add_argument(
+        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
+    )
+    for fits in (identify, diagnose, design):
         fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
         fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
@@ -160,7 +186,7 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 
-    for reads in (check, identify, diagnose, predict, smooth):
+    for reads in (check, identify, diagnose, design, predict, smooth):
         reads.add_argument(
             "--trust-readings", action="store_true", help="use spikes and what a stuck, late or saturated sensor reads"
         )

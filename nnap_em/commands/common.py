@@ -6,7 +6,7 @@ import os
 import shlex
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -16,8 +16,9 @@ import numpy as np
 
 from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
-from ..data.logs import DataWarning, Logs, check_split, read_logs
+from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
+from ..design.limits import DesignError
 from ..em.build import build_system, measure_scales
 from ..em.check import BAD, torques
 from ..em.identify import Identified
@@ -36,13 +37,15 @@ class Halted(RuntimeError):
     """A file could not be written: the message names it, and says what is kept and how to go on."""
 
 
-MISTAKES = (RigError, DataError, StoreError, FitError, ExportError, Halted)
+MISTAKES = (RigError, DataError, StoreError, FitError, DesignError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
-MODEL = "model.npz"
+MODEL, AFTER = "model.npz", "after.npz"
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
 MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
+OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
+"""Those that decide the numbers."""
 Say = Callable[[str], None]
 """Where lines of progress go."""
 
@@ -88,13 +91,26 @@ class Bench(NamedTuple):
     """Only where there are any; as predictions of the reported error may see them."""
 
 
-def read_bench(folder: Path, trust: bool) -> Bench:
-    """A data set; `trust`: no reading is masked."""
+def read_bench(folder: Path, trust: bool, more: Sequence[Path] = ()) -> Bench:
+    """A data set, with `more` logs of the same rig to train on; `trust`: no reading is masked."""
     rig = read_rig(folder / "rig.toml", specs)
-    train = read_logs(folder / "train", rig, trust=trust)
+    train = read_training(rig, (folder, *more), trust)
     test = read_logs(folder / "test", rig, trust=trust, until=GIVEN) if has_logs(folder / "test") else None
     check_split(train, test)
     return Bench(rig, train, test)
+
+
+def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
+    """The training logs of some folders: those in train/, or in the folder itself where it has none."""
+    parts = {folder.name: read_logs(within(folder), rig, trust=trust) for folder in folders}
+    if len(parts) < len(folders):
+        raise DataError(f"{folders[0]}: two of the folders have one name; rename one: files are told by their folders")
+    return together(parts)
+
+
+def within(folder: Path) -> Path:
+    """Where the training logs of a folder are."""
+    return folder if has_logs(folder) and not (folder / "train").is_dir() else folder / "train"
 
 
 def warn_of_torques(folder: Path, bench: Bench) -> None:
@@ -109,8 +125,10 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
 
 
 def model_file(path: Path) -> Path:
-    """The model that is meant by a file, or by the folder that holds it."""
-    return path / MODEL if path.is_dir() else path
+    """The model that is meant by a file, or by the folder of an identification or of a diagnosis."""
+    if not path.is_dir():
+        return path
+    return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
 
 
 def write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> None:
@@ -136,7 +154,7 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[None
 
     Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
     """
-    same = _given(args, "smoother", "particles", "seed", none=True)
+    same = _given(args, *OPTIONS, none=True)
     of = {"rig.toml": dataclasses.asdict(bench.rig), "training data": fingerprint(bench.train.data), **same}
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
@@ -165,8 +183,9 @@ def _how_to_go_on(args: argparse.Namespace, journal: Journal) -> str:
     if not len(journal):
         return "stopped before the end of the first step; nothing was kept"
     command = ["nnap-em", args.command, str(args.folder), "--out", str(args.out)]
-    for name, value in _given(args, "smoother", "particles", "epochs", "seed").items():
-        command += [name, str(value)]
+    for name, value in _given(args, *OPTIONS, "epochs", "more", "logs").items():
+        for one in value if isinstance(value, list) else [value]:
+            command += [name, str(one)]
     command += ["--trust-readings"] * args.trust_readings
     return f"stopped with {len(journal)} finished steps kept; to go on: {shlex.join([*command, '--resume'])}"
 

@@ -23,7 +23,7 @@ from .common import MODEL, Say, read_bench, resumable, warn_of_torques
 def run(args: argparse.Namespace, say: Say) -> None:
     """Fit, and report; the test logs serve for the reported error alone."""
     began = time.perf_counter()
-    bench = read_bench(args.folder, args.trust_readings)
+    bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
     data, epochs = bench.train.data, []
     with resumable(args, bench, say):
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
         for name in ("report.json", "report.html"):  # older ones are not of the model that is written now
             (args.out / name).unlink(missing_ok=True)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
-        notes = {"settings": settings, "epochs": epochs}
+        notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}
         save(args.out / MODEL, fitted, fingerprint=fingerprint(data), notes=notes)
         write_identification(
             args.out, fitted, bench.train, bench.test, epochs,

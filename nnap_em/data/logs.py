@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -101,6 +101,25 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
         if leaks:
             raise DataError(f"{found}; remove one of the two: test sequences are new to the fit")
         warnings.warn(f"{found}; cut sequences without overlap", DataWarning, 2)
+
+
+def together(parts: Mapping[str, Logs]) -> Logs:
+    """Logs of one rig from some folders as one; files of all but the first are told by the names of their folders."""
+    first, *rest = parts.items()
+    if not rest:
+        return first[1]
+    named = [("", first[1]), *((f"{name}/", logs) for name, logs in rest)]
+    files = tuple(start + file for start, logs in named for file in logs.files)
+    masked = tuple(m._replace(file=start + m.file) for start, logs in named for m in logs.masked)
+    every = [logs for _, logs in named]
+    unmasked = pad([s for logs in every for s in _unpadded(logs.as_read)]) if masked else None
+    return Logs(files, pad([s for logs in every for s in _unpadded(logs.data)]), first[1].columns, masked, unmasked)
+
+
+def _unpadded(data: Dataset) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Time, inputs and readings of every sequence, without padding."""
+    t, u, y, valid = map(np.asarray, data)
+    return ((a[rows], b[rows], c[rows]) for a, b, c, rows in zip(t, u, y, valid, strict=True))
 
 
 class _Table(NamedTuple):

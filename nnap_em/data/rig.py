@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from ..storage.files import replace_text
+from .limits import UNBOUNDED, Bounds, read_bounds
 from .units import parameter_unit, quantities
 
 _FRICTION = {"unknown": True, "none": False}
@@ -24,6 +25,8 @@ _MEND = {  # how the line of a key or table should look
     "measurement": 'a table [measurement] with columns = ["theta1", "dtheta1"]',
     "noise_std": "a table [measurement.noise_std] with one number above 0 per column",
     "start": "a table [start] with lines such as theta2 = { mean = 0.0, std = 0.1 }",
+    "limits": "a table [limits] with lines such as u = 0.3 or theta1 = [-2.0, 2.0]",
+    "rate": "a table [limits.rate] with lines such as u = 5.0 (N m/s)",
     "type": 'type = "acrobot"',
     "friction": 'friction = "unknown" (to be learned) or friction = "none"',
     "actuated_joint": "actuated_joint = 2 (or a table [input] with columns and joints)",
@@ -83,6 +86,7 @@ class Rig:
     measured: tuple[str, ...]
     noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
     start: Mapping[str, Declared]
+    limits: Bounds = UNBOUNDED  # what it may be asked to do; what is absent: as far as the logs went
 
     def __str__(self) -> str:
         inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
@@ -106,7 +110,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     """
     path = Path(path)
     root = _Table(path, "", _parse(path))
-    root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start"))
+    root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start", "limits"))
     if root.number("format") != 1:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
@@ -131,6 +135,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},
+        limits=read_bounds(root.table("limits", absent={}), input_columns, spec.states),
     )
 
 
@@ -152,6 +157,7 @@ def write_rig(rig: Rig, path: Path) -> None:
     lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
     lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
     lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
+    lines += _limits(rig.limits)
     replace_text(path, "\n".join(lines) + "\n")
 
 
@@ -306,6 +312,16 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
 
 def _lines(values: Mapping[str, str]) -> list[str]:
     return [f"{name} = {value}    # {parameter_unit(name)}" for name, value in values.items()]
+
+
+def _limits(limits: Bounds) -> list[str]:
+    tables = {"limits": limits.values, "limits.rate": limits.rate, "limits.start": limits.start}
+    return [
+        line
+        for name, table in tables.items()
+        if table
+        for line in ("", f"[{name}]", *(f"{key} = {list(pair)!r}" for key, pair in table.items()))
+    ]
 
 
 def _pair(value: Declared) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, fill_missing
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother, Posterior
@@ -65,8 +65,8 @@ def _shown(model, one) -> Gaussian:
     return show(model, state, seq)
 
 
-class _Paths(NamedTuple):
-    """What the sample paths of all sequences have in common."""
+class Paths(NamedTuple):
+    """Models drawn from the posterior: what the sample paths of all sequences have in common."""
 
     model: StateSpaceModel
     prior: ParameterPrior
@@ -75,19 +75,36 @@ class _Paths(NamedTuple):
     """Friction of each path beyond that of the model."""
     parameters: Float[Array, "path parameter"]
 
+    def inputs(self, seq: Dataset) -> Inputs:
+        """What acts from outside on one sequence, by row and path."""
+        return jax.vmap(lambda p: self.prior.write(self.model, p).inputs(seq), out_axes=1)(self.parameters)
 
-def _roll(common: _Paths, one) -> tuple[Float[Array, "time state"], Float[Array, "time state"]]:
+    def advance(self, x: Float[Array, "path state"], u: Inputs):
+        """The mean of the next state of every path, and the present one as it is shown."""
+        dof = self.nodes.shape[0]
+
+        def one(x, u, table, parameters):
+            force = jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table)
+            now = self.prior.write(self.model, parameters)
+            return now.transition(x, u, force), now.shown(x, u)
+
+        return jax.vmap(one)(x, u, self.tables, self.parameters)
+
+
+def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
+    """`count` models from the posterior of friction and parameters."""
+    model, prior = fitted.model, fitted.m_step.prior
+    nodes = fitted.m_step.weights(model).nodes
+    deviations = phi_samples(fitted, count, key=key)
+    tables = deviations[:, : nodes.size].reshape(-1, *nodes.shape)
+    return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
+
+
+def _roll(common: Paths, one) -> tuple[Float[Array, "time state"], Float[Array, "time state"]]:
     """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
-    model, prior, nodes, tables, parameters = common
+    model, tables = common.model, common.tables
     (mean, cov), seq, known, key = one
-    dof = nodes.shape[0]
-
-    def advance(x, u, table, parameters):
-        force = jax.vmap(jnp.interp)(x[dof : 2 * dof], nodes, table)
-        now = prior.write(model, parameters)
-        return now.transition(x, u, force), now.shown(x, u)
-
-    u = jax.vmap(lambda p: prior.write(model, p).inputs(seq), out_axes=1)(parameters)
+    u = common.inputs(seq)
     rows, last = jnp.arange(mean.shape[0]), jnp.sum(known) - 1
     key_start, key_noise = jax.random.split(key)
     shape = (tables.shape[0], mean.shape[-1])
@@ -97,7 +114,7 @@ def _roll(common: _Paths, one) -> tuple[Float[Array, "time state"], Float[Array,
 
     def step(x, slices):
         k, u, kick = slices
-        following, shown = jax.vmap(advance)(x, u, tables, parameters)
+        following, shown = common.advance(x, u)
         x = jnp.where(k >= last, following + kick, x)
         return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
 
@@ -122,11 +139,7 @@ def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArra
     known = given_samples(data, given)
     posterior = smooth(fitted, data._replace(valid=known))
     key_draw, key_roll = jax.random.split(key)
-    model, prior = fitted.model, fitted.m_step.prior
-    nodes = fitted.m_step.weights(model).nodes
-    deviations = phi_samples(fitted, samples, key=key_draw)
-    tables = deviations[:, : nodes.size].reshape(-1, *nodes.shape)
-    common = _Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
+    common = drawn_paths(fitted, samples, key=key_draw)
     sequences, rows = data.t.shape
     numbers = rows * samples * (posterior.state.mean.shape[-1] + data.u.shape[-1])
     together = max(1, AbstractSmoother.room // (32 * numbers))  # noise, inputs and what draws them

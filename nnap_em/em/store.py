@@ -17,6 +17,7 @@ import numpy as np
 
 from .. import __version__
 from ..data.dataset import Dataset
+from ..data.limits import Bounds
 from ..data.rig import Declared, Rig
 from ..effects import catalogue, parts
 from ..smoother import kinds
@@ -226,6 +227,10 @@ def _rig(told: Mapping[str, Any]) -> Rig:
 
     values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
     values["parameters"], values["start"] = declared(told["parameters"]), declared(told["start"])
+    pairs = {
+        part: {name: tuple(pair) for name, pair in table.items()} for part, table in told.get("limits", {}).items()
+    }
+    values["limits"] = Bounds(**pairs)
     return Rig(**values)
 
 

@@ -1,0 +1,228 @@
+"""What is a designed experiment worth?  Played on `examples/plant.py`, which shares no code with the library.
+
+    python benchmarks/design.py friction --seeds 5 --out OUT     # some three minutes a seed, 2 cores
+    python benchmarks/design.py apart --seeds 5 --out OUT        # some eight minutes a seed
+    python benchmarks/design.py table --out OUT > docs/design_table.md
+
+friction: an acrobot whose joint 1 is measured alone, 30 s of sines.  Then 30 s more, designed or of the same sines: how
+wide is the friction band near rest (the lowest fifth of the velocities in the first logs) as stated, and how far is it
+from the truth?
+
+apart: two laws that 30 s of sines leave equivalent, then 30 s designed: which is named?
+"""
+
+import argparse
+import json
+import math
+import platform
+import time
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import plant
+
+import nnap_em
+from nnap_em.commands import common
+from nnap_em.data.dataset import Dataset, pad
+from nnap_em.design.experiment import Design, design_experiment
+from nnap_em.design.questions import after
+from nnap_em.design.rivals import Law, Rivals, instead
+from nnap_em.em.identify import Identified, friction_table, identify
+from nnap_em.storage.files import cores, replace_text
+
+SEQUENCES = 6
+"""Of 5 s: 30 s."""
+PLAYS = 17
+"""How often the machine plays a design, for limits: 6 sequences and 5 seeds make 510."""
+
+
+def logs(case: plant.Case, folder: Path):
+    """The rig, and its training logs."""
+    plant.write(case, folder)
+    rig = nnap_em.read_rig(folder / "rig.toml", nnap_em.specs)
+    return rig, nnap_em.read_logs(folder / "train", rig).data
+
+
+def play(case: plant.Case, design: Design, seed: int) -> tuple[np.ndarray, Dataset]:
+    """What the machine does with a design: its states, and the logs of it."""
+    machine, rng = plant.build(case), np.random.default_rng([seed, 7])
+    u = design.u[..., 0]
+    start = design.start + rng.standard_normal(design.start.shape) * [0.03, 0.03, 0.0, 0.0]
+    x = plant.simulate(machine, start, u, np.zeros(len(u)), case.process * rng.standard_normal((*u.shape, machine.dof)))
+    y = plant.readings(machine._replace(case=case._replace(seed=10_000 + seed)), x)
+    return x, pad([(design.t, a[:, None], b) for a, b in zip(u, y, strict=True)])
+
+
+def joined(*parts: Dataset) -> Dataset:
+    """Sequences of equal length."""
+    return Dataset(*(np.concatenate([np.asarray(getattr(p, name)) for p in parts]) for name in Dataset._fields))
+
+
+def some(data: Dataset, which: slice) -> Dataset:
+    """A part of the sequences."""
+    return Dataset(*(np.asarray(a)[which] for a in data))
+
+
+def near_rest(case: plant.Case, fitted: Identified, grid: np.ndarray) -> dict[str, list[float]]:
+    """Stated and true error of friction, rms over `grid`, for every joint."""
+    table, machine = friction_table(fitted, jnp.asarray(grid)), plant.build(case)
+    pairs = zip(machine.friction, grid, strict=True)
+    truth = np.stack([plant.friction_torque(case.friction_shape, f, v) for f, v in pairs])
+    rms = lambda a: np.sqrt(np.mean(np.asarray(a) ** 2, axis=1)).tolist()  # noqa: E731
+    return {"stated": rms(table.std), "true": rms(np.asarray(table.torque) - truth)}
+
+
+def expected(design: Design, told, grid: np.ndarray) -> list[float]:
+    """The band that a design promises, rms over `grid`."""
+    nodes = np.asarray(design.fit.nodes)
+    cov = after(np.asarray(design.fit.cov), told.information)[: nodes.size, : nodes.size]
+    out = []
+    for j, v in enumerate(grid):
+        weights = np.stack([np.interp(v, nodes[j], row) for row in np.eye(nodes.shape[1])], axis=1)
+        own = cov[j * nodes.shape[1] : (j + 1) * nodes.shape[1], j * nodes.shape[1] : (j + 1) * nodes.shape[1]]
+        out.append(float(np.sqrt(np.mean(np.einsum("vi,ij,vj->v", weights, own, weights)))))
+    return out
+
+
+def broken(design: Design, x: np.ndarray) -> list[bool]:
+    """Which sequences leave the limits."""
+    low, high = design.limits.lowest, design.limits.highest
+    u, most = design.u, design.limits.rate * (design.t[1] - design.t[0])
+    tame = (u >= design.limits.low - 1e-9).all((1, 2)) & (u <= design.limits.high + 1e-9).all((1, 2))
+    tame &= (np.abs(np.diff(u, axis=1)) <= most + 1e-9).all((1, 2))
+    return (~(tame & (x >= low).all((1, 2)) & (x <= high).all((1, 2)))).tolist()
+
+
+def friction(seed: int, out: Path) -> dict[str, Any]:
+    """One rig."""
+    case = plant.Case(sequences=2 * SEQUENCES, tests=1, torque="sine", seed=seed)
+    rig, data = logs(case, out / f"rig_{seed}")
+    first, key = some(data, slice(SEQUENCES)), jax.random.key(seed)
+    base = identify(rig, first, key=key)
+    began = time.perf_counter()
+    design = design_experiment(base, first, key=key, question="friction", seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
+    seconds = time.perf_counter() - began
+    _, new = play(case, design, seed)
+    fits = {"first": base, "more": identify(rig, data, key=key), "designed": identify(rig, joined(first, new), key=key)}
+    grid = np.linspace(-design.slow, design.slow, 41).T
+    plays = [b for n in range(PLAYS) for b in broken(design, play(case, design, 100 * seed + n)[0])]
+    return {
+        "seed": seed,
+        "design_s": seconds,
+        **{name: near_rest(case, fitted, grid) for name, fitted in fits.items()},
+        "expected": {"designed": expected(design, design.told, grid), "more": expected(design, design.old, grid)},
+        "broken": int(np.sum(plays)),
+        "plays": len(plays),
+    }
+
+
+HALVES = 6
+"""Strengths that are tried, each half of the one before, until the first logs leave a pair equivalent."""
+PAIRS = {
+    "delay or lag": (Law("input_delay", 2), Law("actuator_lag", 2)),
+    "gain or saturation": (Law("motor_gain", 2), Law("saturation", 2)),
+    "brake or friction by position": (Law("eddy_brake", 2), Law("position_dependent_friction", 2)),
+    "payload or centre of mass": (Law("payload", 2), Law("center_of_mass", 2)),
+    "tilt or spring": (Law("base_tilt"), Law("torsional_spring", 1)),
+}
+EVEN = 5.0
+"""Log-likelihood [nat] within which two laws are equivalent, as in a diagnosis."""
+STRENGTH = {"delay": 1, "tau": 1, "mass": 1, "dlc": 1, "angle": 1, "k": 1, "c": 1, "depth": 1}
+"""Parameters that are halved; of gain and limit it is what they take away."""
+
+
+def weaker(effect: dict[str, Any], share: float) -> dict[str, Any]:
+    """An effect a share as strong."""
+    out = dict(effect)
+    for name, value in effect.items():
+        if name in STRENGTH:
+            out[name] = share * value
+        elif name == "gain":
+            out[name] = 1 - share * (1 - value)
+        elif name == "limit":
+            out[name] = value + (1 - share) * (0.46 - value)
+    return out
+
+
+def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified]]:
+    """Log-likelihood of the first law over the second [nat], and both fits."""
+    base = identify(rig, data, key=key)
+    fits = [instead(base, data, None, law) for law in laws]
+    tops = [np.nan_to_num(np.asarray(fit.state.top), nan=-1e6) for fit in fits]
+    return float(np.sum(tops[0] - tops[1])), fits
+
+
+def apart(seed: int, out: Path) -> dict[str, Any]:
+    """All pairs, either law as the true one."""
+    rows = []
+    for name, both in PAIRS.items():
+        for turn in (both, both[::-1]):
+            file = out / f"{seed}_{name}_{turn[0].name}.json".replace(" ", "_")
+            if not file.exists():
+                row = _told_apart(seed, name, turn, out)
+                print(row, flush=True)
+                replace_text(file, json.dumps(row) + "\n")
+            rows.append(json.loads(file.read_text()))
+    return {"seed": seed, "rows": rows}
+
+
+def _told_apart(seed: int, name: str, laws: tuple[Law, Law], out: Path) -> dict[str, Any]:
+    """A rig with the first law: what the first logs say, more of them, and a design."""
+    key = jax.random.key(seed)
+    spring = {"name": "torsional_spring", "joint": 1, "k": 0.06, "theta0": 0.0}
+    (strong,) = plant.STRONG[laws[0].name] if laws[0].name != "torsional_spring" else (spring,)
+    for n in range(HALVES):
+        effect = weaker(strong | ({"joint": laws[0].joint} if laws[0].joint else {}), 0.5 ** (n + 1))
+        case = plant.Case(effects=(effect,), sequences=2 * SEQUENCES, tests=1, torque="sine", seed=seed)
+        rig, data = logs(case, out / "rig")
+        first = some(data, slice(SEQUENCES))
+        lead, fits = ahead(rig, first, laws, key)
+        if abs(lead) < EVEN:
+            break
+    row = {"pair": name, "true": laws[0].name, "effect": effect, "first": lead, "more": math.nan, "designed": math.nan}
+    if abs(lead) >= EVEN:
+        return row
+    own, other = (0, 1) if lead > 0 else (1, 0)  # a diagnosis holds the likelier one
+    pair = Rivals((str(laws[own]), str(laws[other])), fits[own], fits[other])
+    began = time.perf_counter()
+    design = design_experiment(
+        fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
+    )
+    assert design.apart is not None
+    seconds, (_, new) = time.perf_counter() - began, play(case, design, seed)
+    (more, _), (told, _) = (ahead(rig, each, laws, key) for each in (data, joined(first, new)))
+    far = {side: design.apart.distance(t).tolist() for side, t in (("designed", design.told), ("old", design.old))}
+    return row | {"more": more, "designed": told, "distance": far, "design_s": seconds}
+
+
+JOBS = {"friction": friction, "apart": apart}
+
+
+def main() -> None:
+    """Run a job for some seeds; what is done is kept."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("job", choices=[*JOBS])
+    arguments.add_argument("--seeds", type=int, default=5)
+    arguments.add_argument("--out", type=Path, required=True)
+    args = arguments.parse_args()
+    common.set_up()
+    for seed in range(1, args.seeds + 1):
+        file = args.out / f"{args.job}_{seed}.json"
+        if not file.exists():
+            began = time.perf_counter()
+            row = JOBS[args.job](seed, args.out / args.job)
+            row |= {
+                "seconds": time.perf_counter() - began,
+                "date": str(date.today()),
+                "machine": f"{platform.machine()}, {cores()} cores",
+            }
+            replace_text(file, json.dumps(row, indent=1) + "\n")
+        print(file.read_text(), flush=True)
+
+
+if __name__ == "__main__":
+    main()

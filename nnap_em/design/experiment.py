@@ -1,0 +1,207 @@
+"""The next experiment: which inputs, played on the machine, would answer the open questions best."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..em.identify import Identified
+from ..em.mstep import kept
+from ..em.predict import drawn_paths, smooth
+from .information import Fit, known
+from .limits import DesignError, Limits, limits_of
+from .play import allowed, motions
+from .questions import AbstractQuestion, Apart, Friction, Parameters, Several, Told
+from .rivals import Rivals
+from .search import EFFORT, Bench, Effort, Plan, Say, search, tell, told
+from .signals import Proposal, played, starts
+
+DRAWN = 32
+"""Models from the posterior by which every proposal is tried."""
+CHECKED, DRAWN_IN = 500, 200
+"""Models by which the chosen ones are tried, and how many of these are drawn in a figure."""
+SLOW = 20
+"""Percent of the rows that are near rest."""
+NEAR_REST = 0.05
+"""Of the largest velocity: below it velocities count alike, above it the less the denser they would be."""
+
+
+class Design(NamedTuple):
+    """Sequences to be played, and what they would tell."""
+
+    fitted: Identified
+    limits: Limits
+    t: Float[np.ndarray, " time"]
+    """[s]"""
+    u: Float[np.ndarray, "sequence time input"]
+    """[N m, or N]"""
+    start: Float[np.ndarray, "sequence readable"]
+    """Where each begins, set by hand."""
+    low: Float[np.ndarray, "sequence time readable"]
+    """The central 98 % of the motions."""
+    middle: Float[np.ndarray, "sequence time readable"]
+    high: Float[np.ndarray, "sequence time readable"]
+    fit: Fit
+    told: Told
+    """By all sequences."""
+    old: Told
+    """What as much time of the old inputs would tell."""
+    question: AbstractQuestion
+    rivals: tuple[Rivals, ...]
+    apart: Apart | None
+    slow: Float[np.ndarray, " dof"]
+    """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
+    friction_weight: Float[np.ndarray, "dof node"]
+    """Which velocities count; 0 where the logs never were."""
+
+    @property
+    def nothing(self) -> Told:
+        """What is told without an experiment."""
+        return jax.tree.map(np.zeros_like, self.told)
+
+
+def design_experiment(
+    fitted: Identified,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    question: str = "all",
+    rivals: Sequence[Rivals] = (),
+    seconds: float = 30.0,
+    sequences: int = 6,
+    effort: Effort = EFFORT,
+    say: Say = lambda text: None,
+) -> Design:
+    """The `sequences` inputs of `seconds` [s] together that answer a question best, found by a seeded search.
+
+    `question` is "friction", "parameters", the name of one, "apart" (tell each of `rivals`) or "all" of what there is.
+    `data` are the logs that `fitted` was fitted to.  Every sequence stays inside the limits of its rig (`limits_of`)
+    for 500 models drawn from the posterior, process noise included.
+    Raises DesignError where the rig has no input, a start is out of the limits, or there is nothing to ask.
+    """
+    key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
+    data = Dataset(*map(jnp.asarray, data))
+    posterior = smooth(fitted, data)
+    path, used = np.asarray(posterior.state.mean), np.asarray(kept(posterior, data))
+    limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
+    fits = [(known(pair.one), known(pair.other)) for pair in rivals]
+    pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
+    apart = Apart(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
+    visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
+    friction = _friction(fit, visited)
+    asked = _question(question, fitted, fit, friction, apart)
+    rows = round(seconds / sequences / fitted.rig.dt)
+    if rows < 20:
+        raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
+    t = fitted.rig.dt * np.arange(rows + 1)
+    bench = Bench(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
+    plan = search(bench, asked, sequences, rng=rng, effort=effort, say=say)
+    checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
+    plan, found = _checked(bench, checked, plan, effort, say)
+    u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
+    low, middle, high = np.quantile(np.asarray(found.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
+    return Design(
+        fitted,
+        limits,
+        t,
+        u,
+        start,
+        low,
+        middle,
+        high,
+        fit,
+        plan.told.sum(),
+        _old(bench, sequences, data, path, used),
+        asked,
+        tuple(rivals),
+        apart,
+        np.percentile(np.abs(visited), SLOW, axis=0),
+        friction.weight,
+    )
+
+
+def _question(name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Apart | None) -> AbstractQuestion:
+    """The question of that name, or all of those that there are."""
+    prior, there = fitted.m_step.prior, {}
+    if fitted.rig.friction:
+        there["friction"] = friction
+    declared = [i for i, n in enumerate(prior.names) if "." not in n]
+    if prior.size:
+        there["parameters"] = Parameters(fit, tuple(range(prior.size)))
+    singles = {prior.names[i]: Parameters(fit, (i,)) for i in declared}
+    if apart is not None:
+        there["apart"] = apart
+    if name == "all" and there:
+        return Several(tuple(there.values()))
+    if name not in there | singles:
+        known = ", ".join([*there, *singles]) or "none: the fit has no friction map, no parameter and no rival"
+        why = {
+            "apart": "the fit has no effect that the data could not tell from another; name a law with --rival",
+            "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
+            "friction": "the rig is declared free of friction",
+        }.get(name, "not a question of this fit")
+        raise DesignError(f"--for {name}: {why}; possible here: {known}")
+    return (there | singles)[name]
+
+
+def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, "row dof"]:
+    """Velocities that were visited."""
+    dof = fit.nodes.shape[0]
+    return rows[np.isfinite(rows).all(axis=-1), dof : 2 * dof]
+
+
+def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Friction:
+    """Over the visited velocities, near rest no more than its share."""
+    nodes, dof = np.asarray(fit.nodes), fit.nodes.shape[0]
+    low, high = np.percentile(visited, [0.5, 99.5], axis=0)
+    place = np.arcsinh(nodes / (NEAR_REST * np.abs(nodes).max(axis=1, keepdims=True)))
+    weight = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
+    weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12) / dof
+    torque = np.stack([np.asarray(fit.model.unknown(jnp.asarray(v))) for v in nodes.T], axis=1)
+    scale = np.sqrt(np.sum(weight * torque**2, axis=1) * dof)
+    return Friction(fit, np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight)
+
+
+SHRINKS, LAST = 0.85, 12
+"""What a sequence that breaks a limit after all is multiplied with, and how often at most."""
+
+
+def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say):
+    """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
+    proposal = Proposal(*map(np.array, plan.proposal))
+    for _ in range(LAST):
+        u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
+        found = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
+        ok = allowed(found, bench.limits)
+        if ok.all():
+            break
+        say(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
+        proposal.shape[~ok, :, -1] *= SHRINKS
+    else:
+        raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
+    _, each = tell(bench, _padded(proposal, effort.batch), effort.few)
+    return Plan(proposal, each.of(np.arange(len(proposal.family)))), found
+
+
+def _padded(proposal: Proposal, batch: int) -> Proposal:
+    """As many as are played at once: one program serves."""
+    return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
+
+
+def _old(bench: Bench, count: int, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
+    """What the old inputs tell in as much time as `count` new ones take, by their smoothed motions."""
+    rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
+    cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
+    short = rows - cut.t.shape[1]
+    grow = lambda a, **how: np.pad(a, [(0, 0), (0, max(short, 0))] + [(0, 0)] * (a.ndim - 2), **how)  # noqa: E731
+    t, u, y = (grow(a, mode="edge") for a in cut[:3])
+    cut = Dataset(t, u, y, grow(cut.valid))
+    x = grow(path[used, :rows], mode="edge")
+    each = told(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
+    share = count * rows / max(float(cut.valid.sum()), 1.0)
+    return jax.tree.map(lambda a: share * a, each.sum())

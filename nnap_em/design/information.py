@@ -1,0 +1,118 @@
+"""What a sequence would tell: expected information by the sensitivities that the fit itself uses."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..data.dataset import Dataset
+from ..em.identify import Identified
+from ..em.local import local
+from ..em.prior import ParameterPrior
+from ..em.quadratic import Local, friction_columns, whitened_sensitivities
+from ..model.base import prepare
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import TANGENT, Filtered, ekf, kalman_filter
+
+
+class Fit(NamedTuple):
+    """A model and what is known of it: of phi = (torques at velocity nodes, parameters)."""
+
+    model: StateSpaceModel
+    prior: ParameterPrior
+    nodes: Float[Array, "dof node"]
+    cov: Float[Array, "phi phi"]
+    """Posterior covariance of phi (Laplace)."""
+
+
+def known(fitted: Identified) -> Fit:
+    """What is known after a fit."""
+    weights = fitted.m_step.weights(fitted.model)
+    cov = _covariance(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian)
+    return Fit(fitted.model, fitted.m_step.prior, weights.nodes, cov)
+
+
+@eqx.filter_jit
+def _covariance(weights, unknown, w, hessian) -> Float[Array, "phi phi"]:
+    jac = weights.jacobian(unknown, w)
+    half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True)
+    return half.T @ half
+
+
+def information(
+    fit: Fit, seq: Dataset, x: Float[Array, "proposal few time state"]
+) -> Float[np.ndarray, "proposal phi phi"]:
+    """Expected information of phi in sequences, the mean over some motions."""
+    return np.asarray(each(_information, fit, (seq, x)))
+
+
+def _information(fit: Fit, one) -> Float[Array, "phi phi"]:
+    seq, motions = one
+
+    def along(x):
+        path = Gaussian(x, jnp.zeros((*x.shape, x.shape[-1])))
+        here = local(fit.model, fit.prior, path, seq, TANGENT)
+        start = Gaussian(x[0], fit.model.start.cov)
+        filtered = kalman_filter(fit.model.log_q, fit.model.log_r, start, here.affine, here.reading, here.seq)
+        jac = _sensitivities(fit, here, filtered, x)
+        return jac.T @ jac
+
+    return jnp.mean(jax.vmap(along)(motions), axis=0)
+
+
+def _sensitivities(fit: Fit, here: Local, filtered: Filtered, x: Float[Array, "time state"]) -> Float[Array, "row phi"]:
+    """Of the whitened readings to phi."""
+    dof = fit.nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v[None], b))(x[:, dof : 2 * dof], here.by_force)
+    columns = jnp.concatenate([torque, here.by_parameter], axis=-1)
+    columns = jnp.where(here.seq.active[:, None, None], columns, 0.0)
+    still = jnp.zeros((*here.seq.y.shape, torque.shape[-1]), x.dtype)
+    readings = jnp.concatenate([still, here.reading_by_parameter], axis=-1)
+    jac = whitened_sensitivities(filtered, columns, readings, here.seq.observed)
+    return jac.reshape(-1, jac.shape[-1])
+
+
+class Contrast(NamedTuple):
+    """How far the readings of a true model are from what a rival expects, in its whitened innovations r = J delta."""
+
+    information: Float[np.ndarray, "*proposal phi phi"]
+    """J' J, of the rival's own phi."""
+    pull: Float[np.ndarray, "*proposal phi"]
+    """J' r"""
+    square: Float[np.ndarray, "*proposal"]
+    """r' r"""
+
+
+def contrast(
+    rival: Fit, truth: StateSpaceModel, seq: Dataset, start: Float[np.ndarray, "proposal readable"]
+) -> Contrast:
+    """What a rival would make of the readings that `truth` gives from `start` on, without noise."""
+    return Contrast(*map(np.asarray, each(_contrast, (rival, truth), (seq, jnp.asarray(start)))))
+
+
+def _contrast(common, one):
+    (rival, truth), (seq, start) = common, one
+    inputs = truth.inputs(seq)
+
+    def step(x, u):
+        return truth.transition(x, u), truth.emission(x, u)
+
+    _, y = jax.lax.scan(step, _with_memory(truth, start), inputs)
+    prepared = prepare(rival.model, seq._replace(y=jnp.where(jnp.isnan(seq.y), jnp.nan, y)))
+    model, begin = rival.model, Gaussian(_with_memory(rival.model, start), rival.model.start.cov)
+    about = ekf(model, begin, prepared).state.mean
+    here = local(model, rival.prior, Gaussian(about, jnp.zeros((*about.shape, about.shape[-1]))), seq, TANGENT)
+    filtered = kalman_filter(model.log_q, model.log_r, begin, here.affine, here.reading, prepared)
+    here = here._replace(seq=prepared)
+    jac, r = _sensitivities(rival, here, filtered, about), filtered.innovation.ravel()
+    return jac.T @ jac, jac.T @ r, r @ r
+
+
+def _with_memory(model: StateSpaceModel, start: Float[Array, " readable"]) -> Float[Array, " state"]:
+    """A first state, with the memory of the effects at rest."""
+    return jnp.concatenate([start, model.start.mean[start.shape[0] :]])

@@ -1,0 +1,97 @@
+"""What the machine would do, as far as the fit knows it: motions drawn from its posterior."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..em.predict import Paths
+from ..numerics.parallel import each
+from .limits import Limits
+
+BY_HAND = 0.01
+"""Standard deviation of a start that is set by hand, over the range that the coordinate may have, or over a turn."""
+SAFE = 3.5
+"""Standard deviations by which the largest excursion of a motion stays inside a limit: 1 in 4000 if it is normal."""
+
+
+class Motions(NamedTuple):
+    """Of some inputs, by models drawn from the posterior."""
+
+    lowest: Float[Array, "*proposal path readable"]
+    """Of every coordinate and rate over the whole motion."""
+    highest: Float[Array, "*proposal path readable"]
+    x: Float[Array, "*proposal few time state"]
+    """The first few motions themselves."""
+
+
+class _Common(NamedTuple):
+    paths: Paths
+    spread: Float[Array, " readable"]
+    """Standard deviation of the first state."""
+    few: Float[Array, " few"]
+    """As many motions are kept."""
+
+
+def motions(
+    paths: Paths,
+    limits: Limits,
+    t: Float[np.ndarray, " time"],
+    u: Float[np.ndarray, "proposal time input"],
+    start: Float[np.ndarray, "proposal readable"],
+    few: int,
+    *,
+    key: PRNGKeyArray,
+) -> Motions:
+    """Every proposal by every model; the same noise for all proposals, so that they can be compared."""
+    angle = np.asarray(paths.model.system.angles)
+    reach = (limits.highest - limits.lowest)[: angle.size]
+    spread = BY_HAND * np.where(angle, np.minimum(reach, 2 * np.pi), reach)
+    common = _Common(paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(few))
+    keys = jax.random.split(key, 1)[np.zeros(len(u), int)]
+    return each(_motions, common, (blank(t, u, len(paths.model.measured)), jnp.asarray(start), keys))
+
+
+def blank(t: Float[np.ndarray, " time"], u: Float[np.ndarray, "proposal time input"], obs: int) -> Dataset:
+    """Sequences that nobody has read yet."""
+    count, time = u.shape[:2]
+    return Dataset(
+        jnp.broadcast_to(jnp.asarray(t), (count, time)),
+        jnp.asarray(u),
+        jnp.zeros((count, time, obs)),
+        jnp.ones((count, time), bool),
+    )
+
+
+def _motions(common: _Common, one) -> Motions:
+    (paths, spread, few), (seq, start, key) = common, one
+    model, count = paths.model, paths.tables.shape[0]
+    key_start, key_kick = jax.random.split(key)
+    free = spread.shape[0]
+    first = jnp.concatenate([start, model.start.mean[free:]])  # effects begin at rest
+    x0 = jnp.broadcast_to(first, (count, first.shape[0]))
+    x0 = x0.at[:, :free].add(spread[None] * jax.random.normal(key_start, (count, free)))
+    kick = jax.random.normal(key_kick, (seq.t.shape[0], *x0.shape)) * jnp.exp(0.5 * model.log_q)[None, None]
+
+    def step(carry, slices):
+        (x, low, high), (u, kick) = carry, slices
+        low, high = jnp.minimum(low, x[:, :free]), jnp.maximum(high, x[:, :free])
+        following, _ = paths.advance(x, u)
+        return (following + kick, low, high), x[: few.shape[0]]
+
+    begin = x0, x0[:, :free], x0[:, :free]
+    (_, low, high), x = jax.lax.scan(step, begin, (paths.inputs(seq), kick))
+    return Motions(low, high, jnp.swapaxes(x, 0, 1))
+
+
+def allowed(found: Motions, limits: Limits) -> Bool[np.ndarray, " proposal"]:
+    """Whether all motions stay inside the limits, and their excursions far enough for those that were not drawn."""
+    low, high = np.asarray(found.lowest), np.asarray(found.highest)
+    with np.errstate(invalid="ignore", over="ignore"):
+        inside = (low >= limits.lowest).all(axis=(1, 2)) & (high <= limits.highest).all(axis=(1, 2))
+        below = (low.mean(axis=1) - SAFE * low.std(axis=1) >= limits.lowest).all(axis=1)
+        above = (high.mean(axis=1) + SAFE * high.std(axis=1) <= limits.highest).all(axis=1)
+    return inside & below & above

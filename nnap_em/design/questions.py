@@ -1,0 +1,111 @@
+"""What is asked of an experiment: a cost of what it tells, in units of a logarithm, so that costs can be added."""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from .information import Contrast, Fit
+
+
+class Told(NamedTuple):
+    """What some sequences tell together, or each of them; leading axes are proposals."""
+
+    information: Float[np.ndarray, "*proposal phi phi"]
+    contrasts: tuple[Contrast, ...] = ()
+
+    def __add__(self, other: "Told") -> "Told":  # type: ignore[override]
+        pairs = zip(self.contrasts, other.contrasts, strict=True)
+        both = (Contrast(*(a + b for a, b in zip(one, two, strict=True))) for one, two in pairs)
+        return Told(self.information + other.information, tuple(both))
+
+    def of(self, which) -> "Told":
+        """Some of the proposals."""
+        return Told(self.information[which], tuple(Contrast(*(a[which] for a in c)) for c in self.contrasts))
+
+    def sum(self) -> "Told":
+        """All together."""
+        return Told(self.information.sum(axis=0), tuple(Contrast(*(a.sum(axis=0) for a in c)) for c in self.contrasts))
+
+
+def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "*proposal phi phi"]:
+    """Covariance of phi with more information: (C^-1 + A)^-1, of a C that may be singular."""
+    return np.linalg.solve(np.eye(len(cov)) + cov @ information, np.broadcast_to(cov, information.shape))
+
+
+class AbstractQuestion(eqx.Module):
+    """What is asked."""
+
+    @abstractmethod
+    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+        """The smaller, the better it is answered; one less is a factor e in a standard deviation."""
+
+
+class Friction(AbstractQuestion):
+    """How wide are the friction bands, the widest first."""
+
+    fit: Fit
+    scale: Float[np.ndarray, " dof"]
+    """Size of the map of each joint [N m]."""
+    weight: Float[np.ndarray, "dof node"]
+    """Which velocities count; their sum is 1."""
+
+    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+        count = self.weight.size
+        variance = np.diagonal(after(np.asarray(self.fit.cov), told.information), axis1=-2, axis2=-1)[..., :count]
+        relative = variance.reshape(*variance.shape[:-1], *self.weight.shape) / self.scale[:, None] ** 2
+        return np.asarray(0.25 * np.log(np.sum(self.weight * relative**2, axis=(-2, -1)) + 1e-30))
+
+
+class Parameters(AbstractQuestion):
+    """How sure are some parameters: the mean of the logarithms of their standard deviations, in those of the prior."""
+
+    fit: Fit
+    places: tuple[int, ...] = eqx.field(static=True)
+    """Among all parameters."""
+
+    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+        where = np.asarray(self.places) + self.fit.nodes.size
+        cov = after(np.asarray(self.fit.cov), told.information)
+        variance = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1)[..., where], 1e-30)
+        return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
+
+
+SURE = 6.0
+"""Distance of two models [standard deviations of their log-likelihood ratio] from which on more tells nothing new:
+1 in 700 is told wrong."""
+
+
+class Apart(AbstractQuestion):
+    """Which of some laws is the true one: the pair that is hardest to tell counts.
+
+    A log-likelihood ratio is normal with mean d^2 / 2 and variance d^2, d the distance after everything that the rival
+    can adapt: d^2 = r'(I + J C J')^-1 r.  [Atkinson & Fedorov 1975, Biometrika 62, 57, for the criterion]
+    """
+
+    covs: tuple[Float[np.ndarray, "phi phi"], ...]
+    """Of every rival."""
+
+    def distance(self, told: Told) -> Float[np.ndarray, "*proposal pair"]:
+        """Of every pair [standard deviations]."""
+        out = []
+        for cov, (information, pull, square) in zip(self.covs, told.contrasts, strict=True):
+            adapted = np.einsum("...i,...ij,...j->...", pull, after(cov, information), pull)
+            out.append(np.sqrt(np.maximum(square - adapted, 0.0)))
+        return np.stack(out, axis=-1)
+
+    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+        """Half the distance still to go."""
+        far = np.minimum(self.distance(told), SURE)
+        return np.asarray(0.5 * np.mean(SURE - far, axis=-1) + 0.5 * np.max(SURE - far, axis=-1))
+
+
+class Several(AbstractQuestion):
+    """More than one question, each as important."""
+
+    questions: tuple[AbstractQuestion, ...]
+
+    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+        return np.asarray(np.sum([q.cost(told) for q in self.questions], axis=0))

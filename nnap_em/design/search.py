@@ -1,0 +1,168 @@
+"""The search for sequences: many are drawn, the best together are taken, and each is bettered in turn.
+
+Friction has kinks, limits are walls and a free arm is chaotic, so that a slope of the cost leads nowhere for long: the
+search is a seeded one.  What a batch of proposals would do and tell is a step that a resumed run finds again.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..em.predict import Paths
+from ..storage.journal import HERE, step
+from .information import Contrast, Fit, contrast, information
+from .limits import DesignError, Limits
+from .play import allowed, blank, motions
+from .questions import AbstractQuestion, Told
+from .signals import Proposal, drawn, mutated, played, starts
+
+Say = Callable[[str], None]
+
+
+class Effort(NamedTuple):
+    """How long is searched."""
+
+    pool: int = 192
+    """Proposals to choose from."""
+    batch: int = 48
+    """Proposals that are played at once."""
+    rounds: int = 20
+    """Rounds of improvements."""
+    tries: int = 12
+    """Batches that may be drawn to fill the pool."""
+    few: int = 2
+    """Motions along which information is taken."""
+
+
+EFFORT = Effort()
+SHRINKS = 0.7
+"""Of the size of a proposal that breaks a limit."""
+REACH = (0.3, 0.05)
+"""How far the numbers of a proposal are moved in the first round and in the last."""
+
+
+class Bench(NamedTuple):
+    """All that decides what a proposal does and tells."""
+
+    fit: Fit
+    pairs: tuple[tuple[Fit, Fit], ...]
+    """A rival, and the model that is true."""
+    paths: Paths
+    """Models drawn from the posterior."""
+    limits: Limits
+    t: Float[np.ndarray, " time"]
+    key: PRNGKeyArray
+
+
+class Plan(NamedTuple):
+    """Sequences, and what each of them tells."""
+
+    proposal: Proposal
+    told: Told
+
+
+@step(lambda bench, *_: (HERE, Told(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
+def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Told]:
+    """Which proposals stay inside the limits, and what each would tell."""
+    u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
+    found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
+    seq = blank(bench.t, u, len(bench.fit.model.measured))
+    return allowed(found, bench.limits), told(bench, seq, found.x, start)
+
+
+def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:
+    """What sequences tell along the motions x, and from `start` on of the rivals."""
+    pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
+    return Told(information(bench.fit, seq, x), pairs)
+
+
+def search(
+    bench: Bench,
+    question: AbstractQuestion,
+    count: int,
+    *,
+    rng: np.random.Generator,
+    effort: Effort = EFFORT,
+    say: Say = lambda text: None,
+) -> Plan:
+    """The `count` sequences that answer best together.
+
+    Raises DesignError where hardly any proposal stays inside the limits.
+    """
+    pool = _pool(bench, count, rng, effort, say)
+    chosen, total = [], None
+    for _ in range(count):  # greedily: what the next one adds to those that are chosen
+        costs = question.cost(pool.told if total is None else total + pool.told)
+        chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
+        one = pool.told.of(chosen[-1])
+        total = one if total is None else total + one
+    plan = _of(pool, np.asarray(chosen))
+    say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.told.sum())):.3f}")
+    for number in range(effort.rounds):
+        reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
+        plan = _bettered(bench, question, plan, rng, reach, effort)
+        cost = float(question.cost(plan.told.sum()))
+        say(
+            f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
+        )
+    return plan
+
+
+def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, say: Say) -> Plan:
+    """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
+    inputs, states = bench.limits.low.size, bench.limits.first.size
+    found, waiting = [], drawn(rng, effort.batch, inputs, states)
+    for _ in range(effort.tries):
+        ok, told = tell(bench, waiting, effort.few)
+        found.append(_of(Plan(waiting, told), ok))
+        have = sum(len(plan.proposal.family) for plan in found)
+        say(f"{have} of {effort.pool} proposals inside the limits")
+        if have >= effort.pool:
+            break
+        waiting.shape[~ok, :, -1] *= SHRINKS
+        fresh = drawn(rng, effort.batch, inputs, states)
+        again = ~ok & (waiting.shape[..., -1].max(axis=1) > SHRINKS**6)
+        waiting = Proposal(*(_where(again, a, b) for a, b in zip(waiting, fresh, strict=True)))
+    plan = _joined(found)
+    if len(plan.proposal.family) < count:
+        raise DesignError(
+            f"only {len(plan.proposal.family)} of {effort.batch * effort.tries} proposals stay inside the limits; "
+            "widen [limits] in rig.toml, or ask for fewer or shorter sequences"
+        )
+    return plan
+
+
+def _bettered(
+    bench: Bench, question: AbstractQuestion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
+) -> Plan:
+    """Every sequence replaced by the best of some like it, where that is better."""
+    count = len(plan.proposal.family)
+    place = np.arange(effort.batch) % count
+    other = mutated(rng, Proposal(*(a[place] for a in plan.proposal)), reach)
+    ok, told = tell(bench, other, effort.few)
+    for slot in range(count):
+        mine = np.flatnonzero(ok & (place == slot))
+        rest = _of(plan, np.arange(count) != slot).told.sum()
+        costs = question.cost(rest + told.of(np.append(mine, 0)))[: len(mine)]
+        now = float(question.cost(plan.told.sum()))
+        if len(mine) and np.nanmin(costs, initial=np.inf) < now:
+            best = int(mine[np.nanargmin(costs)])
+            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, told), np.asarray([best])),
+                            _of(plan, np.arange(count) > slot)])  # fmt: skip
+    return plan
+
+
+def _of(plan: Plan, which) -> Plan:
+    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.told.of(which))
+
+
+def _joined(plans: list[Plan]) -> Plan:
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *plans)
+
+
+def _where(keep: Bool[np.ndarray, " proposal"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.where(keep.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -1,0 +1,214 @@
+"""Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..data.formats import write_csv
+from ..data.units import parameter_unit
+from ..design.experiment import Design
+from ..design.questions import Told, after
+from ..diagnose.keys import key_of, listed, words
+from ..diagnose.residual import names_of
+from ..storage.files import replace_text
+from .design_plots import bands_figure, motion_figure
+from .document import versions
+from .page import Picture, picture, rendered
+from .tables import write_json
+from .wording import number
+
+Say = Callable[[str], None]
+INPUTS, MOTIONS = "inputs", "motion"
+"""Folders of the files to be played, and of what the machine should then do."""
+ACROSS = 3
+"""Sequences in one figure."""
+
+
+def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, say: Say) -> None:
+    """Write a designed experiment into the folder `out`; `began` is `time.perf_counter()` at the start."""
+    files = _write_sequences(out, design)
+    document = describe(design) | {
+        "question": question,
+        "inputs": [f"{INPUTS}/{file}" for file in files],
+        "motion": [f"{MOTIONS}/{file}" for file in files],
+        "seed": seed,
+        "seconds": time.perf_counter() - began,
+        "versions": versions(),
+    }
+    write_json(out / "design.json", document)
+    replace_text(
+        out / "design.html", rendered("design.html.j2", document=document, pictures=_pictures(design, document))
+    )
+    say(document["verdict"])
+    say(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
+
+
+def _write_sequences(out: Path, design: Design) -> list[str]:
+    """The files of all sequences; older ones that are not of this design go."""
+    fitted, states = design.fitted, design.fitted.model.system.coordinates + design.fitted.model.system.rates
+    count = len(design.u)
+    files = [f"{i + 1:0{len(str(count))}d}.csv" for i in range(count)]
+    for folder in (INPUTS, MOTIONS):
+        for old in (out / folder).glob("*.csv"):
+            old.unlink()
+    for i, file in enumerate(files):
+        write_csv(
+            out / INPUTS / file, {"time": design.t} | dict(zip(fitted.rig.input_columns, design.u[i].T, strict=True))
+        )
+        bands = {"": design.middle, "_low": design.low, "_high": design.high}
+        columns = {f"{name}{end}": band[i, :, s] for s, name in enumerate(states) for end, band in bands.items()}
+        write_csv(out / MOTIONS / file, {"time": design.t} | columns)
+    return files
+
+
+# --- in numbers and words
+
+
+def describe(design: Design) -> dict[str, Any]:
+    """What the experiment is, and what it should tell, as design.json holds it."""
+    fitted, system = design.fitted, design.fitted.model.system
+    states, inputs = system.coordinates + system.rates, fitted.rig.input_columns
+    force = dict(zip(inputs, (system.force_unit(joint) for joint in system.joints), strict=True))
+    limits = design.limits
+    told = {
+        "format": 1,
+        "rig": fitted.rig.name,
+        "system": fitted.rig.system,
+        "units": {name: system.unit(name) for name in states} | force,
+        "sequences": len(design.u),
+        "seconds_each": float(design.t[-1]),
+        "dt": fitted.rig.dt,
+        "starts": [dict(zip(states, map(float, start), strict=True)) for start in design.start],
+        "limits": {
+            "values": _ranges((*inputs, *states), (*limits.low, *limits.lowest), (*limits.high, *limits.highest)),
+            "rate": dict(zip(inputs, map(float, limits.rate), strict=True)),
+            "declared": sorted({*fitted.rig.limits.values, *fitted.rig.limits.rate, *fitted.rig.limits.start}),
+        },
+        "friction": friction_told(design) if fitted.rig.friction else [],
+        "parameters": parameters_told(design),
+        "apart": apart_told(design),
+    }
+    return told | {"verdict": _verdict(told)}
+
+
+def _ranges(names, low, high) -> dict[str, list[float]]:
+    return {name: [float(a), float(b)] for name, a, b in zip(names, low, high, strict=True)}
+
+
+def _sides(design: Design) -> dict[str, Told]:
+    """What is known now, and after each of two experiments."""
+    return {"now": design.nothing, "expected": design.told, "same_time_of_old_inputs": design.old}
+
+
+def friction_told(design: Design) -> list[dict[str, Any]]:
+    """Standard deviation of the friction of every joint over the velocities, now and after."""
+    nodes, cov = np.asarray(design.fit.nodes), np.asarray(design.fit.cov)
+    weight = design.friction_weight
+    stds = {
+        side: np.sqrt(np.diagonal(after(cov, told.information))[: nodes.size]).reshape(nodes.shape)
+        for side, told in _sides(design).items()
+    }
+    out = []
+    for j, v in enumerate(nodes):
+        seen = weight[j] > 0
+        near = seen & (np.abs(v) <= design.slow[j])
+        rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
+        curves = {f"std_{side}": std[j][seen].tolist() for side, std in stds.items()}
+        out.append(
+            {"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms}
+            | {"velocity": v[seen].tolist()}
+            | curves
+        )
+    return out
+
+
+def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
+    """Value and standard deviation of every estimated parameter, now and after."""
+    prior, model = design.fit.prior, design.fit.model
+    if not prior.size:
+        return {}
+    cov, cut = np.asarray(design.fit.cov), design.fit.nodes.size
+    std = np.asarray(prior.std)
+    value = np.asarray(prior.mean + prior.std * prior.read(model))
+    stds = {
+        side: std * np.sqrt(np.diagonal(after(cov, told.information))[cut:]) for side, told in _sides(design).items()
+    }
+    labels = []
+    for name, place in zip(prior.names, prior.places(model), strict=True):
+        at, _, own = name.rpartition(".")
+        whose = f"{words(key_of(model.effects[int(at)]))}, {own}" if at else own
+        labels += [whose] if np.size(place) == 1 else [f"{whose} {i + 1}" for i in range(np.size(place))]
+    return {
+        label: {"value": float(value[i]), "unit": parameter_unit(label)} | {s: float(v[i]) for s, v in stds.items()}
+        for i, label in enumerate(labels)
+    }
+
+
+def apart_told(design: Design) -> list[dict[str, Any]]:
+    """For every pair of rivals: how far they are apart, and how often the wrong one would be likelier."""
+    if design.apart is None:
+        return []
+    far = {side: design.apart.distance(told) for side, told in _sides(design).items()}
+    out = []
+    for i, pair in enumerate(design.rivals):
+        both = {side: float(np.min(d[2 * i : 2 * i + 2])) for side, d in far.items() if side != "now"}
+        wrong = {side: float(stats.norm.cdf(-0.5 * d)) for side, d in both.items()}
+        out.append({"laws": list(pair.names), "distance": both, "told_wrong": wrong})
+    return out
+
+
+def _verdict(told: dict[str, Any]) -> str:
+    """What the experiment is good for, in one sentence."""
+    gains = []
+    if told["friction"]:
+        ratios = [
+            (
+                f["near_rest"]["now"] / f["near_rest"]["expected"],
+                f["near_rest"]["now"] / f["near_rest"]["same_time_of_old_inputs"],
+            )
+            for f in told["friction"]
+        ]
+        best, old = (listed([number(r[i], 2) for r in ratios]) for i in range(2))
+        joints = "joints " + listed([str(f["joint"]) for f in told["friction"]]) if len(ratios) > 1 else "the joint"
+        gains.append(
+            f"the friction band near rest of {joints} {best} times narrower (as much time of the old inputs: {old})"
+        )
+    for name, p in list(told["parameters"].items())[:3]:
+        if math.isfinite(p["now"]) and p["expected"] > 0:
+            gains.append(f"{name} {number(p['now'] / p['expected'], 2)} times surer")
+    for pair in told["apart"]:
+        wrong, old = pair["told_wrong"]["expected"], pair["told_wrong"]["same_time_of_old_inputs"]
+        gains.append(
+            f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
+        )
+    what = f"{told['sequences']} sequences of {number(told['seconds_each'])} s"
+    return f"{what} should make {listed(gains)}."
+
+
+def _odds(p: float) -> str:
+    """A small chance in words."""
+    return f"once in {round(1 / p)} times" if p > 1e-4 else "less than once in 10000 times"
+
+
+# --- in figures
+
+
+def _pictures(design: Design, document: dict[str, Any]) -> list[Picture]:
+    names, out = names_of(design.fitted), []
+    if document["friction"]:
+        caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
+        out.append(picture("found", "Friction bands", caption, bands_figure(document["friction"], names)))
+    for first in range(0, len(design.u), ACROSS):
+        which = range(first, min(first + ACROSS, len(design.u)))
+        caption = (
+            "Above what is to be played, below what the machine should do: the central 98 % of motions by models from "
+            "the posterior. Dashed: limits."
+        )
+        title = f"Sequences {which[0] + 1} to {which[-1] + 1}"
+        out.append(picture("error", title, caption, motion_figure(design, names, which)))
+    return out

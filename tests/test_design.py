@@ -1,0 +1,336 @@
+"""Designed experiments: inputs inside their limits, information by another road, and what a fit then states."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import nnap_em
+from nnap_em.commands import cli
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.limits import Bounds
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.design.experiment import design_experiment
+from nnap_em.design.information import Contrast, Fit, contrast, information, known
+from nnap_em.design.limits import DesignError, Limits, limits_of
+from nnap_em.design.play import motions
+from nnap_em.design.questions import Apart, Told, after
+from nnap_em.design.rivals import Law, open_pairs, rivals
+from nnap_em.design.search import Effort
+from nnap_em.design.signals import FAMILIES, drawn, mutated, played
+from nnap_em.em.identify import identify, parameter_table
+from nnap_em.em.predict import drawn_paths
+from nnap_em.em.store import load
+from nnap_em.em.weights import Weights
+from nnap_em.systems import specs
+
+LIMITS = Limits(
+    np.asarray([-0.4, 0.1]), np.asarray([0.3, 0.5]), np.asarray([2.0, 1e9]),
+    np.asarray([-2.0, -9.0]), np.asarray([2.0, 9.0]), np.zeros(2), np.zeros(2),
+)  # fmt: skip
+SIMULATE = ("--system", "slide", "--sequences", 12, "--test", 0, "--steps", 150)
+SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
+
+
+def _run(*argv) -> int:
+    return cli.main([str(word) for word in argv])
+
+
+@pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[type(f).__name__ for f in FAMILIES])
+def test_inputs_keep_to_torque_and_its_change(family):
+    rng, t = np.random.default_rng(3), 0.01 * np.arange(301)
+    proposal = drawn(rng, 40, 2, 2)._replace(family=np.full(40, family))
+    for one in (proposal, mutated(rng, proposal, 0.5)):
+        u = played(one, LIMITS, t)
+        assert np.all(u >= LIMITS.low[None, None]) and np.all(u <= LIMITS.high[None, None])
+        change = np.abs(np.diff(u[..., 0], axis=1))
+        assert change.max() <= 0.01 * LIMITS.rate[0] * (1 + 1e-9)
+        assert np.abs(u[:, [0, -1], 0]).max() <= 0.01 * LIMITS.rate[0] * (1 + 1e-9)  # from rest, and back to it
+        assert np.ptp(u[..., 0], axis=1).max() > 0.3  # and they are used
+
+
+def test_mutations_stay_numbers_between_0_and_1_and_begin_at_the_parent():
+    rng = np.random.default_rng(0)
+    parent = drawn(rng, 30, 1, 4)
+    near, far = mutated(rng, parent, 1e-9), mutated(rng, parent, 3.0)
+    np.testing.assert_allclose(near.shape, parent.shape, atol=1e-7)
+    assert far.shape.min() >= 0 and far.shape.max() <= 1 and np.abs(far.shape - parent.shape).mean() > 0.2
+
+
+def test_covariance_after_more_information_is_that_of_the_sum_of_precisions():
+    rng = np.random.default_rng(1)
+    half, jac = rng.standard_normal((5, 5)), rng.standard_normal((3, 7, 5))
+    cov, told = half @ half.T, np.einsum("nri,nrj->nij", jac, jac)
+    np.testing.assert_allclose(after(cov, told), np.linalg.inv(np.linalg.inv(cov) + told), rtol=1e-8, atol=1e-10)
+
+
+def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_adapted():
+    """d^2 = r'(I + J C J')^-1 r, the quadratic form of a Gaussian whose mean is known up to J delta."""
+    rng = np.random.default_rng(2)
+    half, jac, r = rng.standard_normal((4, 4)), rng.standard_normal((9, 4)), rng.standard_normal(9)
+    cov = half @ half.T
+    told = Told(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
+    direct = np.sqrt(r @ np.linalg.solve(np.eye(9) + jac @ cov @ jac.T, r))
+    np.testing.assert_allclose(Apart((cov,)).distance(told), [direct], rtol=1e-10)
+
+
+# --- on the bench of the paper's acrobot
+
+
+@pytest.fixture(scope="module")
+def fit(bench) -> tuple[Fit, Dataset, np.ndarray]:
+    _, model, rule, data, path = bench
+    weights: Weights = rule.weights(model)
+    size = weights.nodes.size + weights.prior.size
+    return Fit(model, weights.prior, weights.nodes, jnp.eye(size)), data, np.asarray(path.mean)
+
+
+def test_information_is_the_mean_square_of_the_score(fit):
+    """Fisher's identity, by brute force: readings drawn from the linearised model, their likelihood differentiated.
+
+    The torque of the node near 1 rad/s at joint 1 moves; all else stays, and the model is linear about the path.
+    """
+    from nnap_em.em.local import local
+    from nnap_em.em.quadratic import friction_columns
+    from nnap_em.numerics.gaussian import Gaussian
+    from nnap_em.smoother.kalman import TANGENT, kalman_filter
+
+    known_fit, data, path = fit
+    model, nodes = known_fit.model, known_fit.nodes
+    seq = jax.tree.map(lambda a: jnp.asarray(a)[0], data)
+    place = int(np.argmin(np.abs(np.asarray(nodes[0]) - 1.0)))
+    x = jnp.asarray(path[0])
+    here = local(model, known_fit.prior, Gaussian(x, jnp.zeros((*x.shape, 4))), seq, TANGENT)
+    column = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b)[:, place])(x[:, 2:4], here.by_force)
+    start = Gaussian(x[0], model.start.cov)
+
+    def innovations(amount):
+        affine = here.affine._replace(offset=here.affine.offset + amount * column)
+        return kalman_filter(model.log_q, model.log_r, start, affine, here.reading, here.seq).innovation
+
+    slope = jax.jacfwd(innovations)(jnp.zeros(()))
+    told = information(known_fit, jax.tree.map(lambda a: jnp.asarray(a)[:1], data), x[None, None])
+    np.testing.assert_allclose(told[0, place, place], float(jnp.sum(slope**2)), rtol=1e-8)
+    assert told[0, place, place] > 0
+
+
+def test_a_model_is_no_distance_from_itself_and_some_from_another(fit):
+    known_fit, data, path = fit
+    model = known_fit.model
+    some = jax.tree.map(lambda a: jnp.asarray(a)[:2], data)
+    start = path[:2, 0]
+    same = contrast(known_fit, model, some, start)
+    assert np.all(same.square < 1e-6)  # innovations of a noise-free log of the model itself, up to linearisation
+    heavier = dataclasses.replace(model, system=dataclasses.replace(model.system, m2=1.2 * model.system.m2))
+    assert np.all(contrast(known_fit, heavier, some, start).square > 100 * np.maximum(same.square, 1e-6))
+
+
+# --- on a slide
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory):
+    """A slide whose mass is uncertain: folder, rig, logs and fit."""
+    folder = tmp_path_factory.mktemp("design") / "slide"
+    assert _run("simulate", folder, *SIMULATE) == 0
+    text = (folder / "rig.toml").read_text()
+    (folder / "rig.toml").write_text(re.sub(r"m = 1\.0\b", "m = { mean = 1.1, std = 0.2 }", text))
+    assert _run("identify", folder, "--out", folder.parent / "fit", "--quiet") == 0
+    rig = read_rig(folder / "rig.toml", specs)
+    return folder, rig, read_logs(folder / "train", rig).data, load(folder.parent / "fit" / "model.npz")
+
+
+def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
+    """The fit linearises over the whole posterior, a design along one motion: they agree to a few percent."""
+    *_, data, fitted = slide
+    told, data = known(fitted), Dataset(*map(jnp.asarray, data))
+    path = nnap_em.smooth(fitted, data).state.mean
+    total = information(told, data, path[:, None]).sum(axis=0)
+    weights = fitted.m_step.weights(fitted.model)
+    w = weights.read(fitted.model)
+    hessian, _ = weights.hessian(fitted.model.unknown, w, jnp.asarray(total) + weights.symmetry())
+    std, fits = (float(np.sqrt(np.linalg.inv(np.asarray(h))[-1, -1])) for h in (hessian, fitted.state.hessian))
+    np.testing.assert_allclose(std, fits, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide):
+    """The design is played by the model that made the logs, with noise of its own."""
+    _, rig, data, fitted = slide
+    truth = nnap_em.examples["slide"]().model
+    plan = {"question": "m", "seconds": 6.0, "sequences": 4, "effort": SMALL}
+    design = design_experiment(fitted, data, key=jax.random.key(1), **plan)
+    made = nnap_em.simulate(truth, jnp.asarray(design.start), jnp.asarray(design.u), key=jax.random.key(9)).data
+    both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
+    value, stated = parameter_table(identify(rig, both, key=jax.random.key(0)))["m"]
+    std = lambda told: 0.2 * np.sqrt(after(np.asarray(design.fit.cov), told.information)[-1, -1])  # noqa: E731
+    assert 1 / 1.5 < std(design.told) / stated < 1.5
+    assert abs(value - 1.0) < 4 * stated
+    assert max(std(design.told), std(design.old)) < std(design.nothing)
+
+
+def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
+    *_, data, fitted = slide
+    design = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    paths = drawn_paths(fitted, 300, key=jax.random.key(77))
+    found = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
+    assert np.all(np.asarray(found.lowest) >= design.limits.lowest[None, None])
+    assert np.all(np.asarray(found.highest) <= design.limits.highest[None, None])
+    again = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    np.testing.assert_array_equal(design.u, again.u)  # the same seed, the same numbers
+    assert not np.array_equal(
+        design.u, design_experiment(fitted, data, key=jax.random.key(3), seconds=4.0, sequences=3, effort=SMALL).u
+    )
+
+
+def test_declared_limits_hold_and_wrong_ones_are_told(slide):
+    _, rig, data, fitted = slide
+    path, used, system = np.zeros((12, 151, 2)), np.ones(12, bool), fitted.model.system
+    path[:, :, 0] = np.linspace(-0.1, 0.2, 151)
+    bounded = lambda **tables: dataclasses.replace(rig, limits=Bounds(**tables))  # noqa: E731
+    plain = limits_of(rig, system, data, path, used)
+    assert plain.low[0] == np.asarray(data.u).min() and plain.high[0] == np.asarray(data.u).max()
+    own = bounded(values={"u": (-1.0, 2.0), "x": (-0.5, 0.5)}, rate={"u": (-3.0, 3.0)}, start={"x": (-0.2, 0.3)})
+    told = limits_of(own, system, data, path, used)
+    assert (told.low[0], told.high[0], told.rate[0]) == (-1.0, 2.0, 3.0)
+    assert (told.lowest[0], told.highest[0], told.first[0], told.last[0]) == (-0.5, 0.5, -0.2, 0.3)
+    with pytest.raises(DesignError, match=r"begin at x = 0.7, out of the limits .*\[limits.start\]"):
+        limits_of(bounded(start={"x": (0.7, 0.7)}), system, data, path, used)
+    with pytest.raises(DesignError, match=r"has no input.*\[input\]"):
+        limits_of(dataclasses.replace(rig, input_columns=(), input_joints=()), system, data, path, used)
+    with pytest.raises(DesignError, match=r"u never moved.*\[limits\]"):
+        limits_of(rig, system, data._replace(u=np.zeros_like(data.u)), path, used)
+    tight = fitted._replace(rig=bounded(values={"x": (-1e-4, 1e-4)}))
+    with pytest.raises(DesignError, match=r"stay inside the limits; widen \[limits\]"):
+        design_experiment(tight, data, key=jax.random.key(0), seconds=4.0, sequences=2, effort=SMALL)
+
+
+@pytest.mark.parametrize(
+    "question, reason",
+    {"apart": "--rival", "spring": "possible here: friction, parameters, m", "friction ": "not a question"}.items(),
+)
+def test_a_question_that_the_fit_cannot_answer_is_told(slide, question, reason):
+    _, _, data, fitted = slide
+    with pytest.raises(DesignError, match=re.escape(reason)):
+        design_experiment(fitted, data, key=jax.random.key(0), question=question)
+
+
+def test_rivals_are_fitted_in_the_place_of_a_law(slide):
+    _, _, data, fitted = slide
+    (pair,) = rivals(fitted, data, [(None, Law("motor_gain", 1))])
+    assert pair.names == ("nothing", "motor gain at joint 1")
+    assert not pair.one.model.effects and pair.other.model.effects[0].name == "motor_gain"
+    (other,) = rivals(pair.other, data, [(Law("motor_gain", 1), Law("input_delay"))])
+    assert [effect.name for effect in other.other.model.effects] == ["input_delay"]
+    with pytest.raises(DesignError, match="the fit holds no payload; it holds no effect"):
+        rivals(fitted, data, [(Law("payload"), Law("input_delay"))])
+    with pytest.raises(DesignError, match=r"cannot have base tilt; possible here: .*motor gain at joint 1"):
+        rivals(fitted, data, [(None, Law("base_tilt"))])
+
+
+def test_what_a_report_leaves_open_becomes_pairs():
+    lag = {"name": "actuator_lag", "joint": 2, "channel": None}
+    report = {"effects": [{"name": "input_delay", "joint": 2, "equivalent": [lag]}], "cannot_tell": [lag]}
+    pairs = [(None, Law("actuator_lag", 2)), (Law("input_delay", 2), Law("actuator_lag", 2))]
+    assert open_pairs(report) == pairs
+    assert open_pairs({}) == []
+
+
+# --- the command
+
+
+@pytest.fixture(scope="module")
+def designed(slide) -> Path:
+    folder = slide[0].parent
+    assert _run("design", folder / "fit", "--out", folder / "next", "--seconds", 6, "--sequences", 4, "--quiet") == 0
+    return folder / "next"
+
+
+def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
+    told = json.loads((designed / "design.json").read_text())
+    assert told["inputs"] == [f"inputs/{i}.csv" for i in range(1, 5)] and told["seconds_each"] == 1.5
+    table = np.genfromtxt(designed / told["inputs"][0], delimiter=",", names=True)
+    assert table.dtype.names == ("time", "u") and len(table) == 151
+    low, high = told["limits"]["values"]["u"]
+    assert low <= table["u"].min() and table["u"].max() <= high
+    assert told["friction"][0]["near_rest"]["expected"] < told["friction"][0]["near_rest"]["now"]
+    assert told["parameters"]["m"]["expected"] < told["parameters"]["m"]["now"]
+    page = (designed / "design.html").read_text()
+    assert page.count("<img") == 3 and "None is declared" in page and told["verdict"].split(" should")[0] in page
+    assert not (designed / "unfinished").exists()
+
+
+def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys):
+    """The new logs are the old ones with other names and other noise: all are there, each once."""
+    folder, _, data, _ = slide
+    new = tmp_path / "new"
+    new.mkdir()
+    for i, (u, y) in enumerate(zip(data.u, data.y, strict=True)):
+        rows = [f"{t:.2f},{a[0]!r},{b[0] + 1e-4!r}" for t, a, b in zip(data.t[i], u.tolist(), y.tolist(), strict=True)]
+        (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
+    out = tmp_path / "fit"
+    assert _run("identify", folder, "--more", new, "--out", out, "--epochs", 2, "--quiet") == 0
+    assert (
+        "fitted to 24 sequences"
+        in json.loads((out / "report.json").read_text())["verdict"]
+        .lower()
+        .replace("friction of 1 joint and m to", "fitted to")
+        or "8 sequences" in json.loads((out / "report.json").read_text())["verdict"]
+    )
+    from nnap_em.em.store import read
+
+    assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]
+    again = _run("design", out, "--out", tmp_path / "next", "--seconds", 0.1, "--quiet")
+    assert again == 2 and "give more --seconds" in capsys.readouterr().err
+
+
+def test_logs_that_are_not_those_of_the_fit_are_refused(slide, tmp_path, capsys):
+    folder = slide[0]
+    other = tmp_path / "other"
+    assert _run("simulate", other, *SIMULATE, "--seed", 5) == 0
+    text = (folder / "rig.toml").read_text()
+    (other / "rig.toml").write_text(text)
+    assert _run("design", folder.parent / "fit", "--logs", other, "--out", tmp_path / "next") == 2
+    assert "not the logs, or not read as those, of the fit" in capsys.readouterr().err
+    assert _run("design", folder.parent / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
+    assert "its logs are not at" in capsys.readouterr().err
+    assert not (tmp_path / "next").exists()
+
+
+# --- [limits] of rig.toml
+
+BOUNDS = "\n[limits]\nu = 0.5\nx = [-1, 2.5]\n[limits.rate]\nu = 4\n[limits.start]\nx = 0.25\n"
+
+
+def test_limits_are_read_and_written(slide, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text((slide[0] / "rig.toml").read_text() + BOUNDS)
+    rig = read_rig(path, specs)
+    assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
+    write_rig(rig, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == rig
+
+
+@pytest.mark.parametrize(
+    "lines, reason",
+    [
+        ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
+        ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
+        ("[limits]\nx = [2, 1]", r"\[limits\] x: found \[2, 1\]; write the lower bound first"),
+        ('[limits]\nu = "1"', r"\[limits\] u: found '1'; write u = 0.3 or"),
+        ("[limits]\nrate = 3", r"\[limits\] rate: found 3; write a table \[limits.rate\]"),
+        ("[limits.rate]\nx = 3", r"\[limits.rate\] x: unknown"),
+        ("[limits.start]\nu = 3", r"\[limits.start\] u: unknown"),
+    ],
+)
+def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
+    path = tmp_path / "rig.toml"
+    path.write_text((slide[0] / "rig.toml").read_text() + "\n" + lines + "\n")
+    with pytest.raises(RigError, match=reason):
+        read_rig(path, specs)

@@ -20,8 +20,8 @@ import plant
 from nnap_em.commands.cli import main as nnap_em
 
 EFFECTS = {
-    "input_delay": {"name": "input_delay", "joint": 2, "delay": 0.006},
-    "actuator_lag": {"name": "actuator_lag", "joint": 2, "tau": 0.006},
+    "input_delay": {"name": "input_delay", "joint": 2, "delay": 0.004},
+    "actuator_lag": {"name": "actuator_lag", "joint": 2, "tau": 0.004},
 }
 SEQUENCES = 6
 

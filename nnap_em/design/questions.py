@@ -1,7 +1,8 @@
 """What is asked of an experiment: a cost of what it tells, in units of a logarithm, so that costs can be added."""
 
+import math
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -37,6 +38,9 @@ def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "
 
 class AbstractQuestion(eqx.Module):
     """What is asked."""
+
+    least: ClassVar[float] = -math.inf
+    """The cost of a whole answer."""
 
     @abstractmethod
     def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
@@ -85,6 +89,7 @@ class Apart(AbstractQuestion):
     can adapt: d^2 = r'(I + J C J')^-1 r.  [Atkinson & Fedorov 1975, Biometrika 62, 57, for the criterion]
     """
 
+    least: ClassVar[float] = 0.0
     covs: tuple[Float[np.ndarray, "phi phi"], ...]
     """Of every rival."""
 

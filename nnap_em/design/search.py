@@ -103,6 +103,8 @@ def search(
     plan = _of(pool, np.asarray(chosen))
     say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.told.sum())):.3f}")
     for number in range(effort.rounds):
+        if float(question.cost(plan.told.sum())) <= question.least:
+            break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(bench, question, plan, rng, reach, effort)
         cost = float(question.cost(plan.told.sum()))

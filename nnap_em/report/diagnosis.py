@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.logs import Logs
+from ..data.rig import Rig
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.outcome import Closed, Intervention, Step
@@ -73,7 +74,7 @@ def write_diagnosis(
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
         "disagreements": [d._asdict() for d in disputed],
         "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
-        "next": advice(found, disputed, rivals),
+        "next": [*advice(found, disputed, rivals), *_experiment(closed.before.rig)],
     }
     write_json(out / "report.json", document)
     replace_text(out / "report.html", page(document, figures))
@@ -152,6 +153,13 @@ def _search_pictures(steps: tuple[Step, ...]) -> list[Picture]:
     figure = screen_figure(entries, first.measure, chosen=chosen)
     caption = f"What each candidate promises, before any refit: {first.measure}."
     return [picture("details", "The first look", caption, figure)]
+
+
+def _experiment(rig: Rig) -> list[str]:
+    """The command that asks the machine."""
+    if not rig.input_columns:
+        return []
+    return ["nnap-em design FIT --out NEXT, FIT this folder: the inputs that would tell most, ready to be played."]
 
 
 def _look(step: Step, dt: float) -> dict[str, Any]:

@@ -68,21 +68,23 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
             raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")
     error, found = document.get("error") or {}, document.get("effects") or []
     parameters = document.get("parameters") or {}
-    return (
-        _environment()
-        .get_template("page.html.j2")
-        .render(
-            document=document,
-            fitted="effects" not in document and "model" in document,
-            pictures=pictures,
-            effects=found,
-            errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
-            tiles=_error_tiles(document) + _test_tiles(document),
-            failed=_failures(document.get("tests")),
-            doubted=_doubted(document),
-            parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
-        )
+    return rendered(
+        "page.html.j2",
+        document=document,
+        fitted="effects" not in document and "model" in document,
+        pictures=pictures,
+        effects=found,
+        errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
+        tiles=_error_tiles(document) + _test_tiles(document),
+        failed=_failures(document.get("tests")),
+        doubted=_doubted(document),
+        parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
     )
+
+
+def rendered(template: str, **content: Any) -> str:
+    """A template of this folder, filled in."""
+    return _environment().get_template(template).render(**content)
 
 
 def _environment() -> jinja2.Environment:

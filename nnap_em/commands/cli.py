@@ -42,6 +42,7 @@ _INIT = """\
 examples:
   nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
   nnap-em init log.csv --out bench
+  nnap-em init run.mcap --system acrobot --out bench    with a table [import] of what was found where
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.

@@ -7,6 +7,7 @@ from ..storage.files import replace_text
 from ..systems import specs
 from .common import Say
 from .draft import draft
+from .draft_recorded import draft_recorded
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
@@ -15,7 +16,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
     path = (args.out or home) / "rig.toml"
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
-    found = draft(args.log, args.system, specs)
+    found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
     replace_text(path, found.text)
     for note in found.notes:
         say(f"in the log: {note}")

@@ -14,7 +14,7 @@ from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
 from .files import reader
-from .pieces import LEAST, Gap, Piece, commanded, cut, gaps, grid, longest_silence, spans, watched
+from .pieces import LEAST, Gap, Piece, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .recording import Address, Recording, Topic, Track, refuse
 from .signals import SLOW, Signal, averaged, held, interpolated
 
@@ -92,21 +92,20 @@ def bring(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mappi
         wanted.setdefault(at.topic, []).append(at.path)
     recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in wanted.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
-    signals = {name: _signal(recording, name, at, origin, shifts) for name, at in every.items()}
+    clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
+    signals = {name: _signal(recording, name, at, clocks[at.topic]) for name, at in every.items()}
     facts = tuple(_facts(topic, recording, addresses, origin, plan, rig.dt) for topic in topics)
     return _gridded(recording, origin, rig, states, plan, addresses, signals, facts)
 
 
-def _signal(recording: Recording, name: str, at: Address, origin: int, shifts: Mapping[str, float]) -> Signal:
+def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"]) -> Signal:
     """A column at its own times; messages without that number are left out."""
-    track = recording.tracks[at.topic]
-    y = track.values[at.path]
+    y = recording.tracks[at.topic].values[at.path]
     there = np.isfinite(y)
     if np.count_nonzero(there) < 2:
         found = f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
         mend = "name a field that holds numbers in [import.columns], or take the log out"
         refuse(recording.path, f"column {name!r}", found, mend)
-    t = (track.t - origin) * 1e-9 + shifts.get(at.topic, 0.0)
     if there.all():
         return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
     return Signal(at.topic, t[there], y[there] * at.scale)
@@ -124,14 +123,14 @@ def _gridded(
 ) -> Brought:
     inputs = {name: signals[name] for name in rig.input_columns}
     readings = {name: signals[name] for name in rig.measured}
-    start, end = _common(recording.path, inputs, readings)
+    start, end = _common(recording.path, inputs, readings, rig.dt)
     _fine(recording.path, readings, rig.dt)
     at = grid(readings, start, end, rig.dt)
     longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
     there = _there(inputs, readings, at, rig.dt, longest)
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
-    columns |= {name: interpolated(s, at, rig.dt, longest[name])[0] for name, s in readings.items()}
+    columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
     found = [
         _checked(piece, columns, rig.measured) for piece in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
     ]
@@ -158,9 +157,9 @@ def _gridded(
     )
 
 
-def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal]) -> tuple[float, float]:
+def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> tuple[float, float]:
     """From when to when all topics speak [s]; DataError where they do not."""
-    found = spans(inputs, readings)
+    found = spans(inputs, readings, dt)
     start, end = max(first for first, _ in found.values()), min(last for _, last in found.values())
     if end <= start:
         late = max(found, key=lambda topic: found[topic][0])

@@ -11,8 +11,14 @@ from .signals import Signal, integrals
 
 REACH = 0.25
 """Longest delay that is looked for [s]."""
-ROWS = 20_000
+PARTS = 3
+"""The readings are cut in so many parts, whose delays must agree."""
+SPREAD = 0.01
+"""How far the delays of the parts may be apart [s]."""
+ROWS = 12_000
 """Readings that a delay is told from at most: those around the liveliest input."""
+WIDTHS = (1, 2, 4, 8)
+"""Differences are over so many times the least stretch that shows anything: what is surest decides."""
 SURE = 0.3
 """Correlation of what is left of both signals from which on a delay is told."""
 
@@ -71,17 +77,48 @@ def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> D
     the correlation of the rest, over shifts, is the generalised cross-correlation [Knapp & Carter 1976].
     """
     cause, effect = signals[pair.cause], signals[pair.effect]
-    step = effect.interval
-    wide = max(round(max(2 * cause.interval, 4 * step) / step), 1)
-    at = _liveliest(cause, effect, step, wide)
-    unknown = Delay(pair.cause, cause.topic, pair.effect, effect.topic, math.nan, math.nan, 0.0)
+    regressors = [signals[name] for name in around if name in signals]
+    least = max(round(max(2 * cause.interval, 4 * effect.interval) / effect.interval), 1)
+    found = [
+        _over(pair, cause, effect, regressors, least * times) for times in WIDTHS[: 1 if pair.order == 0 else None]
+    ]
+    sure = [each for each in found if each.std > 0]
+    best = min(sure, key=lambda each: each.std) if sure else max(found, key=lambda each: each.correlation)
+    return Delay(pair.cause, cause.topic, pair.effect, effect.topic, *best)
+
+
+class _Best(NamedTuple):
+    """A shift [s], its standard deviation, and the correlation there."""
+
+    seconds: float
+    std: float
+    correlation: float
+
+
+def _over(pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], wide: int) -> _Best:
+    """The best shift for differences over so many readings: the wider, the less noise and the less detail.
+
+    It is the mean of those of parts of the readings, and known as well as they agree.
+    """
+    every = _liveliest(cause, effect)
+    found = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, PARTS)]
+    shifts, like = np.array([shift for shift, _ in found]), float(np.mean([r for _, r in found]))
+    if np.isnan(shifts).any() or np.ptp(shifts) > SPREAD:
+        return _Best(math.nan, math.nan, like)
+    least = effect.interval / 100  # parts may agree by chance
+    return _Best(float(shifts.mean()), max(float(np.std(shifts, ddof=1)), least) / math.sqrt(PARTS), like)
+
+
+def _part(
+    pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], wide: int, at: Float[np.ndarray, " x"]
+) -> tuple[float, float]:
+    """The best shift for the readings at these times, NaN where there is none, and the correlation there."""
     if at.size < 20 * wide:
-        return unknown
-    y = np.interp(at, effect.t, effect.y)
-    target = _difference(y, pair.order, wide)
-    inside = slice(0, at.size) if pair.order == 0 else slice(wide // 2, wide // 2 + target.size)
-    inside = slice(wide, wide + target.size) if pair.order == 2 else inside
-    rest = _Rest(_explained(at[inside], [signals[name] for name in around if name in signals]))
+        return math.nan, 0.0
+    cause, *around = (_between(signal, at[0] - REACH, at[-1] + REACH) for signal in (cause, *around))
+    target = _difference(np.interp(at, effect.t, effect.y), pair.order, wide)
+    first = (0, wide // 2, wide)[pair.order]
+    rest = _Rest(_explained(at[first : first + target.size], around))
     target = rest(target)
     size = math.sqrt(target @ target)
 
@@ -89,30 +126,29 @@ def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> D
         told = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
         return float(told @ target) / max(math.sqrt(told @ told) * size, 1e-300)
 
-    coarse = max(min(step, 0.005), REACH / 400)
+    coarse = max(min(effect.interval, 0.005), REACH / 50)
     shifts = np.arange(-REACH, REACH + coarse / 2, coarse)
     found = np.array([likeness(shift) for shift in shifts])
     k = int(np.argmax(found))
     if found[k] < SURE or k in (0, shifts.size - 1):
-        return unknown._replace(correlation=float(found[k]))
+        return math.nan, float(found[k])
     best, fine = float(shifts[k]), coarse
-    for _ in range(3):
+    for _ in range(4):
         fine /= 3
         best = max((best + j * fine for j in range(-3, 4)), key=likeness)
-    left, mid, right = (_information(likeness(best + j * coarse / 2), target.size / wide) for j in (-1, 0, 1))
-    curve = (2 * mid - left - right) / (coarse / 2) ** 2
-    std = 1 / math.sqrt(curve) if curve > 0 else math.nan
-    return unknown._replace(seconds=best, std=std, correlation=likeness(best))
+    return best, likeness(best)
 
 
-def _information(r: float, count: float) -> float:
-    """Log-likelihood of a fit with this correlation [nat]."""
-    return -0.5 * count * math.log(max(1 - r * r, 1e-12))
+def _between(signal: Signal, start: float, end: float) -> Signal:
+    """The part of a signal that tells its values from start to end [s]."""
+    first, last = np.searchsorted(signal.t, (start, end))
+    part = slice(max(int(first) - 1, 0), int(last) + 1)
+    return Signal(signal.topic, signal.t[part], signal.y[part])
 
 
-def _liveliest(cause: Signal, effect: Signal, step: float, wide: int) -> Float[np.ndarray, " x"]:
+def _liveliest(cause: Signal, effect: Signal) -> Float[np.ndarray, " x"]:
     """Times of readings, where both signals are known for every shift: the stretch in which the cause varies most."""
-    first = max(cause.t[0], effect.t[0]) + REACH
+    step, first = effect.interval, max(cause.t[0], effect.t[0]) + REACH
     end = min(cause.t[-1], effect.t[-1]) - REACH
     count = int((end - first) / step) if end > first else 0
     if count <= ROWS:

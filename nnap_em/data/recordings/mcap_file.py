@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ..dataset import DataError
 from .clock import choose
@@ -60,7 +60,7 @@ def topics(path: Path) -> tuple[Topic, ...]:
 def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
     """The numbers at these paths of these topics, in the order of their times."""
     with _opened(path) as log:
-        parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {topic: [] for topic in wanted}
+        parts: dict[str, list[_Part]] = {topic: [] for topic in wanted}
         codecs: dict[int, Codec] = {}
         stamps: dict[int, tuple[str, ...]] = {}
 
@@ -73,9 +73,8 @@ def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
                 codecs[number] = _codec(log, number)
                 stamps[number] = _stamp(codecs[number], batch)
             values = codecs[number].read(batch.data, batch.start, batch.size, (*wanted[topic], *stamps[number]))
-            if not stamps[number]:
-                values = np.hstack([values, np.full((len(values), 2), np.nan)])
-            parts[topic].append((batch.t, values))
+            stamp = _nanoseconds(values[:, len(wanted[topic]) :]) if stamps[number] else None
+            parts[topic].append(_Part(batch.t, stamp, np.ascontiguousarray(values[:, : len(wanted[topic])].T)))
         notes = _cut(log)
     tracks = {}
     for topic, pieces in parts.items():
@@ -85,22 +84,31 @@ def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
     return Recording(path, tracks, notes)
 
 
-def _track(path: Path, topic: str, paths: Sequence[str], pieces: list[tuple[np.ndarray, np.ndarray]]) -> Track:
-    """The pieces of one topic, which are let go on the way."""
-    log = np.concatenate([t for t, _ in pieces])
-    columns = [np.concatenate([values[:, i] for _, values in pieces]) for i in range(len(paths) + 2)]
-    pieces.clear()
-    clock = choose(path, topic, log, _nanoseconds(*columns[len(paths) :]))
-    as_is = clock.kept.size == log.size and (np.diff(clock.kept) == 1).all()
-    values = {name: y if as_is else y[clock.kept] for name, y in zip(paths, columns, strict=False)}
-    return Track(clock.t, values, clock.name, clock.notes)
+class _Part(NamedTuple):
+    """Messages of one topic in one piece of the file."""
+
+    t: Int[np.ndarray, " message"]
+    stamp: Int[np.ndarray, " message"] | None
+    values: Float[np.ndarray, "path message"]
 
 
-def _nanoseconds(seconds: np.ndarray, rest: np.ndarray) -> Int[np.ndarray, " message"] | None:
-    """Stamps, where every message has one."""
-    if not np.isfinite(seconds).all() or not np.isfinite(rest).all():
+def _track(path: Path, topic: str, paths: Sequence[str], parts: list[_Part]) -> Track:
+    """The pieces of one topic as one, which are let go."""
+    log = np.concatenate([part.t for part in parts])
+    stamps = [part.stamp for part in parts if part.stamp is not None]
+    columns = np.concatenate([part.values for part in parts], axis=1)
+    parts.clear()
+    clock = choose(path, topic, log, np.concatenate(stamps) if sum(map(len, stamps)) == log.size else None)
+    if clock.kept.size < log.size or (np.diff(clock.kept) != 1).any():
+        columns = columns[:, clock.kept]
+    return Track(clock.t, dict(zip(paths, columns, strict=True)), clock.name, clock.notes)
+
+
+def _nanoseconds(values: Float[np.ndarray, "message two"]) -> Int[np.ndarray, " message"] | None:
+    """Stamps of seconds and nanoseconds, where every message has one."""
+    if not np.isfinite(values).all():
         return None
-    return seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64)
+    return values[:, 0].astype(np.int64) * 1_000_000_000 + values[:, 1].astype(np.int64)
 
 
 @contextmanager

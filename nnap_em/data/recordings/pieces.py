@@ -12,6 +12,8 @@ from .signals import SAME, Signal
 
 INTERVALS = 5
 """Silence of so many of its own intervals, and of so many rows, is a gap of a topic where none is declared."""
+NEAR = 2.5
+"""Intervals of a topic between neighbours that are interpolated at most: one message may be lost."""
 LEAST = 50
 """Rows of a sequence, where no shortest one is declared."""
 
@@ -33,6 +35,11 @@ class Piece(NamedTuple):
     """Why it is dropped; empty: it is used."""
 
 
+def reach(signal: Signal, dt: float) -> float:
+    """How far apart neighbours may be that are interpolated [s]."""
+    return max(NEAR * signal.interval, dt)
+
+
 def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
     """From which silence on a topic has a gap [s]."""
     return INTERVALS * max(signal.interval, dt) if declared is None else declared
@@ -44,12 +51,12 @@ def gaps(signal: Signal, longest: float) -> list[Gap]:
     return [Gap(float(signal.t[k]), float(signal.t[k + 1])) for k in places]
 
 
-def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal]) -> dict[str, tuple[float, float]]:
-    """From when to when each topic speaks [s]; a command is held for one more of its intervals."""
+def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> dict[str, tuple[float, float]]:
+    """From when to when each topic speaks [s]; a command is held for one more of its intervals, not to its end."""
     found: dict[str, tuple[float, float]] = {}
-    for signals, more in ((inputs, 1.0), (readings, 0.0)):
+    for signals, hold in ((inputs, True), (readings, False)):
         for s in signals.values():
-            span = (float(s.t[0]), float(s.t[-1]) + (more * s.interval if s.t.size > 1 else 0.0))
+            span = (float(s.t[0]), float(s.t[-1]) + (s.interval - 2 * SAME * dt if hold else 0.0))
             first, last = found.get(s.topic, span)
             found[s.topic] = (max(first, span[0]), min(last, span[1]))
     return found

@@ -30,7 +30,7 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
         mend = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {mend}")
     made = drafted(path, _table(path, found), system, specs)
-    lines = [f'# u = "/topic:field"    # what else there is: {each}' for each in _others(topics, found)]
+    lines = [f"# not used: {each}" for each in _others(topics, found)]
     lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if f'"{name}"' in made.text]
     head = "\n[import.columns]    # where each column is in the log\n"
     return made._replace(text=made.text + head + "\n".join(lines) + "\n")

@@ -9,6 +9,8 @@ from .style import BLUE, GREEN, READING, TRUTH, VERMILION, ZERO, head, styled
 
 MOST = 6
 """Logs that are drawn."""
+WIDE = 10.0
+"""Times the shortest interval from which on intervals are drawn on a logarithmic axis."""
 _PARTS = {"train": ("training", BLUE), "test": ("test", GREEN), None: ("dropped", READING)}
 
 
@@ -33,7 +35,12 @@ def timeline(document: Mapping[str, Any]) -> Figure:
         left.set(yticks=range(len(topics) + 1), yticklabels=[*names, "sequences"], xlabel="time [s]")
         left.set_title(log["file"])
         left.set_ylim(len(topics) + 0.5, -0.5)
-        right.set(ylim=left.get_ylim(), yticks=[], xlabel="interval [ms]", xscale="log")
+        right.set(ylim=left.get_ylim(), yticks=[], xlabel="interval [ms]")
+        intervals = [1e3 / topic["rate"] for topic in topics]
+        if max(intervals) > WIDE * min(intervals):
+            right.set_xscale("log")
+        else:
+            right.set_xlim(left=0.0)
         right.axvline(1e3 * document["dt"], color=ZERO, ls="--", lw=1.0, label="one row")
         left.grid(axis="y", visible=False)
     more = len(document["logs"]) - len(logs)

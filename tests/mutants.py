@@ -792,6 +792,55 @@ MUTANTS = (
         "gain = float(np.sum",
         "test_screen.py::test_projection_is_least_squares",
     ),
+    Mutant(
+        "a command is that of the row after",
+        "data/recordings/signals.py",
+        'side="right") - 1, 0, signal.t.size - 1)',
+        'side="right"), 0, signal.t.size - 1)',
+        "test_import.py::test_held_averaged_and_integrated_signals_are_their_closed_forms",
+    ),
+    Mutant(
+        "readings interpolated over a gap",
+        "data/recordings/signals.py",
+        "((width <= reach) | exact)",
+        "((width <= 9 * reach) | exact)",
+        "test_import.py::test_a_reading_is_interpolated_only_between_near_neighbours",
+    ),
+    Mutant(
+        "a gap does not end a sequence",
+        "data/recordings/pieces.py",
+        "np.diff(signal.t) > longest)",
+        "np.diff(signal.t) > 9 * longest)",
+        "test_import.py::test_sequences_are_cut_at_gaps[readings]",
+    ),
+    Mutant(
+        "sign of a delay between topics",
+        "data/recordings/delays.py",
+        "integrals(cause, at - shift, pair.order",
+        "integrals(cause, at + shift, pair.order",
+        "test_import.py::test_the_delay_of_a_duplicate_and_of_an_angle_behind_its_rate",
+    ),
+    Mutant(
+        "alignment counted from the encapsulation",
+        "data/recordings/ros2.py",
+        "-(self.at - _HEAD) % width",
+        "-self.at % width",
+        "test_recordings.py::test_a_message_is_laid_out_as_it_was_written[padding]",
+    ),
+    Mutant(
+        "names are no part of the form of a message",
+        "data/recordings/ros2.py",
+        "self.text(named=field in NAMES)",
+        "self.text(named=False)",
+        "test_recordings.py::test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder",
+    ),
+    Mutant(
+        "header stamps that run backwards are taken",
+        "data/recordings/clock.py",
+        "back = np.flatnonzero(np.diff(stamp) < 0)",
+        "back = np.flatnonzero(np.diff(stamp) < -1e18)",
+        "test_recordings.py::test_which_clock_is_taken_and_why[backwards]",
+    ),
 )
 
 

@@ -449,3 +449,14 @@ def test_the_page_tells_what_was_done(tmp_path):
     assert topic["rate"] == pytest.approx(100, rel=0.02) and len(topic["gaps"]) == 1
     assert topic["jitter"] == pytest.approx(np.std(np.diff(t)[np.diff(t) < 0.5]), rel=1e-3)
     assert topic["worst"] < 0.01 * 0.45
+
+
+def test_what_is_left_of_a_cut_log_is_imported_and_told(tmp_path, capsys):
+    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    assert "look at this: a.mcap: the file is cut short" in capsys.readouterr().err
+    assert "the file is cut short" in (tmp_path / "out/import.html").read_text()
+    u = _table(tmp_path / "out/train/000.csv")[:, 1]
+    assert 50 < u.size < 300
+    np.testing.assert_allclose(u, np.cos(T[: u.size]), rtol=1e-11)

@@ -302,6 +302,16 @@ BAD = {  # the file, and words of the message
     "IDL": ("a.mcap", lambda p: _unread(p, "cdr", "ros2idl"), ["'/js'", "'ros2idl'", "write it as"]),
     "no stamps": ("a.mcap", lambda p: _stamped(p, None, 0 * ns(T)), ["'/js'", "no stamps", "300 messages", "record"]),
     "backwards": ("a.mcap", _back, ["'/js'", "backwards at message 202, by 4.99 s", "cut the file"]),
+    "no JSON": (
+        "a.mcap",
+        lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T), [b'{"q": 1'] * 300)}),
+        ["'/js'", "does not fit its schema (Expecting", "record again"],
+    ),
+    "HDF5 without times": (
+        "a.h5",
+        lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
+        ["'/js/time'", "no numbers", "cut the rows"],
+    ),
     "no messages": ("a.mcap", lambda p: write_mcap(p, {"/js": (plain_json(), [], [])}), ["'/js'", "no messages"]),
     "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), ["no HDF5 file", "another copy"]),
     "no time axis": ("a.h5", lambda p: write_hdf5(p, {"js": {"q": T}}), ["'/js'", "no time axis (holds q)", "`time`"]),

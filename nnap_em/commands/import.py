@@ -2,9 +2,7 @@
 
 import argparse
 import time
-import warnings
 
-from ..data.logs import DataWarning
 from ..data.recordings.bring import Brought, bring
 from ..data.recordings.declared import read_plan
 from ..data.recordings.folder import completed, places, write_sequences
@@ -25,8 +23,6 @@ def run(args: argparse.Namespace, say: Say) -> None:
         logs = []
         for path in args.logs:
             logs.append(bring(path, rig, specs[rig.system].states, plan, shifts))
-            for note in logs[-1].notes:
-                warnings.warn(f"{path}: {note}", DataWarning, 2)
             say(f"{path}: {_told(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)

@@ -1,5 +1,6 @@
 """Logs on the grid as a data set: which sequence is for training, its file, and rig.toml with what was found."""
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,7 @@ def places(logs: Sequence[Brought], test: float) -> list[str]:
     `test` from 1 on is how many, below 1 their share; one sequence is left to train on.
     """
     count = sum(len(log.values) for log in logs)
-    wanted = round(test) if test >= 1 else min(round(test * count + 0.5 * (test > 0)), count - 1)
+    wanted = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
     if wanted >= count:
         mend = "give fewer, or set [import] longest lower in rig.toml"
         raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {mend}")

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ..dataset import DataError
 from .clock import rising
+from .objects import MOST
 from .recording import EXTRA, Recording, Topic, Track, refuse
 
 TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
@@ -53,6 +54,8 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
         names = ", ".join(group) or "nothing"
         mend = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
         refuse(path, where, f"has no time axis (holds {names})", mend)
+    if axis.dtype.kind == "f" and not np.isfinite(axis[:]).all():
+        refuse(path, f"data set {axis.name!r}", "holds times that are no numbers", "cut the rows without a time")
     clock = rising(path, f"data set {axis.name!r}", _nanoseconds(axis), axis.name.rpartition("/")[2])
     values = {each: _column(group, each)[clock.kept] for each in paths}
     return Track(clock.t, values, clock.name, clock.notes)
@@ -97,6 +100,8 @@ def _numeric(group: Any) -> Iterator[tuple[str, Any]]:
     """Data sets of one number or one row of numbers per time."""
     for name, data in group.items():
         if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in "iuf" and data.shape[0] > 1:
+            if data.ndim == 2 and data.shape[1] > MOST:
+                continue
             yield name, data
 
 

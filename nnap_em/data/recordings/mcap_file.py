@@ -71,10 +71,8 @@ def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
             number, topic = batch.channel, log.frames.channels[batch.channel].topic
             if number not in codecs:
                 codecs[number] = _codec(log, number)
-                stamps[number] = _stamp(codecs[number], batch)
-            values = codecs[number].read(batch.data, batch.start, batch.size, (*wanted[topic], *stamps[number]))
-            stamp = _nanoseconds(values[:, len(wanted[topic]) :]) if stamps[number] else None
-            parts[topic].append(_Part(batch.t, stamp, np.ascontiguousarray(values[:, : len(wanted[topic])].T)))
+            values, stamp = _decoded(log, batch, codecs[number], wanted[topic], stamps)
+            parts[topic].append(_Part(batch.t, stamp, values))
         notes = _cut(log)
     tracks = {}
     for topic, pieces in parts.items():
@@ -82,6 +80,23 @@ def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
             refuse(path, f"topic {topic!r}", "has no messages", "name another topic, or take the log out")
         tracks[topic] = _track(path, topic, wanted[topic], pieces)
     return Recording(path, tracks, notes)
+
+
+def _decoded(
+    log: _Open, batch: Batch, reader: Codec, paths: Sequence[str], stamps: dict[int, tuple[str, ...]]
+) -> tuple[Float[np.ndarray, "path message"], Int[np.ndarray, " message"] | None]:
+    """Numbers and stamps of a batch; DataError where a message is none of its schema."""
+    try:
+        if batch.channel not in stamps:
+            stamps[batch.channel] = _stamp(reader, batch)
+        fields = stamps[batch.channel]
+        values = reader.read(batch.data, batch.start, batch.size, (*paths, *fields))
+    except Exception as error:  # what the decoders raise on damaged bytes is open-ended
+        found = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
+        mend = "the recorder wrote another type than it said: record again, or name another topic"
+        refuse(log.path, f"topic {log.frames.channels[batch.channel].topic!r}", found, mend)
+    stamp = _nanoseconds(values[:, len(paths) :]) if fields else None
+    return np.ascontiguousarray(values[:, : len(paths)].T), stamp
 
 
 class _Part(NamedTuple):

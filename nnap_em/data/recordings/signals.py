@@ -1,6 +1,7 @@
 """A quantity at times of its own: held, averaged, interpolated and integrated exactly where it is read."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,14 +12,15 @@ SLOW = 1.5
 """Rows from one reading to the next from which on readings stand in their nearest row, with empty rows between."""
 
 
-class Signal(NamedTuple):
+@dataclass(frozen=True)
+class Signal:
     """Values [SI] at times [s] that rise."""
 
     topic: str
     t: Float[np.ndarray, " message"]
     y: Float[np.ndarray, " message"]
 
-    @property
+    @cached_property
     def interval(self) -> float:
         """Median time from one value to the next [s]."""
         return float(np.median(np.diff(self.t))) if self.t.size > 1 else np.inf

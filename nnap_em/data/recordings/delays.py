@@ -13,6 +13,8 @@ REACH = 0.25
 """Longest delay that is looked for [s]."""
 PARTS = 3
 """The readings are cut in so many parts, whose delays must agree."""
+BIAS = 0.25
+"""Intervals of the readings that parts which agree may all be wrong by; a third was seen, where angles tell it."""
 SPREAD = 0.01
 """How far the delays of the parts may be apart [s]."""
 ROWS = 12_000
@@ -105,8 +107,8 @@ def _over(pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], w
     shifts, like = np.array([shift for shift, _ in found]), float(np.mean([r for _, r in found]))
     if np.isnan(shifts).any() or np.ptp(shifts) > SPREAD:
         return _Best(math.nan, math.nan, like)
-    least = effect.interval / 100  # parts may agree by chance
-    return _Best(float(shifts.mean()), max(float(np.std(shifts, ddof=1)), least) / math.sqrt(PARTS), like)
+    std = math.hypot(float(np.std(shifts, ddof=1)) / math.sqrt(PARTS), BIAS * effect.interval)
+    return _Best(float(shifts.mean()), std, like)
 
 
 def _part(

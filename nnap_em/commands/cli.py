@@ -20,6 +20,7 @@ _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
   nnap-em init bench/train/01.csv --system acrobot  a first rig.toml from the log, to be filled in
+  nnap-em import run.mcap --rig rig.toml --out bench  a data set from logs of a robot: MCAP, HDF5, CSV, ...
   nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
@@ -42,9 +43,21 @@ _INIT = """\
 examples:
   nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
   nnap-em init log.csv --out bench
+  nnap-em init run.mcap --system acrobot --out bench    with a table [import] of what was found where
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
+"""
+_IMPORT = """\
+examples:
+  nnap-em init run.mcap --system acrobot            a first rig.toml, with a table [import] of the topics
+  nnap-em import run.mcap --rig rig.toml --out bench
+  nnap-em import day1.mcap day2.mcap --rig rig.toml --out bench --test 0.2 --shift /joint_states=-0.012
+
+Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and says in FOLDER/
+import.html what it did: rates, jitter, gaps, delays between topics, rows used.  Where columns come from stands in the
+table [import.columns] of rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf) and HDF5 need
+pip install "nnap-em[logs]".
 """
 _CHECK = """\
 example:
@@ -142,10 +155,28 @@ def parser() -> argparse.ArgumentParser:
         )
 
     init = command("init", "write a first rig.toml for a log", _INIT)
-    init.add_argument("csv", metavar="CSV", type=Path, help="a log with a header")
+    init.add_argument("log", metavar="LOG", type=Path, help="a CSV file with a header, MCAP or HDF5")
     init.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
     init.add_argument(
         "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
+    )
+
+    bring = command("import", "write a data set from logs as machines write them", _IMPORT)
+    bring.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
+    bring.add_argument(
+        "--rig", metavar="RIG", type=Path, required=True, help="rig.toml; its [import] says what is where"
+    )
+    bring.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
+    bring.add_argument(
+        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (.2)"
+    )
+    bring.add_argument(
+        "--shift",
+        type=_shift,
+        action="append",
+        default=[],
+        metavar="TOPIC=S",
+        help="add seconds to the times of a topic",
     )
 
     check = command("check", "say whether the logs can identify what is asked", _CHECK)
@@ -309,6 +340,16 @@ def _natural(text: str) -> int:
 
 def _time(text: str) -> float:
     return _number(text, float, 0.0, "seconds, 0 or more")
+
+
+def _part(text: str) -> float:
+    value = _number(text, float, 0.0, "a whole number, or a share below 1")
+    return value if value < 1 else float(_natural(text))
+
+
+def _shift(text: str) -> tuple[str, float]:
+    topic, _, seconds = text.rpartition("=")
+    return topic, _number(seconds, float, -1e12, "TOPIC=SECONDS, such as /joint_states=-0.012")
 
 
 def _positive(text: str) -> float:

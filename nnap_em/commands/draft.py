@@ -75,8 +75,14 @@ def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Dr
 
     Raises DataError where the log cannot be read or the system not be told.
     """
-    table = _numbers(path)
-    columns = _from_one([_meaning(name) for name in table])
+    return drafted(path, _numbers(path), system, specs)
+
+
+def drafted(
+    path: Path, table: Mapping[str, Float[np.ndarray, " time"]], system: str | None, specs: Mapping[str, SystemSpec]
+) -> Draft:
+    """The rig.toml that columns of a log call for."""
+    columns = _from_one([meaning(name) for name in table])
     system = system or _system(path, columns, specs)
     spec = specs[system]
     measured = [name for name in table if name in spec.states]
@@ -104,7 +110,7 @@ def _numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
     return found
 
 
-def _meaning(name: str) -> _Column:
+def meaning(name: str) -> _Column:
     """What a column seems to hold, by its name."""
     word, unit = name.strip().lower(), ""
     if not any(pattern.match(word) for pattern in _NAMES.values()) and (match := _UNIT.match(word)):

@@ -7,15 +7,16 @@ from ..storage.files import replace_text
 from ..systems import specs
 from .common import Say
 from .draft import draft
+from .draft_recorded import draft_recorded
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
     """Write it, to be filled in; one that is there stays as it is."""
-    home = args.csv.parent.parent if args.csv.parent.name in ("train", "test") else args.csv.parent
+    home = args.log.parent.parent if args.log.parent.name in ("train", "test") else args.log.parent
     path = (args.out or home) / "rig.toml"
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
-    found = draft(args.csv, args.system, specs)
+    found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
     replace_text(path, found.text)
     for note in found.notes:
         say(f"in the log: {note}")

@@ -1,9 +1,6 @@
 """nnap-em simulate: a data set with known truth."""
 
 import argparse
-import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,28 +14,21 @@ from ..data.rig import Rig, nearest, write_rig
 from ..model.simulate import Experiment, declared, examples, sensed, sweep_experiment
 from ..model.state_space import StateSpaceModel
 from ..report.tables import visited_nodes, write_friction
+from ..storage.files import whole_folder
 from ..systems import specs
 from .common import Say
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
     """Write it, whole or not at all."""
-    if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
-        raise DataError(f"{args.out}: is there already; give a new folder, or empty this one")
-    model, sweep = examples[args.system]()
-    measured = args.measured and _states(args.measured, specs[args.system].states)
-    model = sensed(model, measured, args.process_noise, args.measurement_noise)
-    count, key = args.sequences + args.test, jax.random.key(args.seed)
-    experiment = sweep_experiment(model, sweep, count, args.steps, key=key)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f".{args.out.name}.", dir=args.out.parent))
-    try:
+    with whole_folder(args.out) as part:
+        model, sweep = examples[args.system]()
+        measured = args.measured and _states(args.measured, specs[args.system].states)
+        model = sensed(model, measured, args.process_noise, args.measurement_noise)
+        count, key = args.sequences + args.test, jax.random.key(args.seed)
+        experiment = sweep_experiment(model, sweep, count, args.steps, key=key)
         _write(part, model, declared(args.system, model), experiment, args.sequences)
-        part.chmod(0o755)
-        os.replace(part, args.out)
-        say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
 
 
 def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:

@@ -42,14 +42,14 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
 
     Raises DataError that names the row and the column.
     """
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    if size > LARGEST:
-        mend = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
-        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {mend}")
+    _check_size(path)
     return _readers[path.suffix.lower()](path, required, gaps)
+
+
+def column_names(path: Path) -> list[str]:
+    """The names of the columns of a log, in the order of the file."""
+    _check_size(path)
+    return _namers[path.suffix.lower()](path)
 
 
 def place(path: Path, column: str, row: int | None = None) -> str:
@@ -105,14 +105,8 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
 
 def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a Parquet file, where null and NaN are missing samples."""
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
-        raise DataError(f"{path}: cannot be read without pyarrow; {mend}") from None
-    with _damaged(path, "Parquet"):
-        file = parquet.ParquetFile(path)
-        names = file.schema_arrow.names
+    file = _parquet_file(path)
+    names = file.schema_arrow.names
     _check_names(path, names, (*required, *gaps))
     with _damaged(path, "Parquet"):
         table = file.read(columns=[*required, *gaps])
@@ -122,6 +116,16 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
 
 def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
+    found = _mat_columns(path)
+    _check_names(path, list(found), (*required, *gaps))
+    return _stack(path, {name: np.asarray(found[name]) for name in (*required, *gaps)}, gaps)
+
+
+_readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
+
+
+def _mat_columns(path: Path) -> dict[str, Any]:
+    """The vectors of a MAT file, or those of the one struct in it."""
     with _damaged(path, "MAT"):
         try:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
@@ -130,11 +134,24 @@ def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
     found = {name: value for name, value in content.items() if not name.startswith("__")}
     if len(found) == 1 and (only := next(iter(found.values()))).dtype.names:
         found = {name: np.asarray(only[name].item()) for name in only.dtype.names}
-    _check_names(path, list(found), (*required, *gaps))
-    return _stack(path, {name: np.asarray(found[name]) for name in (*required, *gaps)}, gaps)
+    return found
 
 
-_readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
+def _parquet_file(path: Path) -> Any:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without pyarrow; {mend}") from None
+    with _damaged(path, "Parquet"):
+        return parquet.ParquetFile(path)
+
+
+_namers: dict[str, Callable[[Path], list[str]]] = {
+    ".csv": lambda path: _header(_text(path)),
+    ".parquet": lambda path: list(_parquet_file(path).schema_arrow.names),
+    ".mat": lambda path: list(_mat_columns(path)),
+}
 
 
 def _logs(folder: Path) -> list[Path]:
@@ -153,6 +170,16 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
             raise _unreadable(path, error) from None
         mend = "use another copy, or write it as CSV"
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {mend}") from None
+
+
+def _check_size(path: Path) -> None:
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if size > LARGEST:
+        mend = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
+        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {mend}")
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:

@@ -110,7 +110,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     """
     path = Path(path)
     root = _Table(path, "", _parse(path))
-    root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start", "limits"))
+    root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start", "limits", "import"))
     if root.number("format") != 1:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})

@@ -4,9 +4,11 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -66,6 +68,24 @@ def replace_bytes(path: Path, content: bytes) -> None:
 def replace_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all (through a temporary file in its folder, which is made if need be)."""
     replace_bytes(path, text.encode())
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """A folder to write into, which is at `out` once all is written, and gone where something fails.
+
+    Raises StoreError where something is at `out` already.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        refuse(out, "is there already", "give a new folder, or empty this one")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        yield part
+        part.chmod(0o755)
+        os.replace(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def sweep(folder: Path) -> None:

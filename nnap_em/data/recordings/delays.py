@@ -1,0 +1,188 @@
+"""How much later one topic tells what another told: by which shift their signals fit each other best."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .signals import Signal, integrals
+
+REACH = 0.25
+"""Longest delay that is looked for [s]."""
+PARTS = 3
+"""The readings are cut in so many parts, whose delays must agree."""
+BIAS = 0.25
+"""Intervals of the readings that parts which agree may all be wrong by; a third was seen, where angles tell it."""
+SPREAD = 0.01
+"""How far the delays of the parts may be apart [s]."""
+ROWS = 12_000
+"""Readings that a delay is told from at most: those around the liveliest input."""
+WIDTHS = (1, 2, 4, 8)
+"""Differences are over so many times the least stretch that shows anything: what is surest decides."""
+SURE = 0.3
+"""Correlation of what is left of both signals from which on a delay is told."""
+
+
+class Pair(NamedTuple):
+    """Two signals of which the second follows the first."""
+
+    cause: str
+    effect: str
+    order: int
+    """How often the first is integrated to give the second: a torque to a rate 1, to an angle 2, one quantity 0."""
+    held: bool
+    """Whether the first is held between its values, as a command is."""
+
+
+class Delay(NamedTuple):
+    """By how much the second signal comes after the first [s]."""
+
+    cause: str
+    """The column, and its topic."""
+    cause_topic: str
+    effect: str
+    effect_topic: str
+    seconds: float
+    """NaN: cannot be told."""
+    std: float
+    correlation: float
+
+
+def pairs(
+    inputs: Mapping[str, int], states: Sequence[str], signals: Mapping[str, Signal], duplicates: Sequence[str]
+) -> list[Pair]:
+    """What follows what on another topic: motion its torque, an angle its rate, a quantity itself.
+
+    `inputs` are columns and their joints, from 1; `states` coordinates, then rates; a duplicate of a column is called
+    as it is, with a '.
+    """
+    dof, found = len(states) // 2, []
+
+    def apart(one: str, two: str) -> bool:
+        return one in signals and two in signals and signals[one].topic != signals[two].topic
+
+    for name, joint in inputs.items():
+        moved = ((states[dof + joint - 1], 1), (states[joint - 1], 2)) if joint <= dof else ()
+        found += [Pair(name, state, order, True) for state, order in moved if apart(name, state)][:1]
+    for q, v in zip(states[:dof], states[dof:], strict=True):
+        found += [Pair(v, q, 1, False)] if apart(v, q) else []
+    return found + [Pair(name, f"{name}'", 0, False) for name in duplicates if apart(name, f"{name}'")]
+
+
+def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> Delay:
+    """The shift at which the n-th difference of the effect is most like that of the n-fold integral of the cause.
+
+    Differences and integrals are over the same stretches, so that no derivative of noise is taken and nothing is
+    late by half a sample.  What the columns `around` explain of both (gravity, friction, couplings) is taken out first;
+    the correlation of the rest, over shifts, is the generalised cross-correlation [Knapp & Carter 1976].
+    """
+    cause, effect = signals[pair.cause], signals[pair.effect]
+    regressors = [signals[name] for name in around if name in signals]
+    least = max(round(max(2 * cause.interval, 4 * effect.interval) / effect.interval), 1)
+    found = [
+        _over(pair, cause, effect, regressors, least * times) for times in WIDTHS[: 1 if pair.order == 0 else None]
+    ]
+    sure = [each for each in found if each.std > 0]
+    best = min(sure, key=lambda each: each.std) if sure else max(found, key=lambda each: each.correlation)
+    return Delay(pair.cause, cause.topic, pair.effect, effect.topic, *best)
+
+
+class _Best(NamedTuple):
+    """A shift [s], its standard deviation, and the correlation there."""
+
+    seconds: float
+    std: float
+    correlation: float
+
+
+def _over(pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], wide: int) -> _Best:
+    """The best shift for differences over so many readings: the wider, the less noise and the less detail.
+
+    It is the mean of those of parts of the readings, and known as well as they agree.
+    """
+    every = _liveliest(cause, effect)
+    found = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, PARTS)]
+    shifts, like = np.array([shift for shift, _ in found]), float(np.mean([r for _, r in found]))
+    if np.isnan(shifts).any() or np.ptp(shifts) > SPREAD:
+        return _Best(math.nan, math.nan, like)
+    std = math.hypot(float(np.std(shifts, ddof=1)) / math.sqrt(PARTS), BIAS * effect.interval)
+    return _Best(float(shifts.mean()), std, like)
+
+
+def _part(
+    pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], wide: int, at: Float[np.ndarray, " x"]
+) -> tuple[float, float]:
+    """The best shift for the readings at these times, NaN where there is none, and the correlation there."""
+    if at.size < 20 * wide:
+        return math.nan, 0.0
+    cause, *around = (_between(signal, at[0] - REACH, at[-1] + REACH) for signal in (cause, *around))
+    target = _difference(np.interp(at, effect.t, effect.y), pair.order, wide)
+    first = (0, wide // 2, wide)[pair.order]
+    rest = _Rest(_explained(at[first : first + target.size], around))
+    target = rest(target)
+    size = math.sqrt(target @ target)
+
+    def likeness(shift: float) -> float:
+        told = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
+        return float(told @ target) / max(math.sqrt(told @ told) * size, 1e-300)
+
+    coarse = max(min(effect.interval, 0.005), REACH / 50)
+    shifts = np.arange(-REACH, REACH + coarse / 2, coarse)
+    found = np.array([likeness(shift) for shift in shifts])
+    k = int(np.argmax(found))
+    if found[k] < SURE or k in (0, shifts.size - 1):
+        return math.nan, float(found[k])
+    best, fine = float(shifts[k]), coarse
+    for _ in range(4):
+        fine /= 3
+        best = max((best + j * fine for j in range(-3, 4)), key=likeness)
+    return best, likeness(best)
+
+
+def _between(signal: Signal, start: float, end: float) -> Signal:
+    """The part of a signal that tells its values from start to end [s]."""
+    first, last = np.searchsorted(signal.t, (start, end))
+    part = slice(max(int(first) - 1, 0), int(last) + 1)
+    return Signal(signal.topic, signal.t[part], signal.y[part])
+
+
+def _liveliest(cause: Signal, effect: Signal) -> Float[np.ndarray, " x"]:
+    """Times of readings, where both signals are known for every shift: the stretch in which the cause varies most."""
+    step, first = effect.interval, max(cause.t[0], effect.t[0]) + REACH
+    end = min(cause.t[-1], effect.t[-1]) - REACH
+    count = int((end - first) / step) if end > first else 0
+    if count <= ROWS:
+        return first + step * np.arange(max(count, 0))
+    starts = np.linspace(first, end - ROWS * step, 20)
+    ends = np.searchsorted(cause.t, starts + ROWS * step)
+    places = zip(np.searchsorted(cause.t, starts).tolist(), ends.tolist(), strict=True)
+    spread = [float(np.std(cause.y[a:b])) if b > a + 1 else 0.0 for a, b in places]
+    return starts[int(np.argmax(spread))] + step * np.arange(ROWS)
+
+
+def _difference(y: Float[np.ndarray, " x"], order: int, wide: int) -> Float[np.ndarray, " less"]:
+    for _ in range(order):
+        y = y[wide:] - y[:-wide]
+    return y
+
+
+def _explained(at: Float[np.ndarray, " x"], around: Sequence[Signal]) -> Float[np.ndarray, "x regressor"]:
+    """Functions of the state that forces may be of."""
+    columns = [np.ones(at.size)]
+    for signal in around:
+        y = np.interp(at, signal.t, signal.y)
+        columns += [y, np.sin(y), np.cos(y), np.tanh(4 * y / max(float(np.std(y)), 1e-300))]
+    return np.stack(columns, axis=-1)
+
+
+class _Rest:
+    """What some columns do not explain of a signal."""
+
+    def __init__(self, columns: Float[np.ndarray, "x regressor"]):
+        u, s, _ = np.linalg.svd(columns, full_matrices=False)
+        self.basis = u[:, s > 1e-9 * s[0]]
+
+    def __call__(self, y: Float[np.ndarray, " x"]) -> Float[np.ndarray, " x"]:
+        return y - self.basis @ (self.basis.T @ y)

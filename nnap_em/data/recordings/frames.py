@@ -1,0 +1,205 @@
+"""The records of an MCAP file by their places: chunks with their indices, and messages in what they hold.
+
+The format: mcap.dev/spec.  Messages of a chunk are found by its indices, which NumPy reads; where there is none, record
+by record.
+"""
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Callable, Container, Iterator, Mapping
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+MAGIC = b"\x89MCAP0\r\n"
+SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, END = 3, 4, 5, 6, 7, (2, 15)
+_LOOSE = 2**22
+"""Bytes of messages outside chunks that are taken at once."""
+
+
+class Batch(NamedTuple):
+    """Messages of one channel in one piece of the file."""
+
+    channel: int
+    data: UInt8[np.ndarray, " byte"]
+    t: Int[np.ndarray, " message"]
+    """Log time [ns]."""
+    start: Int[np.ndarray, " message"]
+    """Where each message begins in `data`."""
+    size: Int[np.ndarray, " message"]
+    """Bytes."""
+
+
+class Broken(ValueError):
+    """A piece of the file that is not whole, or cannot be unpacked: the text says why."""
+
+
+class Walked(NamedTuple):
+    """What stands in a piece of the file, record by record."""
+
+    schemas: dict[int, Any]
+    channels: dict[int, Any]
+    messages: Mapping[int, Int[np.ndarray, "message two"]]
+    """Log time [ns] and offset of the records of each channel."""
+
+
+class Frames:
+    """The data section of an open file, piece by piece."""
+
+    def __init__(self, file: BinaryIO):
+        self.file, self.end = file, os.fstat(file.fileno()).st_size
+        self.schemas: dict[int, Any] = {}
+        self.channels: dict[int, Any] = {}
+        self.whole = True
+        """False once the file ended inside a record, or without its summary."""
+        self.chunks = 0
+        self.lost = 0
+        """Bytes after the last whole record."""
+
+    def batches(self, wanted: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
+        """Messages of wanted channels, piece by piece; of all of the file, or of the chunk at an offset.
+
+        `wanted` is asked before each piece, because channels turn up on the way.
+        """
+        self.file.seek(len(MAGIC) if at is None else at)
+        chunk, index, loose = None, {}, bytearray()
+        for code, position, size in self._records():
+            if chunk is not None and code != INDEX:
+                yield from self._chunk(chunk, index, wanted)
+                chunk, index = None, {}
+                if at is not None:
+                    return
+            if loose and (code not in (SCHEMA, CHANNEL, MESSAGE) or len(loose) > _LOOSE):
+                yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, wanted)
+                loose = bytearray()
+            if code == CHUNK:
+                chunk = (position, size)
+                self.chunks += 1
+            elif code == INDEX:
+                channel, entries = _index(self.file.read(size))
+                index[channel] = entries
+            elif code in (SCHEMA, CHANNEL, MESSAGE):
+                loose += struct.pack("<BQ", code, size) + self.file.read(size)
+        if chunk is not None:
+            yield from self._chunk(chunk, {}, wanted)  # its indices may be cut short
+        if loose:
+            yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, wanted)
+
+    def _records(self) -> Iterator[tuple[int, int, int]]:
+        """Code, offset of the content and size of each record, up to the summary."""
+        while True:
+            position = self.file.tell()
+            head = self.file.read(9)
+            if len(head) == 9:
+                code, size = struct.unpack("<BQ", head)
+                if position + 9 + size <= self.end:
+                    if code in END:
+                        return
+                    yield code, position + 9, size
+                    self.file.seek(position + 9 + size)
+                    continue
+            self.whole, self.lost = False, self.end - position
+            return
+
+    def _chunk(self, chunk: tuple[int, int], index: Mapping[int, np.ndarray], wanted) -> Iterator[Batch]:
+        known = index and index.keys() <= self.channels.keys()
+        if known and not any(channel in wanted() for channel in index):
+            return
+        self.file.seek(chunk[0])
+        yield from self._piece(unpack(self.file.read(chunk[1])), index if known else {}, wanted)
+
+    def _piece(self, data: UInt8[np.ndarray, " byte"], index: Mapping[int, np.ndarray], wanted) -> Iterator[Batch]:
+        batches = [_batch(channel, data, entries) for channel, entries in index.items() if channel in wanted()]
+        if not index or None in batches:
+            found = walk(data)
+            self.schemas |= found.schemas
+            self.channels |= found.channels
+            batches = [_batch(channel, data, rows) for channel, rows in found.messages.items() if channel in wanted()]
+        yield from (batch for batch in batches if batch is not None and batch.t.size)
+
+
+def unpack(record: bytes) -> UInt8[np.ndarray, " byte"]:
+    """What a chunk record holds, unpacked; Broken where it is damaged, or of an unknown compression."""
+    size, crc, length = struct.unpack_from("<QII", record, 16)
+    compression = record[32 : 32 + length].decode(errors="replace")
+    packed = memoryview(record)[40 + length :]
+    if compression not in _unpackers:
+        raise Broken(f"compression {compression!r} of its chunks is not read; write it with lz4, zstd or none")
+    try:
+        data = _unpackers[compression](packed, size)
+    except ImportError as error:
+        raise Broken(f"its chunks are packed by {compression}, and {error.name} is not there; pip install") from None
+    except Exception as error:
+        raise Broken(f"a chunk cannot be unpacked ({error})") from None
+    if crc and zlib.crc32(data) != crc:
+        raise Broken("the checksum of a chunk does not hold")
+    return np.frombuffer(data, np.uint8)
+
+
+def _lz4(packed: memoryview, size: int) -> bytes:
+    import lz4.frame
+
+    return lz4.frame.decompress(packed)
+
+
+def _zstd(packed: memoryview, size: int) -> bytes:
+    import zstandard
+
+    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+
+
+_unpackers: dict[str, Callable[[memoryview, int], Any]] = {
+    "": lambda packed, size: packed,
+    "lz4": _lz4,
+    "zstd": _zstd,
+}
+
+
+def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:
+    """Record by record; what ends in the middle of one ends before it."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Channel, Schema
+
+    found, text, at = Walked({}, {}, {}), data.tobytes(), 0
+    rows: dict[int, list[tuple[int, int]]] = {}
+    while at + 9 <= len(text):
+        code, size = struct.unpack_from("<BQ", text, at)
+        if at + 9 + size > len(text):
+            break
+        if code == MESSAGE:
+            channel, _, t = struct.unpack_from("<HIQ", text, at + 9)
+            rows.setdefault(channel, []).append((t, at))
+        elif code == SCHEMA:
+            schema = Schema.read(ReadDataStream(io.BytesIO(text[at + 9 : at + 9 + size])))
+            found.schemas[schema.id] = schema
+        elif code == CHANNEL:
+            channel = Channel.read(ReadDataStream(io.BytesIO(text[at + 9 : at + 9 + size])))
+            found.channels[channel.id] = channel
+        at += 9 + size
+    return found._replace(messages={channel: np.array(each, np.int64) for channel, each in rows.items()})
+
+
+def _index(record: bytes) -> tuple[int, Int[np.ndarray, "message two"]]:
+    channel, size = struct.unpack_from("<HI", record)
+    return channel, np.frombuffer(record, "<i8", size // 8, 6).reshape(-1, 2)
+
+
+def _batch(channel: int, data: UInt8[np.ndarray, " byte"], rows: Int[np.ndarray, "message two"]) -> Batch | None:
+    """The messages at these places; None where there are none at one of them."""
+    t, at = rows[:, 0], rows[:, 1]
+    if not at.size:
+        return Batch(channel, data, t, at, at)
+    if at.min() < 0 or at.max() + 31 > data.size or (data[at] != MESSAGE).any():
+        return None
+    size = _numbers(data, "<i8", at + 1) - 22
+    if (_numbers(data, "<u2", at + 9) != channel).any() or size.min() < 0 or (at + 31 + size).max() > data.size:
+        return None
+    return Batch(channel, data, t, at + 31, size)
+
+
+def _numbers(data: UInt8[np.ndarray, " byte"], kind: str, at: Int[np.ndarray, " message"]) -> np.ndarray:
+    """Numbers at any bytes."""
+    return np.ndarray((data.size - np.dtype(kind).itemsize + 1,), kind, data, strides=(1,))[at]

@@ -1,0 +1,76 @@
+"""Numbers of decoded messages: dicts, lists and objects with fields, whoever decoded them."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from .recording import steps
+
+NAMES = ("name", "names", "joint_names")
+"""Fields that name the entries of the arrays beside them."""
+MOST = 256
+"""Entries of an array that are listed."""
+
+
+def flatten(message: Any) -> dict[str, float]:
+    """All numbers of a message by their paths; entries of an array by name where names stand beside it."""
+    return dict(_numbers(message, ""))
+
+
+def pick(message: Any, path: str) -> float:
+    """The number at a path; NaN where the message has none."""
+    at, parent = message, None
+    try:
+        for step in steps(path):
+            if isinstance(step, int):
+                at = at[step]
+            elif step.startswith("["):
+                at = at[list(_names(parent)).index(step[1:])]
+            else:
+                at, parent = _get(at, step), at
+        return math.nan if at is None or isinstance(at, str) else float(at)
+    except (KeyError, IndexError, ValueError, AttributeError, TypeError):
+        return math.nan
+
+
+def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:
+    if isinstance(at, bool | int | float):
+        yield path, float(at)
+    elif _is_list(at):
+        for i, item in enumerate(at[:MOST]):
+            yield from _numbers(item, f"{path}[{i}]")
+    elif not isinstance(at, str | bytes | None):
+        names = _names(at)
+        for field in _fields(at):
+            value, inner = _get(at, field), f"{path}.{field}" if path else field
+            if _is_list(value) and len(value) == len(names) and field not in NAMES:
+                for name, item in zip(names, value, strict=True):
+                    yield from _numbers(item, f"{inner}[{name}]")
+            else:
+                yield from _numbers(value, inner)
+
+
+def _is_list(value: Any) -> bool:
+    return (isinstance(value, Sequence) and not isinstance(value, str | bytes)) or hasattr(value, "typecode")
+
+
+def _names(parent: Any) -> Sequence[str]:
+    """The names of the entries, different texts all."""
+    for field in NAMES:
+        found = _get(parent, field, None)
+        if found and _is_list(found) and all(isinstance(n, str) and n for n in found) and len(set(found)) == len(found):
+            return list(found)
+    return []
+
+
+def _fields(at: Any) -> Sequence[str]:
+    if isinstance(at, Mapping):
+        return [str(name) for name in at]
+    described = getattr(at, "DESCRIPTOR", None)
+    return [field.name for field in described.fields] if described else list(getattr(at, "__slots__", vars(at)))
+
+
+def _get(at: Any, field: str, *absent: Any) -> Any:
+    if isinstance(at, Mapping):
+        return at.get(field, *absent) if absent else at[field]
+    return getattr(at, field, *absent)

@@ -1,0 +1,98 @@
+"""Rows of one uniform grid, and the stretches of it in which every topic speaks."""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .signals import SAME, Signal
+
+INTERVALS = 5
+"""Silence of so many of its own intervals, and of so many rows, is a gap of a topic where none is declared."""
+NEAR = 2.5
+"""Intervals of a topic between neighbours that are interpolated at most: one message may be lost."""
+LEAST = 50
+"""Rows of a sequence, where no shortest one is declared."""
+
+
+class Gap(NamedTuple):
+    """A silence of a topic, between two messages [s]."""
+
+    start: float
+    end: float
+
+
+class Piece(NamedTuple):
+    """Rows of the grid that follow each other."""
+
+    first: int
+    end: int
+    """The row after the last one."""
+    why: str = ""
+    """Why it is dropped; empty: it is used."""
+
+
+def reach(signal: Signal, dt: float) -> float:
+    """How far apart neighbours may be that are interpolated [s]."""
+    return max(NEAR * signal.interval, dt)
+
+
+def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
+    """From which silence on a topic has a gap [s]."""
+    return INTERVALS * max(signal.interval, dt) if declared is None else declared
+
+
+def gaps(signal: Signal, longest: float) -> list[Gap]:
+    """The silences that are longer [s]."""
+    places = np.flatnonzero(np.diff(signal.t) > longest)
+    return [Gap(float(signal.t[k]), float(signal.t[k + 1])) for k in places]
+
+
+def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> dict[str, tuple[float, float]]:
+    """From when to when each topic speaks [s]; a command is held for one more of its intervals, not to its end."""
+    found: dict[str, tuple[float, float]] = {}
+    for signals, hold in ((inputs, True), (readings, False)):
+        for s in signals.values():
+            span = (float(s.t[0]), float(s.t[-1]) + (s.interval - 2 * SAME * dt if hold else 0.0))
+            first, last = found.get(s.topic, span)
+            found[s.topic] = (max(first, span[0]), min(last, span[1]))
+    return found
+
+
+def grid(readings: Mapping[str, Signal], start: float, end: float, dt: float) -> Float[np.ndarray, " row"]:
+    """Rows from a reading of the fastest topic on, so that readings as regular as the grid are taken as they are."""
+    fastest = min(readings.values(), key=lambda s: s.interval)
+    t = fastest.t[fastest.t >= start - SAME * dt]
+    first = float(t[0]) if t.size else start
+    return first + dt * np.arange(max(math.floor((end - first) / dt + SAME) + 1, 0))
+
+
+def commanded(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
+    """Rows in which an input is known: for one interval after its last value before a gap."""
+    there = np.ones(at.size, bool)
+    for gap in gaps(signal, longest):
+        there &= (at < gap.start + max(signal.interval, dt) - SAME * dt) | (at >= gap.end - SAME * dt)
+    return there
+
+
+def watched(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
+    """Rows outside the gaps of a reading."""
+    there = np.ones(at.size, bool)
+    for gap in gaps(signal, longest):
+        there &= (at <= gap.start + SAME * dt) | (at >= gap.end - SAME * dt)
+    return there
+
+
+def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Piece]:
+    """The stretches of rows that are there, the long ones in equal parts, the short ones marked as dropped."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
+    found = []
+    for first, end in edges.tolist():
+        parts = -(-(end - first) // longest)
+        places = np.round(np.linspace(first, end, parts + 1)).astype(int).tolist()
+        why = "" if end - first >= shortest else f"shorter than {shortest} rows"
+        found += [Piece(a, b, why) for a, b in pairwise(places)]
+    return found

@@ -1,0 +1,86 @@
+"""A quantity at times of its own: held, averaged, interpolated and integrated exactly where it is read."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+SAME = 1e-3
+"""Share of a row by which times may differ and still be one: clocks count in ns, and rows are rounded."""
+SLOW = 1.5
+"""Rows from one reading to the next from which on readings stand in their nearest row, with empty rows between."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Values [SI] at times [s] that rise."""
+
+    topic: str
+    t: Float[np.ndarray, " message"]
+    y: Float[np.ndarray, " message"]
+
+    @cached_property
+    def interval(self) -> float:
+        """Median time from one value to the next [s]."""
+        return float(np.median(np.diff(self.t))) if self.t.size > 1 else np.inf
+
+
+def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
+    """The value given last, at the row or before it."""
+    return signal.y[_before(signal, at + SAME * dt)]
+
+
+def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
+    """The mean from each row to the next of a signal that is held between its values."""
+    whole = np.append(0.0, np.cumsum(signal.y[:-1] * np.diff(signal.t)))
+
+    def integral(x: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        i = _before(signal, x)
+        return whole[i] + signal.y[i] * (x - signal.t[i])
+
+    return (integral(at + dt) - integral(at)) / dt
+
+
+def interpolated(
+    signal: Signal, at: Float[np.ndarray, " row"], dt: float, reach: float
+) -> tuple[Float[np.ndarray, " row"], Bool[np.ndarray, " row"]]:
+    """Straight lines between neighbours, and where there is a value.
+
+    There is none where neighbours are more than `reach` [s] apart, nor, where readings come slower than rows, in rows
+    that are nearest to no reading.  Between readings of noise sigma a value has less: from sigma / sqrt(2) on.
+    """
+    t, slack = signal.t, SAME * dt
+    right = np.clip(np.searchsorted(t, at), 1, max(t.size - 1, 1))
+    width = t[right] - t[right - 1]
+    x = np.clip(at, t[0], t[-1])
+    exact = np.minimum(np.abs(x - t[right]), np.abs(x - t[right - 1])) <= slack
+    there = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((width <= reach) | exact)
+    if signal.interval > SLOW * dt:
+        nearest = np.round((t - at[0]) / dt).astype(int)
+        hit = np.zeros(at.size, bool)
+        hit[nearest[(nearest >= 0) & (nearest < at.size)]] = True
+        there &= hit
+    share = (x - t[right - 1]) / width
+    y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
+    return np.where(there, y, np.nan), there
+
+
+def integrals(signal: Signal, at: Float[np.ndarray, " x"], times: int, *, steps: bool) -> Float[np.ndarray, " x"]:
+    """The signal integrated so many times (0, 1, 2) from its first value on; held between values, or straight lines."""
+    t, y, width = signal.t, signal.y, np.diff(signal.t)
+    slope = np.append(np.zeros_like(width) if steps else np.diff(y) / width, 0.0)
+    once = np.append(0.0, np.cumsum(y[:-1] * width + slope[:-1] * width**2 / 2))
+    part = once[:-1] * width + y[:-1] * width**2 / 2 + slope[:-1] * width**3 / 6
+    twice = np.append(0.0, np.cumsum(part))
+    i = _before(signal, at)
+    x = at - t[i]
+    if times == 0:
+        return y[i] + slope[i] * x
+    if times == 1:
+        return once[i] + y[i] * x + slope[i] * x**2 / 2
+    return twice[i] + once[i] * x + y[i] * x**2 / 2 + slope[i] * x**3 / 6
+
+
+def _before(signal: Signal, at: Float[np.ndarray, " x"]) -> np.ndarray:
+    return np.clip(np.searchsorted(signal.t, at, side="right") - 1, 0, signal.t.size - 1)

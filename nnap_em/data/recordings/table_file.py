@@ -1,0 +1,37 @@
+"""CSV, Parquet and MAT files: one topic without a name, whose fields are the columns."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..formats import column_names, read_table
+from .clock import rising
+from .hdf5_file import TIME, UNITS
+from .recording import Recording, Topic, Track, refuse
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """The columns, save that of the time."""
+    names = column_names(path)
+    clock = _clock(path, names)
+    return (Topic("", f"table, time in column {clock!r}", None, tuple(name for name in names if name != clock)),)
+
+
+def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
+    """These columns; an empty field is NaN."""
+    name = _clock(path, column_names(path))
+    table = read_table(path, (name,), wanted[""])
+    scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
+    t = np.round(table[:, 0] * scale * 1e9).astype(np.int64)
+    clock = rising(path, f"column {name!r}", t, name)
+    values = {column: table[clock.kept, i] for i, column in enumerate(wanted[""], 1)}
+    return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
+
+
+def _clock(path: Path, names: Sequence[str]) -> str:
+    """The column that is the time."""
+    found = next((name for name in names if TIME.match(name)), None)
+    if found is None:
+        refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", "name it 'time' [s]")
+    return found

@@ -1,0 +1,75 @@
+"""The first rig.toml from topics: what is found is right, and import takes it once it is filled in."""
+
+import re
+
+import numpy as np
+import pytest
+from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
+
+from nnap_em.commands import cli
+from nnap_em.commands.draft_recorded import draft_recorded, found_columns, joint_columns
+from nnap_em.data.dataset import DataError
+from nnap_em.data.recordings.recording import Topic
+from nnap_em.data.rig import read_rig
+from nnap_em.systems import specs
+
+T = 0.004 * np.arange(2000)
+Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
+V = np.stack([np.cos(T), -2 * np.sin(2 * T)], axis=1)
+
+
+def _robot(path, command="/effort_controller/commands"):
+    rng = np.random.default_rng(0)
+    noisy = Q + 1e-3 * rng.normal(size=Q.shape)
+    states = joint_states(("hip", "knee"), noisy, V, 0 * Q, stamps=ns(T))
+    topics = {"/joint_states": (ros2(*JOINTS), ns(T), states)}
+    topics |= {command: (ros2(*MULTI), ns(T), arrays(np.stack([T, -T], 1)))} if command else {}
+    return write_mcap(path, topics)
+
+
+def _filled(path):
+    path.write_text(re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", path.read_text()))
+    return path
+
+
+@pytest.mark.parametrize("command, inputs", [("/effort_controller/commands", "data[0]"), (None, "effort[hip]")])
+def test_a_robot_is_drafted_and_imported(tmp_path, command, inputs):
+    log = _robot(tmp_path / "a.mcap", command)
+    assert cli.main(["init", str(log), "--system", "acrobot"]) == 0
+    rig = read_rig(_filled(tmp_path / "rig.toml"), specs)
+    assert (rig.dt, rig.measured) == (0.004, ("theta1", "theta2", "dtheta1", "dtheta2"))
+    assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == {"tau1": 1, "tau2": 2}
+    assert rig.noise_std["theta1"] == pytest.approx(1e-3, rel=0.1)  # the median of 2000 third differences
+    text = (tmp_path / "rig.toml").read_text()
+    assert f'"tau1" = "{command or "/joint_states"}:{inputs}"' in text
+    assert '"dtheta2" = "/joint_states:velocity[knee]"' in text
+    argv = ["import", str(log), "--rig", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out"), "--test", "0"]
+    assert cli.main(argv) == 0
+    assert (tmp_path / "out/train/000.csv").read_text().startswith("time,tau1,tau2,theta1,theta2,dtheta1,dtheta2\n")
+
+
+def test_hdf5_and_names_of_a_json_log(tmp_path):
+    groups = {"arm": {"time": T, "q": Q, "qd": V}, "motor": {"time": T, "tau": np.cos(T)}}
+    found = draft_recorded(write_hdf5(tmp_path / "a.h5", groups), "pendubot", specs)
+    for line in ('"theta2" = "/arm:q[1]"', '"dtheta1" = "/arm:qd[0]"', '"tau" = "/motor:tau"', "dt = 0.004"):
+        assert line in found.text
+    notes = [{"pos": float(q), "vel": float(v), "u": 0.5} for q, v in zip(Q[:, 0], V[:, 0], strict=True)]
+    log = write_mcap(tmp_path / "a.mcap", {"/slide": (plain_json(), ns(T), notes)})
+    found = draft_recorded(log, None, specs)
+    assert 'type = "slide"' in found.text and '"dx" = "/slide:vel"' in found.text
+
+
+def test_joints_are_called_as_a_machine_calls_them():
+    """The seam for machines whose coordinates are the joints of a file."""
+    topic = Topic("/js", "", None, ("position[hip]", "position[knee]", "velocity[knee]"))
+    found = joint_columns(topic, {"hip": "hip", "knee": "knee"})
+    assert {name: str(at) for name, at in found.items()} == {
+        "hip": "/js:position[hip]", "knee": "/js:position[knee]", "dknee": "/js:velocity[knee]"
+    }  # fmt: skip
+    assert list(found_columns([topic])) == ["theta1", "theta2", "dtheta2"]
+
+
+def test_a_log_without_a_machine_is_refused(tmp_path):
+    log = write_mcap(tmp_path / "a.mcap", {"/rosout": (plain_json(), ns(T[:9]), [{"level": 3}] * 9)})
+    with pytest.raises(DataError, match=r"no topic looks like joints or torques \(topics: /rosout\); write rig.toml"):
+        draft_recorded(log, None, specs)

@@ -1,0 +1,462 @@
+"""Topics with clocks of their own on one grid: closed forms, round trips, gaps, delays; what cannot be is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
+
+from nnap_em.commands import cli
+from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.logs import read_logs
+from nnap_em.data.recordings.delays import Pair, delay
+from nnap_em.data.recordings.pieces import cut
+from nnap_em.data.recordings.signals import Signal, averaged, held, integrals, interpolated
+from nnap_em.data.rig import read_rig
+from nnap_em.systems import specs
+
+DT = 0.01
+RIG = """\
+format = 1
+name = "bench"
+
+[model]
+type = "pendulum"
+m = 0.3
+lc = 0.2
+I = 0.01
+g = 9.81
+friction = "unknown"
+
+[input]
+columns = ["u"]
+joints = [1]
+
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+
+[measurement]
+columns = ["theta1", "dtheta1"]
+"""
+COLUMNS = """
+[import]
+{more}
+[import.columns]
+theta1 = "/js:position[joint]"
+dtheta1 = "/js:velocity[joint]"
+u = "/cmd:data[0]"
+"""
+
+
+def _rig(folder, more: str = "", text: str = RIG, columns: str = COLUMNS):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "rig.toml").write_text(text + columns.replace("{more}", more))
+    return folder / "rig.toml"
+
+
+def _theta(t):
+    return np.sin(3 * t)
+
+
+def _write(path, t, command_t, command, theta=_theta, joint: str = "joint", **options):
+    """A JointState topic and a command topic."""
+    rate = 3 * np.cos(3 * t) if theta is _theta else 0 * t
+    states = joint_states((joint,), theta(t)[:, None], rate[:, None], stamps=ns(t))
+    topics = {
+        "/js": (ros2(*JOINTS), ns(t + 0.002), states),
+        "/cmd": (ros2(*MULTI), ns(command_t), arrays(command)),
+    }
+    return write_mcap(path, topics, **options)
+
+
+def _import(*words):
+    return cli.main(["import", *map(str, words)])
+
+
+def _table(path):
+    return read_table(path, ("time", "u"), ("theta1", "dtheta1"))
+
+
+def _jittered(rng, end, dt, amount):
+    """Times about dt apart that never stand."""
+    t = dt * np.arange(round(end / dt))
+    return t + amount * dt * rng.uniform(-0.5, 0.5, t.size)
+
+
+def test_two_clocks_with_jitter_come_to_one_grid(tmp_path):
+    """Readings within h^2 / 8 max|f''| of the truth, h the largest interval; inputs exactly what was commanded last."""
+    rng = np.random.default_rng(0)
+    t, command_t = _jittered(rng, 20.0, 0.004, 0.8), _jittered(rng, 20.0, 0.0131, 0.8)
+    command = rng.normal(size=command_t.size)
+    log = _write(tmp_path / "a.mcap", t, command_t, command)
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    table = _table(tmp_path / "out/train/000.csv")
+    document = json.loads((tmp_path / "out/import.json").read_text())
+    start = document["logs"][0]["sequences"][0]["start"] + document["logs"][0]["origin_ns"] * 1e-9 - ns(0) * 1e-9
+    at = start + table[:, 0]
+    h = np.diff(t).max()
+    # 12 digits in the file; the origin of 1.7e9 s is known to 2.4e-7 s, at a rate of 3 rad/s and 9 rad/s^2
+    assert np.max(np.abs(table[:, 2] - np.sin(3 * at))) < h**2 / 8 * 9 + 1e-6
+    assert np.max(np.abs(table[:, 3] - 3 * np.cos(3 * at))) < h**2 / 8 * 27 + 3e-6
+    last = np.searchsorted(command_t, at, side="right") - 1
+    sure = np.min(np.abs(at[:, None] - command_t), axis=1) > 2e-5  # a thousandth of a row, rounded
+    np.testing.assert_allclose(table[sure, 1], command[last][sure], rtol=1e-11)
+    assert sure.mean() > 0.99 and table.shape[0] > 1950
+
+
+def test_a_command_that_is_held_between_rows_is_averaged_as_asked(tmp_path):
+    t = DT * np.arange(200)
+    command_t = np.sort(np.append(t, t[:-1] + 0.0025))
+    command = np.arange(command_t.size, dtype=float)
+    log = _write(tmp_path / "a.mcap", t, command_t, command)
+    assert _import(log, "--rig", _rig(tmp_path, 'input = "mean"'), "--out", tmp_path / "out", "--test", 0) == 0
+    u = _table(tmp_path / "out/train/000.csv")[:-1, 1]
+    np.testing.assert_allclose(u, 0.25 * command[:-1:2] + 0.75 * command[1::2], rtol=1e-6)  # stamps are in ns
+
+
+def test_held_averaged_and_integrated_signals_are_their_closed_forms():
+    rng = np.random.default_rng(1)
+    s = Signal("a", np.sort(rng.uniform(0, 1, 40)), rng.normal(size=40))
+    fine = np.linspace(s.t[0], s.t[-1], 200_001)
+    middle = 0.5 * (fine[1:] + fine[:-1])
+    for steps in (True, False):
+        y = held(s, middle, 0.0) if steps else np.interp(middle, s.t, s.y)
+        once = np.append(0.0, np.cumsum(y) * (fine[1] - fine[0]))
+        twice = np.append(0.0, np.cumsum(0.5 * (once[1:] + once[:-1])) * (fine[1] - fine[0]))
+        # the midpoint rule is wrong by up to a step at each of the 40 knots: 5e-6 * 40 * 5
+        np.testing.assert_allclose(integrals(s, fine, 1, steps=steps), once, rtol=0, atol=1e-3)
+        np.testing.assert_allclose(integrals(s, fine, 2, steps=steps), twice, rtol=0, atol=1e-3)
+    rows = np.linspace(s.t[0], s.t[-1] - 0.1, 30)
+    mean = (integrals(s, rows + 0.1, 1, steps=True) - integrals(s, rows, 1, steps=True)) / 0.1
+    np.testing.assert_allclose(averaged(s, rows, 0.1), mean, rtol=1e-12)
+
+
+def test_a_reading_is_interpolated_only_between_near_neighbours():
+    s = Signal("a", np.array([0.0, 0.01, 0.02, 0.05, 0.06, 0.07]), np.arange(6.0))
+    y, there = interpolated(s, np.array([0.0, 0.005, 0.02, 0.03, 0.05, 0.065, 0.07, 0.08]), 0.01, 0.015)
+    np.testing.assert_array_equal(there, [True, True, True, False, True, True, True, False])
+    np.testing.assert_allclose(y[there], [0, 0.5, 2, 3, 4.5, 5], rtol=1e-12)
+    assert np.isnan(y[~there]).all()
+
+
+def test_slow_readings_stand_in_their_nearest_rows(tmp_path):
+    t, slow = 0.01 * np.arange(1000), 0.04 * np.arange(250) + 0.001
+    joints = joint_states(("joint",), None, 3 * np.cos(3 * t)[:, None], stamps=ns(t))
+    topics = {
+        "/js": (ros2(*JOINTS), ns(t), joints),
+        "/camera": (plain_json(), ns(slow), [{"angle": float(x)} for x in _theta(slow)]),
+        "/cmd": (ros2(*MULTI), ns(t), arrays(0 * t)),
+    }
+    log = write_mcap(tmp_path / "a.mcap", topics)
+    rig = _rig(tmp_path, columns=COLUMNS.replace("/js:position[joint]", "/camera:angle"))
+    assert _import(log, "--rig", rig, "--out", tmp_path / "out", "--test", 0) == 0
+    theta = _table(tmp_path / "out/train/000.csv")[:, 2]
+    filled = np.flatnonzero(np.isfinite(theta))
+    assert (np.diff(filled) == 4).all() and filled.size > 240
+    # straight lines over 0.04 s; taken as they are they would be 0.001 s * 3 rad/s = 0.003 rad off
+    assert np.max(np.abs(theta[filled] - _theta(DT * (filled + 1)))) < 0.04**2 / 8 * 9 + 1e-6
+
+
+GAPS = {  # readings and commands that were lost [s, s), and the sequences that are left [rows]
+    "a reading": ((3.0, 3.02), None, [1000]),
+    "readings": ((3.0, 3.5), None, [300, 650]),
+    "commands": (None, (3.0, 3.5), [300, 650]),
+    "both": ((3.0, 3.5), (3.2, 4.0), [300, 600]),
+    "a short piece": ((3.0, 3.5), (3.6, 5.0), [300, 500]),
+    "a topic stops": (None, (8.0, 99.0), [800]),
+    "a topic starts late": ((-1.0, 2.0), None, [800]),
+}
+
+
+@pytest.mark.parametrize("readings, commands, rows", GAPS.values(), ids=GAPS)
+def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
+    t = DT * np.arange(1000)
+    kept, commanded = (t[(t < a - 1e-9) | (t >= b - 1e-9)] for a, b in (x or (99, 99) for x in (readings, commands)))
+    log = _write(tmp_path / "a.mcap", kept, commanded, np.cos(commanded))
+    assert _import(log, "--rig", _rig(tmp_path, "gap = 0.1"), "--out", tmp_path / "out", "--test", 0) == 0
+    files = sorted((tmp_path / "out/train").iterdir())
+    tables = [_table(path) for path in files]
+    assert [len(table) for table in tables] == pytest.approx(rows, abs=1)  # a gap begins in a row, and ends in one
+    document = json.loads((tmp_path / "out/import.json").read_text())["logs"][0]
+    for table, s in zip(tables, (s for s in document["sequences"] if s["file"]), strict=True):
+        at = table[:, 0] + s["start"]
+        at += kept[0] if kept[0] < commanded[0] else commanded[0]
+        np.testing.assert_allclose(table[:, 1], np.cos(at), rtol=0, atol=1e-9)
+        there = np.isfinite(table[:, 2])
+        np.testing.assert_allclose(table[there, 2], np.sin(3 * at[there]), rtol=0, atol=1e-9)
+        assert np.sum(~there) == s["missing"]["theta1"] == (2 if readings == (3.0, 3.02) else 0)
+    assert any("shorter than 50 rows" in s["why"] for s in document["sequences"]) == (readings == (3.0, 3.5) and
+        commands == (3.6, 5.0))  # fmt: skip
+    read_logs(tmp_path / "out/train", read_rig(tmp_path / "out/rig.toml", specs))
+
+
+def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
+    there = np.ones(1000, bool)
+    there[400:410] = False
+    found = cut(there, 50, 150)
+    assert [(p.first, p.end) for p in found] == [
+        (0, 133), (133, 267), (267, 400), (410, 558), (558, 705), (705, 852), (852, 1000)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("test, parts", [(1, (3, 1)), (0.5, (2, 2)), (0, (4, 0)), (0.01, (3, 1))])
+def test_the_last_sequences_are_for_the_test(tmp_path, test, parts):
+    t = DT * np.arange(1000)
+    log = _write(tmp_path / "a.mcap", t, t, np.cos(t))
+    rig = _rig(tmp_path, "longest = 2.5")
+    assert _import(log, "--rig", rig, "--out", tmp_path / "out", "--test", test) == 0
+    assert tuple(len(list((tmp_path / "out").glob(f"{part}/*.csv"))) for part in ("train", "test")) == parts
+    every = np.concatenate([_table(p)[:, 2] for p in sorted((tmp_path / "out/train").iterdir())])
+    np.testing.assert_allclose(every, _theta(t[: every.size]), rtol=0, atol=1e-9)
+
+
+def test_more_test_sequences_than_there_are_is_refused(tmp_path, capsys):
+    t = DT * np.arange(200)
+    log = _write(tmp_path / "a.mcap", t, t, np.cos(t))
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 2
+    assert "the logs give 1 sequences, and one is needed to train on" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def _driven(t_cmd, u, t):
+    """A pendulum's angle and rate under a held torque, by small steps."""
+    from scipy.integrate import solve_ivp
+
+    def rate(x, y):
+        k = max(np.searchsorted(t_cmd, x, side="right") - 1, 0)
+        return [y[1], (u[k] - 0.02 * y[1] - 0.3 * 9.81 * 0.2 * np.sin(y[0])) / (0.01 + 0.3 * 0.04)]
+
+    return solve_ivp(rate, (t[0], t[-1]), [0.0, 0.0], t_eval=t, max_step=0.002, rtol=1e-8).y
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Torques at 200 Hz, readings at 500 Hz, 20 s."""
+    rng = np.random.default_rng(3)
+    t_cmd, t = 0.005 * np.arange(4200), 0.002 * np.arange(10_250) + 0.5
+    u = np.convolve(rng.normal(size=4200), np.ones(20) / 20, "same") * 0.5
+    return t_cmd, u, t, _driven(t_cmd, u, t)
+
+
+@pytest.mark.parametrize("late", (0.012, -0.03, 0.0))
+@pytest.mark.parametrize("what", ("rate", "angle"))
+def test_a_delay_is_told_to_a_millisecond(driven, late, what):
+    """With noise of 1 mrad and 20 mrad/s."""
+    t_cmd, u, t, (q, v) = driven
+    rng = np.random.default_rng(4)
+    q, v = q + 1e-3 * rng.normal(size=q.size), v + 2e-2 * rng.normal(size=v.size)
+    signals = {"u": Signal("/cmd", t_cmd, u), "q": Signal("/js", t + late, q), "v": Signal("/js", t + late, v)}
+    found = delay(Pair("u", "v" if what == "rate" else "q", 1 if what == "rate" else 2, True), signals, ("q", "v"))
+    assert abs(found.seconds - late) < 1e-3
+    assert found.std < 1e-3
+
+
+def test_the_delay_of_a_duplicate_and_of_an_angle_behind_its_rate(driven):
+    _, _, t, (q, v) = driven
+    signals = {"v": Signal("/js", t, v), "q": Signal("/a", t + 0.012, q), "q'": Signal("/b", t + 0.007, q)}
+    assert abs(delay(Pair("v", "q", 1, False), signals, ()).seconds - 0.012) < 1e-3
+    assert abs(delay(Pair("q", "q'", 0, False), signals, ()).seconds + 0.005) < 1e-3
+
+
+def test_signals_that_have_nothing_to_do_with_each_other_have_no_delay():
+    rng = np.random.default_rng(5)
+    t = 0.01 * np.arange(4000)
+    signals = {name: Signal(name, t, rng.normal(size=t.size)) for name in ("u", "v")}
+    assert np.isnan(delay(Pair("u", "v", 1, True), signals, ()).seconds)
+
+
+def test_a_delay_is_reported_and_taken_out_as_asked_only(tmp_path, driven, capsys):
+    t_cmd, u, t, (q, v) = driven
+    states = joint_states(("joint",), q[:, None], v[:, None], stamps=ns(t + 0.012))
+    topics = {"/js": (ros2(*JOINTS), ns(t + 0.012), states), "/cmd": (ros2(*MULTI), ns(t_cmd), arrays(u))}
+    log, rig = write_mcap(tmp_path / "a.mcap", topics), _rig(tmp_path)
+    assert _import(log, "--rig", rig, "--out", tmp_path / "as is", "--test", 0) == 0
+    said = capsys.readouterr().err
+    (told,) = json.loads((tmp_path / "as is/import.json").read_text())["logs"][0]["delays"]
+    assert told["seconds"] == pytest.approx(0.012, abs=1e-3)
+    assert "/js is 12" in said and "nothing was shifted" in said and "--shift /js=-0.01" in said
+    assert "/js is 12" in (tmp_path / "as is/import.html").read_text()
+    assert _import(log, "--rig", rig, "--out", tmp_path / "mended", "--test", 0, "--shift", "/js=-0.012") == 0
+    document = json.loads((tmp_path / "mended/import.json").read_text())
+    assert abs(document["logs"][0]["delays"][0]["seconds"]) < 1e-3 and document["shifts"] == {"/js": -0.012}
+    one, two = (_table(tmp_path / name / "train/000.csv") for name in ("as is", "mended"))
+    # the grid begins at a reading: the same readings, with the commands of 12 ms later
+    np.testing.assert_allclose(one[:100, 2], two[:100, 2], rtol=0, atol=1e-6)
+    k = round(0.512 / 0.005)
+    assert one[0, 1] == pytest.approx(u[k], rel=1e-11) and two[0, 1] == pytest.approx(u[k - 2], rel=1e-11)
+
+
+@pytest.mark.parametrize("clock", ("sequence", "session"))
+def test_what_was_simulated_comes_back_from_mcap(tmp_path, clock):
+    """The acrobot of `simulate`, three sequences as recordings: the same CSV files to the last digit but one."""
+    bench = tmp_path / "bench"
+    assert cli.main(["simulate", str(bench), "--sequences", "2", "--test", "1", "--steps", "150"]) == 0
+    text = (bench / "rig.toml").read_text().replace('"sequence"', f'"{clock}"')
+    rig = read_rig(bench / "rig.toml", specs)
+    (tmp_path / "rig.toml").write_text(text + "\n[import]\nshortest = 0.5\n")
+    logs, tables = [], []
+    for i, path in enumerate([*sorted((bench / "train").iterdir()), *sorted((bench / "test").iterdir())]):
+        table = read_table(path, ("time", *rig.input_columns), rig.measured)
+        tables.append(table)
+        stamps = ns(table[:, 0] + 10.0 * i)
+        n = 1 + len(rig.input_columns)
+        state = [dict(zip(rig.measured, row.tolist(), strict=True)) for row in table[:, n:]]
+        command = [dict(zip(rig.input_columns, row.tolist(), strict=True)) for row in table[:, 1:n]]
+        topics = {"/state": (plain_json(), stamps, state), "/command": (plain_json(), stamps, command)}
+        logs.append(write_mcap(tmp_path / f"{i}.mcap", topics))
+    assert _import(*logs, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", "--test", 1) == 0
+    files = [*sorted((tmp_path / "out/train").iterdir()), *sorted((tmp_path / "out/test").iterdir())]
+    for i, (path, table) in enumerate(zip(files, tables, strict=True)):
+        back = read_table(path, ("time", *rig.input_columns), rig.measured)
+        start = 10.0 * i if clock == "session" else 0.0
+        np.testing.assert_allclose(back[:, 0], table[:, 0] + start, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(back[:, 1], table[:, 1])  # commands are held, not interpolated
+        # readings at stamps that are rounded to ns: 5e-10 s times 50 rad/s^2
+        np.testing.assert_allclose(back[:, 2:], table[:, 2:], rtol=1e-11, atol=1e-7)
+    found = read_rig(tmp_path / "out/rig.toml", specs)
+    assert found.measured == rig.measured and '"/state:theta1"' in (tmp_path / "out/rig.toml").read_text()
+    read_logs(tmp_path / "out/train", found)
+
+
+def test_hdf5_and_csv_give_the_same_as_mcap(tmp_path):
+    t = DT * np.arange(300)
+    columns = {"theta1": _theta(t), "dtheta1": 3 * np.cos(3 * t), "u": np.cos(t)}
+    write_csv(tmp_path / "a.csv", {"time": t} | columns)
+    write_hdf5(tmp_path / "a.h5", {"arm": {"time": t} | columns})
+    _write(tmp_path / "a.mcap", t, t, np.cos(t))
+    tables = []
+    for name in ("a.csv", "a.h5", "a.mcap"):
+        rig = _rig(tmp_path / name[2:], columns=COLUMNS if name == "a.mcap" else "")
+        assert _import(tmp_path / name, "--rig", rig, "--out", tmp_path / f"out {name}", "--test", 0) == 0
+        tables.append(_table(tmp_path / f"out {name}/train/000.csv"))
+    for table in tables:
+        np.testing.assert_allclose(table, tables[0], rtol=0, atol=1e-8)  # stamps in ns, at 9 rad/s^2
+        np.testing.assert_allclose(table[:, 1], np.cos(t), rtol=1e-11)
+
+
+def test_units_of_a_log_are_scaled(tmp_path):
+    t = DT * np.arange(300)
+    log = _write(tmp_path / "a.mcap", t, t, np.cos(t), theta=lambda t: np.rad2deg(_theta(t)))
+    scaled = COLUMNS.replace('"/js:position[joint]"', '{ from = "/js:position[0]", scale = 0.017453292519943295 }')
+    assert _import(log, "--rig", _rig(tmp_path, columns=scaled), "--out", tmp_path / "out", "--test", 0) == 0
+    np.testing.assert_allclose(_table(tmp_path / "out/train/000.csv")[:, 2], _theta(t), rtol=0, atol=1e-9)
+
+
+def _empty(values):
+    return np.full_like(values, np.nan)
+
+
+T = DT * np.arange(300)
+
+
+def _said(old: str, new: str) -> dict[str, str]:
+    return {"columns": COLUMNS.replace(old, new, 1)}
+
+
+REFUSED = {  # what is wrong with the rig's table, or with the log, and words of the message
+    "unknown topic": (_said("/cmd:", "/cmmd:"), {}, ["column 'u'", "no topic '/cmmd'", "did you mean '/cmd'"]),
+    "unknown field": (_said("data[0]", "dat"), {}, ["column 'u'", "no field 'dat'", "data[0]"]),
+    "wrong index": (_said("data[0]", "data[3]"), {}, ["'data' of '/cmd' has 1 values", "count from 0 to 0"]),
+    "unknown joint": (_said("position[joint]", "position[jiont]"), {}, ["did you mean 'position[joint]'"]),
+    "not declared": ({"columns": ""}, {}, ["column 'u': nothing is called so", "[import.columns] u =", "/cmd:data[0]"]),
+    "unknown key": ({"more": "gaps = 1"}, {}, ["[import] gaps", "unknown", "did you mean 'gap'"]),
+    "unknown column": (_said("theta1 =", "theta2 ="), {}, ["[import.columns] theta2", "no column of this rig"]),
+    "no address": (_said('"/cmd:data[0]"', "3"), {}, ["[import.columns] u", "found 3", "topic:field"]),
+    "no scale": (_said('"/cmd:data[0]"', '{ from = "/cmd:data[0]", scale = 0 }'), {}, ["scale is 0"]),
+    "input": ({"more": 'input = "holds"'}, {}, ["[import] input", "did you mean 'hold'"]),
+    "gap": ({"more": "gap = -1"}, {}, ["[import] gap", "seconds above 0"]),
+    "no overlap": ({}, {"command_t": T + 100}, ["topics '/js' and '/cmd'", "no time in common", "--shift /cmd="]),
+    "all NaN": ({}, {"command": _empty(T)}, ["column 'u'", "0 numbers in 300 messages", "[import.columns]"]),
+    "dt too fine": ({"text": RIG.replace("0.01\ninput", "0.001\ninput")}, {}, ["is much finer", "write dt = 0.01"]),
+    "too short": ({"more": "shortest = 100"}, {}, ["has 300 rows", "a sequence needs 10000"]),
+}
+
+
+@pytest.mark.parametrize("rig, log, words", REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_imported_is_refused_and_nothing_is_written(tmp_path, capsys, rig, log, words):
+    log = {"t": T, "command_t": T, "command": np.cos(T)} | log
+    path = _write(tmp_path / "a.mcap", **log)
+    assert _import(path, "--rig", _rig(tmp_path, **rig), "--out", tmp_path / "out") == 2
+    said = capsys.readouterr().err.strip().split("\n")[-1]
+    assert any(str(tmp_path / name) in said for name in ("a.mcap", "rig.toml")) and ";" in said
+    for word in words:
+        assert word in said
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "rig.toml"]
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path, capsys):
+    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("mine")
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out") == 2
+    assert "out: is there already; give a new folder, or empty this one" in capsys.readouterr().err
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
+
+
+def test_a_shift_of_an_unknown_topic_is_refused(tmp_path, capsys):
+    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--shift", "/jss=1") == 2
+    assert "--shift /jss: no topic of that name is used; did you mean '/js'?" in capsys.readouterr().err
+
+
+def test_a_name_that_stands_twice_is_asked_for(tmp_path, capsys):
+    notes = [{"u": 0.1, "theta1": float(x), "dtheta1": 0.0} for x in _theta(T)]
+    topics = {name: (plain_json(), ns(T), notes) for name in ("/one", "/two")}
+    log = write_mcap(tmp_path / "a.mcap", topics)
+    assert _import(log, "--rig", _rig(tmp_path, columns=""), "--out", tmp_path / "out") == 2
+    assert "column 'u': may be '/one:u' and '/two:u'; write [import.columns] u" in capsys.readouterr().err
+
+
+def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
+    """As the coordinates of a machine that was read from its file are."""
+    from nnap_em.data.recordings.columns import resolve
+    from nnap_em.data.recordings.files import reader
+
+    joints = joint_states(("shoulder", "elbow"), *[np.ones((300, 2))] * 3)
+    path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(T), joints)})
+    found = resolve(path, reader(path).topics(path), ("elbow",), ("shoulder", "dshoulder"), {})
+    assert {name: at.path for name, at in found.items()} == {
+        "elbow": "effort[elbow]", "shoulder": "position[shoulder]", "dshoulder": "velocity[shoulder]"
+    }  # fmt: skip
+
+
+def test_other_commands_accept_the_table_and_ignore_it(tmp_path):
+    with_table, without = (read_rig(_rig(tmp_path / str(i), columns=c), specs) for i, c in enumerate((COLUMNS, "")))
+    assert with_table == without
+
+
+def test_the_page_tells_what_was_done(tmp_path):
+    rng = np.random.default_rng(2)
+    t = _jittered(rng, 10.0, 0.01, 0.4)
+    t = t[(t < 3) | (t > 4)]
+    log = _write(tmp_path / "a.mcap", t, DT * np.arange(1000), np.cos(DT * np.arange(1000)))
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 0
+    page = (tmp_path / "out/import.html").read_text()
+    for text in (
+        "/js",
+        "/cmd",
+        "train/000.csv",
+        "test/000.csv",
+        "header stamp",
+        "log time",
+        "data:image",
+    ):
+        assert text in page
+    assert "<script" not in page and "http" not in page.split("</style>")[1].split("data:image")[0]
+    topic = json.loads((tmp_path / "out/import.json").read_text())["logs"][0]["topics"][0]
+    assert topic["rate"] == pytest.approx(100, rel=0.02) and len(topic["gaps"]) == 1
+    assert topic["jitter"] == pytest.approx(np.std(np.diff(t)[np.diff(t) < 0.5]), rel=1e-3)
+    assert topic["worst"] < 0.01 * 0.45
+
+
+def test_what_is_left_of_a_cut_log_is_imported_and_told(tmp_path, capsys):
+    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    assert "look at this: a.mcap: the file is cut short" in capsys.readouterr().err
+    assert "the file is cut short" in (tmp_path / "out/import.html").read_text()
+    u = _table(tmp_path / "out/train/000.csv")[:, 1]
+    assert 50 < u.size < 300
+    np.testing.assert_allclose(u, np.cos(T[: u.size]), rtol=1e-11)

@@ -1,0 +1,358 @@
+"""Files of recorders: every encoding and layout gives the numbers that were written; what is broken is refused."""
+
+import struct
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.writer import CompressionType
+from recorders import (
+    EPOCH,
+    FLOAT,
+    JOINTS,
+    MULTI,
+    NO_INDEX,
+    NS,
+    arrays,
+    joint_states,
+    ns,
+    plain_json,
+    ros2,
+    write_hdf5,
+    write_mcap,
+)
+
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import write_csv
+from nnap_em.data.recordings import codecs
+from nnap_em.data.recordings.files import reader
+from nnap_em.data.recordings.objects import flatten, pick
+
+T = 0.01 * np.arange(300)
+Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
+U = np.cos(3 * T)
+
+
+def _read(path, **wanted):
+    """Tracks by topic without its slash."""
+    return reader(path).read(path, {f"/{topic}": paths for topic, paths in wanted.items()}).tracks
+
+
+def _log(path, **options):
+    joints = joint_states(("shoulder", "elbow"), Q, 2 * Q, stamps=ns(T - 0.003))
+    topics = {
+        "/js": (ros2(*JOINTS), ns(T), joints),
+        "/cmd": (ros2(*MULTI), ns(T + 0.001), arrays(U)),
+        "/rest": (ros2("std_msgs/msg/Float64", FLOAT), ns(T), (SimpleNamespace(data=1.0) for _ in T)),
+    }
+    return write_mcap(path, topics, **options)
+
+
+LAYOUTS = {
+    "zstd": {},
+    "lz4": {"compression": CompressionType.LZ4},
+    "not packed": {"compression": CompressionType.NONE},
+    "no chunks": {"use_chunking": False},
+    "no index, no summary": NO_INDEX,
+    "one chunk": {"chunk_size": 2**30},
+}
+
+
+@pytest.mark.parametrize("options", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_layout_of_a_file_gives_what_was_written(tmp_path, options):
+    path = _log(tmp_path / "a.mcap", **options)
+    found = {topic.name: topic for topic in reader(path).topics(path)}
+    assert found["/js"].fields[2:] == (
+        "position[shoulder]", "position[elbow]", "velocity[shoulder]", "velocity[elbow]"
+    )  # fmt: skip
+    assert found["/cmd"].fields == ("layout.data_offset", "data[0]")
+    assert found["/js"].messages in (300, None)
+    tracks = _read(path, js=("position[elbow]", "velocity[shoulder]"), cmd=("data[0]",))
+    np.testing.assert_array_equal(tracks["/js"].values["position[elbow]"], Q[:, 1])
+    np.testing.assert_array_equal(tracks["/js"].values["velocity[shoulder]"], 2 * Q[:, 0])
+    np.testing.assert_array_equal(tracks["/cmd"].values["data[0]"], U)
+    np.testing.assert_array_equal(tracks["/js"].t, ns(T - 0.003))
+    np.testing.assert_array_equal(tracks["/cmd"].t, ns(T + 0.001))
+    assert (tracks["/js"].clock, tracks["/cmd"].clock) == ("header stamp", "log time")
+
+
+def test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder(tmp_path, monkeypatch):
+    """Frames of other lengths, joints in another order, a joint that is missing, and a list that is empty."""
+    forms = [
+        ("base", ("a", "b")),
+        ("a longer frame", ("a", "b")),
+        ("base", ("b", "a")),
+        ("", ("a",)),
+        ("x", ("c", "a")),
+    ]
+    rng = np.random.default_rng(0)
+    messages = []
+    for k in rng.integers(len(forms), size=200):
+        frame, names = forms[k]
+        y = rng.normal(size=(1, len(names)))
+        messages += joint_states(names, y, None if k == 1 else 2 * y, frame=frame)
+    path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(0.01 * np.arange(200)), messages)})
+    wanted = ("position[a]", "position[b]", "velocity[b]", "position[1]", "header.stamp.sec")
+    fast = _read(path, js=wanted)["/js"].values
+    monkeypatch.setattr(codecs, "FORMS", 0)
+    slow = _read(path, js=wanted)["/js"].values
+    for name in wanted:
+        np.testing.assert_array_equal(fast[name], slow[name])
+        np.testing.assert_array_equal(fast[name], [pick(message, name) for message in messages])
+    assert np.isnan(fast["velocity[b]"]).any() and np.isfinite(fast["position[a]"]).all()
+
+
+def test_the_fast_way_is_taken(tmp_path, monkeypatch):
+    path = _log(tmp_path / "a.mcap")
+    calls = []
+    generic = codecs.Decoded.read
+    monkeypatch.setattr(codecs.Decoded, "read", lambda self, data, start, size, paths: calls.append(start.size) or
+                        generic(self, data, start, size, paths))  # fmt: skip
+    _read(path, js=("position[elbow]",), cmd=("data[0]",))
+    assert calls == [1, 1]  # one look at each topic
+
+
+def test_a_layout_that_differs_from_the_generic_decoder_is_not_used(tmp_path, monkeypatch):
+    from nnap_em.data.recordings.ros2 import Layout
+
+    monkeypatch.setattr(Layout, "read", lambda self, data, start, path: np.zeros(start.size))
+    found = _read(_log(tmp_path / "a.mcap"), js=("position[elbow]",))["/js"].values
+    np.testing.assert_array_equal(found["position[elbow]"], Q[:, 1])
+
+
+MESSAGE = {  # a definition, a message of it, and numbers in it
+    "padding": ("uint8 a\nfloat64 b\nint16 c\nfloat32 d\n", {"a": 3, "b": -1.5, "c": -7, "d": 0.25}),
+    "lists": ("uint8[3] a\nint32[] b\nbool[<=4] c\n", {"a": [1, 2, 3], "b": [-5, 6], "c": [True, False]}),
+    "constants": ("int32 K=3\nstring<=9 s\nint64 a # so many\nuint32 b 7\n", {"s": "ab", "a": -9, "b": 5}),
+    "empty list": ("float64[] a\nfloat32 b\n", {"a": [], "b": 0.5}),
+    "nothing": ("", {}),
+}
+
+
+@pytest.mark.parametrize("text, fields", MESSAGE.values(), ids=MESSAGE)
+def test_a_message_is_laid_out_as_it_was_written(text, fields):
+    *_, encode = ros2("pkg/msg/One", text)
+    data = encode(SimpleNamespace(**fields))
+    form = codecs.layout(codecs.definitions("pkg/msg/One", text), "pkg/One", data)
+    numbers = flatten(SimpleNamespace(**fields))
+    for path, value in numbers.items():
+        assert form.read(np.frombuffer(data, np.uint8), np.zeros(1, int), path)[0] == value
+    assert form.matches(np.frombuffer(data, np.uint8), np.zeros(1, int), np.array([len(data)])).all()
+
+
+def _protobuf():
+    """A message with a number, a list and a stamp."""
+    file = descriptor_pb2.FileDescriptorProto(name="m.proto", package="robot", syntax="proto3")
+    stamp = file.message_type.add(name="Stamp")
+    for i, (name, kind) in enumerate((("seconds", 3), ("nanos", 5)), 1):
+        stamp.field.add(name=name, number=i, type=kind, label=1)
+    state = file.message_type.add(name="State")
+    state.field.add(name="timestamp", number=1, type=11, label=1, type_name=".robot.Stamp")
+    state.field.add(name="q", number=2, type=1, label=3)
+    state.field.add(name="u", number=3, type=2, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName("robot.State"))
+    text = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    return made, ("robot.State", "protobuf", text, "protobuf", lambda message: message.SerializeToString())
+
+
+def test_protobuf_and_json(tmp_path):
+    made, schema = _protobuf()
+    stamps = ns(T - 0.002)
+    states = [made(timestamp={"seconds": int(s) // NS, "nanos": int(s) % NS}, q=q.tolist(), u=0.5)
+              for s, q in zip(stamps, Q, strict=True)]  # fmt: skip
+    notes = [{"joint": {"names": ["a", "b"], "q": q.tolist()}, "on": True, "text": "x"} for q in Q]
+    path = write_mcap(tmp_path / "a.mcap", {"/state": (schema, ns(T), states), "/json": (plain_json(), ns(T), notes)})
+    fields = {topic.name: topic.fields for topic in reader(path).topics(path)}
+    assert fields["/state"] == ("timestamp.seconds", "timestamp.nanos", "q[0]", "q[1]", "u")
+    assert fields["/json"] == ("joint.q[a]", "joint.q[b]", "on")
+    found = _read(path, state=("q[1]", "u"), json=("joint.q[a]", "on"))
+    np.testing.assert_array_equal(found["/state"].values["q[1]"], Q[:, 1])
+    np.testing.assert_array_equal(found["/state"].t, stamps)
+    np.testing.assert_array_equal(found["/json"].values["joint.q[a]"], Q[:, 0])
+    assert found["/state"].values["u"][0] == 0.5 and found["/json"].values["on"][0] == 1.0
+
+
+AXES = {  # how a group says its times, and the unit
+    "name": ("time", lambda t: t, {}),
+    "whole ns": ("stamps", lambda t: np.round(t * 1e9).astype(np.int64) + EPOCH, {"axis": "time"}),
+    "ms by name": ("t_ms", lambda t: 1e3 * t, {}),
+    "us by attribute": ("clock", lambda t: 1e6 * t, {"units": "us"}),
+}
+
+
+@pytest.mark.parametrize("name, made, attributes", AXES.values(), ids=AXES)
+def test_hdf5_finds_its_time_axis(tmp_path, name, made, attributes):
+    import h5py
+
+    path = write_hdf5(tmp_path / "a.h5", {"arm/state": {name: made(T), "q": Q, "u": U, "gains": np.ones(7)}})
+    with h5py.File(path, "a") as file:
+        file[f"arm/state/{name}"].attrs.update(attributes)
+    (topic,) = (t for t in reader(path).topics(path) if "q[0]" in t.fields)
+    assert (topic.name, topic.fields, topic.messages) == ("/arm/state", ("q[0]", "q[1]", "u"), 300)
+    track = reader(path).read(path, {"/arm/state": ("q[1]", "u")}).tracks["/arm/state"]
+    np.testing.assert_array_equal(track.values["q[1]"], Q[:, 1])
+    np.testing.assert_allclose((track.t - track.t[0]) * 1e-9, T, rtol=0, atol=2e-9)  # ns, rounded twice
+
+
+def test_hdf5_shares_the_time_of_a_group_above(tmp_path):
+    path = write_hdf5(tmp_path / "a.h5", {"run": {"time": T}, "run/arm": {"q": Q}, "run/motor": {"u": U}})
+    tracks = reader(path).read(path, {"/run/arm": ("q[0]",), "/run/motor": ("u",)}).tracks
+    np.testing.assert_array_equal(tracks["/run/motor"].values["u"], U)
+    np.testing.assert_array_equal(tracks["/run/motor"].t, tracks["/run/arm"].t)
+
+
+def _stamped(path, stamps, log=None):
+    log = ns(T) if log is None else log
+    return write_mcap(path, {"/js": (ros2(*JOINTS), log, joint_states(("a",), Q[:, :1], stamps=stamps))})
+
+
+CLOCKS = {  # header stamps, the clock that is taken, and what is said
+    "there": (ns(T - 0.01), "header stamp", ""),
+    "all 0": (0 * ns(T), "log time", "header stamps are all 0"),
+    "backwards": (ns(T) - 3 * (np.arange(300) == 50) * 10**7, "log time", "run backwards (1 times)"),
+    "another clock": (ns(T) - EPOCH, "log time", "of another clock, 1.7e+09 s"),
+    "twice": (ns(np.round(T, 1)), "header stamp", "messages have the time of the next one"),
+}
+
+
+@pytest.mark.parametrize("stamps, clock, note", CLOCKS.values(), ids=CLOCKS)
+def test_which_clock_is_taken_and_why(tmp_path, stamps, clock, note):
+    track = _read(_stamped(tmp_path / "a.mcap", stamps), js=("position[a]",))["/js"]
+    assert track.clock == clock and note in "".join(track.notes)
+    assert (np.diff(track.t) > 0).all() and bool(track.notes) == bool(note)
+
+
+def test_a_log_that_is_a_little_out_of_order_is_sorted(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        from mcap.writer import Writer
+
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/x", "json", 0)
+        for k in (0, 1, 3, 2, 4):
+            writer.add_message(channel, EPOCH + k * 10**7, b'{"x": %d}' % k, 0)
+        writer.finish()
+    track = _read(path, x=("x",))["/x"]
+    np.testing.assert_array_equal(track.values["x"], np.arange(5))
+    assert "1 messages were out of order by up to 0.01 s: sorted" in track.notes
+
+
+def _cut(path):
+    """A log whose end was lost in the middle of a chunk."""
+    _log(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return path
+
+
+def test_what_is_whole_of_a_cut_file_is_read_and_told(tmp_path):
+    path = _cut(tmp_path / "a.mcap")
+    assert {topic.name for topic in reader(path).topics(path)} == {"/js", "/cmd", "/rest"}
+    found = reader(path).read(path, {"/cmd": ("data[0]",)})
+    values = found.tracks["/cmd"].values["data[0]"]
+    assert 50 < values.size < 300
+    np.testing.assert_array_equal(values, U[: values.size])
+    assert "the file is cut short" in found.notes[0] and "what is whole was read" in found.notes[0]
+
+
+def _flipped(path):
+    _log(path, compression=CompressionType.NONE)
+    content = bytearray(path.read_bytes())
+    place = content.index(struct.pack("<d", Q[7, 1]))
+    content[place] ^= 1
+    path.write_bytes(content)
+    return path
+
+
+def _lost(path):
+    """A chunk of an unknown compression."""
+    _log(path)
+    path.write_bytes(path.read_bytes().replace(b"\x04\x00\x00\x00zstd", b"\x04\x00\x00\x00snap"))
+    return path
+
+
+def _unread(path, encoding="flatbuffer", form="bfbs"):
+    schema = ("robot.State", form, b"...", encoding, lambda message: message)
+    return write_mcap(path, {"/js": (schema, ns(T), [b"1234"] * 300)})
+
+
+def _back(path):
+    log = ns(T) - 5 * NS * (np.arange(300) > 200)
+    import mcap.writer
+
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        channel = writer.register_channel("/js", "json", 0)
+        for t in log.tolist():
+            writer.add_message(channel, t, b'{"x": 1}', t)
+        writer.finish()
+    return path
+
+
+BAD = {  # the file, and words of the message
+    "no MCAP file": ("a.mcap", lambda p: p.write_text("hello, world"), ["no MCAP file"]),
+    "a changed bit": ("a.mcap", _flipped, ["the checksum of a chunk does not hold", "another copy"]),
+    "unknown compression": ("a.mcap", _lost, ["'snap'", "lz4, zstd or none"]),
+    "unknown encoding": ("a.mcap", _unread, ["'/js'", "'flatbuffer' is not read", "JSON or protobuf"]),
+    "IDL": ("a.mcap", lambda p: _unread(p, "cdr", "ros2idl"), ["'/js'", "'ros2idl'", "write it as"]),
+    "no stamps": ("a.mcap", lambda p: _stamped(p, None, 0 * ns(T)), ["'/js'", "no stamps", "300 messages", "record"]),
+    "backwards": ("a.mcap", _back, ["'/js'", "backwards at message 202, by 4.99 s", "cut the file"]),
+    "no JSON": (
+        "a.mcap",
+        lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T), [b'{"q": 1'] * 300)}),
+        ["'/js'", "does not fit its schema (Expecting", "record again"],
+    ),
+    "HDF5 without times": (
+        "a.h5",
+        lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
+        ["'/js/time'", "no numbers", "cut the rows"],
+    ),
+    "no messages": ("a.mcap", lambda p: write_mcap(p, {"/js": (plain_json(), [], [])}), ["'/js'", "no messages"]),
+    "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), ["no HDF5 file", "another copy"]),
+    "no time axis": ("a.h5", lambda p: write_hdf5(p, {"js": {"q": T}}), ["'/js'", "no time axis (holds q)", "`time`"]),
+    "HDF5 backwards": (
+        "a.h5",
+        lambda p: write_hdf5(p, {"js": {"time": T[::-1], "q": T}}),
+        ["'/js/time'", "backwards at row 2"],
+    ),
+    "CSV without time": ("a.csv", lambda p: write_csv(p, {"q": T}), ["no column of times (found q)", "'time'"]),
+    "no such file": ("b.mcap", lambda p: None, ["no such file"]),
+    "another kind": ("a.bag", lambda p: p.write_text("x"), ["logs end in .mcap, .h5", "rename"]),
+}
+
+
+@pytest.mark.parametrize("name, make, words", BAD.values(), ids=BAD)
+def test_what_cannot_be_read_is_refused_with_its_mend(tmp_path, name, make, words):
+    path = tmp_path / name
+    make(path)
+    with pytest.raises(DataError) as refused:
+        source = reader(path)
+        source.topics(path)
+        source.read(path, {"" if name.endswith("csv") else "/js": ("q",)})
+    for word in (str(path), *words):
+        assert word in str(refused.value)
+    assert ";" in str(refused.value)
+
+
+@pytest.mark.parametrize("name, module", [("a.mcap", "mcap"), ("a.h5", "h5py")])
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, name, module):
+    for each in [m for m in sys.modules if m == module or m.startswith(f"{module}.")]:
+        monkeypatch.setitem(sys.modules, each, None)
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(b"any")
+    with pytest.raises(DataError, match=r'cannot be read without .*; pip install "nnap-em\[logs\]"'):
+        reader(tmp_path / name).topics(tmp_path / name)
+
+
+@pytest.mark.parametrize("packing, module", [("zstd", "zstandard"), ("lz4", "lz4")])
+def test_without_the_library_of_the_chunks_the_message_names_it(tmp_path, monkeypatch, packing, module):
+    path = _log(tmp_path / "a.mcap", **LAYOUTS[packing])
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, f"{module}.frame", None)
+    with pytest.raises(DataError, match=rf'packed by {packing}, .*pip install "nnap-em\[logs\]"'):
+        _read(path, js=("position[elbow]",))

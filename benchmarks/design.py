@@ -30,7 +30,8 @@ from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.design.experiment import Design, design_experiment
 from nnap_em.design.questions import after
-from nnap_em.design.rivals import Law, Rivals, instead
+from nnap_em.design.rivals import Law, Rivals
+from nnap_em.diagnose.rivals import instead
 from nnap_em.em.identify import Identified, friction_table, identify
 from nnap_em.storage.files import cores, replace_text
 
@@ -151,7 +152,7 @@ def weaker(effect: dict[str, Any], share: float) -> dict[str, Any]:
 def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified]]:
     """Log-likelihood of the first law over the second [nat], and both fits."""
     base = identify(rig, data, key=key)
-    fits = [instead(base, data, None, law) for law in laws]
+    fits = [instead(base, data, None, law.means) for law in laws]
     tops = [np.nan_to_num(np.asarray(fit.state.top), nan=-1e6) for fit in fits]
     return float(np.sum(tops[0] - tops[1])), fits
 

@@ -20,7 +20,7 @@ from nnap_em.design.experiment import design_experiment
 from nnap_em.design.information import Contrast, Fit, contrast, information, known
 from nnap_em.design.limits import DesignError, Limits, limits_of
 from nnap_em.design.play import motions
-from nnap_em.design.questions import Apart, Told, after
+from nnap_em.design.questions import Apart, Told, after, share
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
@@ -70,6 +70,16 @@ def test_covariance_after_more_information_is_that_of_the_sum_of_precisions():
     np.testing.assert_allclose(after(cov, told), np.linalg.inv(np.linalg.inv(cov) + told), rtol=1e-8, atol=1e-10)
 
 
+def test_new_logs_tell_the_share_that_the_old_ones_told():
+    """A posterior that is wider than the information of its logs says explains a share of it, by construction .3."""
+    rng = np.random.default_rng(4)
+    jac = rng.standard_normal((30, 4))
+    prior, told = 9 * np.eye(4), jac.T @ jac
+    fit = lambda cov: Fit(None, None, None, jnp.asarray(cov), jnp.asarray(prior))  # type: ignore[arg-type]  # noqa: E731
+    np.testing.assert_allclose(share(fit(after(prior, 0.3 * told)), told), 0.3, rtol=1e-4)
+    assert share(fit(after(prior, 2.0 * told)), told) == 1.0
+
+
 def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_adapted():
     """d^2 = r'(I + J C J')^-1 r, the quadratic form of a Gaussian whose mean is known up to J delta."""
     rng = np.random.default_rng(2)
@@ -88,7 +98,7 @@ def fit(bench) -> tuple[Fit, Dataset, np.ndarray]:
     _, model, rule, data, path = bench
     weights: Weights = rule.weights(model)
     size = weights.nodes.size + weights.prior.size
-    return Fit(model, weights.prior, weights.nodes, jnp.eye(size)), data, np.asarray(path.mean)
+    return Fit(model, weights.prior, weights.nodes, jnp.eye(size), 4 * jnp.eye(size)), data, np.asarray(path.mean)
 
 
 def test_information_is_the_mean_square_of_the_score(fit):

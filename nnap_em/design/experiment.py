@@ -15,7 +15,7 @@ from ..em.predict import drawn_paths, smooth
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .questions import AbstractQuestion, Apart, Friction, Parameters, Several, Told
+from .questions import AbstractQuestion, Apart, Friction, Parameters, Several, Told, share
 from .rivals import Rivals
 from .search import EFFORT, Bench, Effort, Plan, Say, search, tell, told
 from .signals import Proposal, played, starts
@@ -99,6 +99,9 @@ def design_experiment(
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
     t = fitted.rig.dt * np.arange(rows + 1)
     bench = Bench(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
+    row = _row_of_logs(bench, data, path, used)
+    count = float(np.sum(np.asarray(data.valid)[used]))
+    bench = bench._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
     plan = search(bench, asked, sequences, rng=rng, effort=effort, say=say)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
@@ -116,7 +119,7 @@ def design_experiment(
         high,
         fit,
         plan.told.sum(),
-        _old(bench, sequences, data, path, used),
+        row.times(bench.share * sequences * t.size),
         asked,
         tuple(rivals),
         apart,
@@ -193,8 +196,8 @@ def _padded(proposal: Proposal, batch: int) -> Proposal:
     return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
 
 
-def _old(bench: Bench, count: int, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
-    """What the old inputs tell in as much time as `count` new ones take, by their smoothed motions."""
+def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
+    """What a row of the logs tells, the mean along their smoothed motions, as far as a new sequence is long."""
     rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
     short = rows - cut.t.shape[1]
@@ -203,5 +206,4 @@ def _old(bench: Bench, count: int, data: Dataset, path: Float[np.ndarray, "seq t
     cut = Dataset(t, u, y, grow(cut.valid))
     x = grow(path[used, :rows], mode="edge")
     each = told(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
-    share = count * rows / max(float(cut.valid.sum()), 1.0)
-    return jax.tree.map(lambda a: share * a, each.sum())
+    return each.sum().times(1.0 / max(float(cut.valid.sum()), 1.0))

@@ -28,20 +28,23 @@ class Fit(NamedTuple):
     nodes: Float[Array, "dof node"]
     cov: Float[Array, "phi phi"]
     """Posterior covariance of phi (Laplace)."""
+    prior_cov: Float[Array, "phi phi"]
+    """That before any log."""
 
 
 def known(fitted: Identified) -> Fit:
     """What is known after a fit."""
     weights = fitted.m_step.weights(fitted.model)
-    cov = _covariance(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian)
-    return Fit(fitted.model, fitted.m_step.prior, weights.nodes, cov)
+    cov, before = _covariances(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian)
+    return Fit(fitted.model, fitted.m_step.prior, weights.nodes, cov, before)
 
 
 @eqx.filter_jit
-def _covariance(weights, unknown, w, hessian) -> Float[Array, "phi phi"]:
-    jac = weights.jacobian(unknown, w)
-    half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True)
-    return half.T @ half
+def _covariances(weights, unknown, w, hessian) -> tuple[Float[Array, "phi phi"], Float[Array, "phi phi"]]:
+    before, jac = weights.hessian(unknown, w, weights.symmetry())
+    halves = (jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(h), jac.T, lower=True) for h in (hessian, before))
+    after, prior = (half.T @ half for half in halves)
+    return after, prior
 
 
 def information(

@@ -53,9 +53,8 @@ def limits_of(
     if not rig.input_columns:
         raise DesignError(f"rig {rig.name!r} has no input: there is nothing to design; declare its drive in [input]")
     names, dof = system.coordinates + system.rates, len(system.coordinates)
-    valid = np.asarray(data.valid) & used[:, None]
-    u, mean = np.asarray(data.u), path[..., : 2 * dof]
-    reached = mean[valid & np.isfinite(mean).all(axis=-1)]
+    valid, u, mean = np.asarray(data.valid), np.asarray(data.u), path[..., : 2 * dof]
+    reached = mean[valid & used[:, None] & np.isfinite(mean).all(axis=-1)]
     change = np.abs(np.diff(u, axis=1))[valid[:, 1:] & valid[:, :-1]] / rig.dt
     bounds = rig.limits
     inputs = _told(rig.input_columns, bounds.values, u[valid].min(axis=0), u[valid].max(axis=0))

@@ -5,8 +5,10 @@ from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import root_scalar
 
 from .information import Contrast, Fit
 
@@ -22,6 +24,10 @@ class Told(NamedTuple):
         both = (Contrast(*(a + b for a, b in zip(one, two, strict=True))) for one, two in pairs)
         return Told(self.information + other.information, tuple(both))
 
+    def times(self, amount: float) -> "Told":
+        """As much of it."""
+        return jax.tree.map(lambda a: amount * a, self)
+
     def of(self, which) -> "Told":
         """Some of the proposals."""
         return Told(self.information[which], tuple(Contrast(*(a[which] for a in c)) for c in self.contrasts))
@@ -34,6 +40,22 @@ class Told(NamedTuple):
 def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "*proposal phi phi"]:
     """Covariance of phi with more information: (C^-1 + A)^-1, of a C that may be singular."""
     return np.linalg.solve(np.eye(len(cov)) + cov @ information, np.broadcast_to(cov, information.shape))
+
+
+def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
+    """Share of the expected information of the `logs` of a fit that the fit itself owns up to.
+
+    Where noise is what the model says it is one; on a real machine recordings disagree, the fit says so by a wider
+    posterior (`em.multistep.robust_hessian`), and new logs will tell as much less.
+    """
+    before, now = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
+    counts = now > 1e-12 * now.max()
+
+    def wider(part: float) -> float:
+        """Mean logarithm of the variances over those of the fit."""
+        return float(np.mean(np.log(np.diagonal(after(before, part * logs))[counts] / now[counts])))
+
+    return 1.0 if wider(1.0) >= 0 or wider(1e-6) <= 0 else root_scalar(wider, bracket=(1e-6, 1.0)).root
 
 
 class AbstractQuestion(eqx.Module):

@@ -1,30 +1,16 @@
 """Laws that the logs could not tell apart, each fitted in the other's place, so that an experiment can be asked to."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-import numpy as np
-
 from ..data.dataset import Dataset
-from ..diagnose.accept import LikelihoodRule
-from ..diagnose.evidence import Question
-from ..diagnose.grow import Loop, asked
-from ..diagnose.hypothesis import Hypothesis
 from ..diagnose.keys import key_of, words
-from ..diagnose.look import EFFORT, Say
-from ..diagnose.propose import extended, proposals, seeded, surroundings
-from ..diagnose.refit import Trial, refit
-from ..diagnose.screen import score_test
+from ..diagnose.look import Say
+from ..diagnose.rivals import instead, possible
 from ..effects import AbstractEffect
 from ..em.identify import Identified
 from .limits import DesignError
-
-STARTS = 3
-"""Places from which a law is fitted."""
-PASSES = 10
-"""Passes of a fit from one of them, more than in a search: rivals are compared closely."""
 
 
 class Law(NamedTuple):
@@ -73,7 +59,7 @@ def rivals(
     out, beside = [], []
     for own, other in wanted:
         say(f"fitting {other} in place of {own or 'nothing'}")
-        model = instead(fitted, Dataset(*map(jnp.asarray, data)), own, other, say)
+        model = _instead(fitted, data, own, other)
         if own is None:
             beside.append((str(other), model))
         else:
@@ -82,36 +68,15 @@ def rivals(
     return out + [Rivals((a, b), one, other) for (a, one), (b, other) in pairs if beside]
 
 
-def instead(fitted: Identified, data: Dataset, own: Law | None, other: Law, say: Say = lambda text: None) -> Identified:
-    """The fit with one law in the place of another (None: on top), from quick refits.
-
-    Raises DesignError where the fit does not hold the one, or the machine cannot have the other.
-    """
+def _instead(fitted: Identified, data: Dataset, own: Law | None, other: Law) -> Identified:
+    """The fit with one law in the place of another."""
     effects = fitted.model.effects
-    now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(effects))
-    if own is not None:
-        place = next((i for i, effect in enumerate(effects) if own.means(effect)), None)
-        if place is None:
-            held = ", ".join(words(key_of(effect)) for effect in effects)
-            raise DesignError(f"the fit holds no {own}; it holds {held or 'no effect'}")
-        now = now.without(place)
-    loop = Loop(fitted, {}, data, LikelihoodRule(), EFFORT, say)
-    question, _ = asked(loop, now, loop.longest)
-    trials = _trials(fitted, question._replace(bare=now.having(())), other)
-    best = max(trials, key=lambda trial: float(np.nansum(np.where(question.used, trial.loglik, 0.0))))
-    state = fitted.state._replace(model=best.model, best=best.model, hessian=best.hessian, top=best.loglik)
-    return fitted._replace(state=state, m_step=best.m_step)
-
-
-def _trials(fitted: Identified, question: Question, law: Law) -> Iterator[Trial]:
-    """Fits of a law from its most promising starts."""
-    around = surroundings(fitted.rig, question.model, question.data, question.path, question.rows)
-    every = proposals(around, question.model.effects)
-    same = [candidate for candidate in every if law.means(candidate.start)]
-    if not same:
-        known = sorted({words(key_of(candidate.start)) for candidate in every})
-        raise DesignError(f"this machine cannot have {law}; possible here: {', '.join(known)}")
-    for entry in sorted(score_test(question, same).screened, key=lambda s: -s.gain)[:STARTS]:
-        full = question.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
-        path = extended(full.model, question.path, question.data)
-        yield refit(full.model, full.m_step.early(), path, question.data, question.used, passes=PASSES)
+    place = next((i for i, effect in enumerate(effects) if own is not None and own.means(effect)), None)
+    if own is not None and place is None:
+        held = ", ".join(words(key_of(effect)) for effect in effects)
+        raise DesignError(f"the fit holds no {own}; it holds {held or 'no effect'}")
+    found = instead(fitted, data, place, other.means)
+    if found is None:
+        known = sorted({words(key_of(effect)) for effect in possible(fitted, data)})
+        raise DesignError(f"this machine cannot have {other}; possible here: {', '.join(known)}")
+    return found

@@ -56,6 +56,8 @@ class Bench(NamedTuple):
     limits: Limits
     t: Float[np.ndarray, " time"]
     key: PRNGKeyArray
+    share: float = 1.0
+    """Of the expected information that is believed (`questions.share`)."""
 
 
 class Plan(NamedTuple):
@@ -71,7 +73,7 @@ def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, "
     u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
     found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
     seq = blank(bench.t, u, len(bench.fit.model.measured))
-    return allowed(found, bench.limits), told(bench, seq, found.x, start)
+    return allowed(found, bench.limits), told(bench, seq, found.x, start).times(bench.share)
 
 
 def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:

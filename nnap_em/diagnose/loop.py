@@ -34,10 +34,9 @@ from .outcome import Closed, Step
 from .quantised import quantised
 from .refit import refit
 from .residual import white_innovations
+from .rivals import EVEN, apart
 from .undo import Difference, concluded, needed
 
-EVEN = 5.0
-"""Alternatives whose refit is within this many nats of the winner cannot be told from it."""
 SAME = 0.01
 """Share of an effect's information that an equivalent one may leave unexplained."""
 
@@ -240,7 +239,7 @@ def close_the_loop(
     if white_readings(data):
         outcome = closed(LikelihoodRule())
         if white_innovations(outcome.after, data):
-            return outcome
+            return apart(outcome, data)
         say("one-step errors follow each other, so that their likelihood proves nothing: multi-step errors decide")
         return closed(ShareRule())
     before, data, touches, pieces = untouched(fitted, before, data)

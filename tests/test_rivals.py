@@ -1,0 +1,54 @@
+"""Laws in the place of one another, over the whole length of the logs."""
+
+import jax
+import numpy as np
+import pytest
+
+from nnap_em.commands import cli
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.diagnose.hypothesis import Found
+from nnap_em.diagnose.keys import key_of
+from nnap_em.diagnose.outcome import Closed
+from nnap_em.diagnose.rivals import apart, instead, possible
+from nnap_em.em.identify import identify
+from nnap_em.systems import specs
+
+GAIN = 0.7
+
+
+@pytest.fixture(scope="module")
+def weak_drive(tmp_path_factory):
+    """A slide whose drive gives less than the logs say, fitted without and with that gain."""
+    folder = tmp_path_factory.mktemp("rivals") / "slide"
+    size = ("--system", "slide", "--sequences", "4", "--test", "0", "--steps", "150")
+    assert cli.main(["simulate", str(folder), *size]) == 0
+    rig = read_rig(folder / "rig.toml", specs)
+    logged = read_logs(folder / "train", rig).data
+    data = logged._replace(u=np.asarray(logged.u) / GAIN)
+    bare = identify(rig, data, key=jax.random.key(0), epochs=12)
+    full = instead(bare, data, None, lambda effect: effect.name == "motor_gain")
+    assert full is not None
+    return data, bare, full
+
+
+def _closed(bare, full, *equivalent) -> Closed:
+    return Closed(bare, full, (Found(None, 1.0, 1.0, 0.0, 1, equivalent),), ())  # type: ignore[arg-type]
+
+
+def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
+    data, bare, full = weak_drive
+    (effect,) = full.model.effects
+    assert abs(float(effect.values()["gain"]) - GAIN) < 0.05
+    assert instead(bare, data, None, lambda effect: effect.name == "base_tilt") is None  # a slide has no such law
+    assert "motor_gain" in {effect.name for effect in possible(bare, data)}
+
+
+def test_only_what_the_whole_length_cannot_tell_stays_equivalent(weak_drive):
+    data, bare, full = weak_drive
+    (own,) = map(key_of, full.model.effects)
+    delay = next(key_of(effect) for effect in possible(bare, data) if effect.name == "input_delay")
+    told = apart(_closed(bare, full, delay, own), data)
+    assert told.found[0].equivalent == (own,)  # the same law in its own place is as likely
+    untouched = _closed(bare, full)
+    assert apart(untouched, data) is untouched

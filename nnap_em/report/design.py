@@ -1,6 +1,5 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +24,8 @@ from .wording import number
 Say = Callable[[str], None]
 INPUTS, MOTIONS = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
+NOTED = 1.1
+"""How much surer a parameter becomes to be named in the verdict."""
 ACROSS = 3
 """Sequences in one figure."""
 
@@ -178,14 +179,15 @@ def _verdict(told: dict[str, Any]) -> str:
         gains.append(
             f"the friction band near rest of {joints} {best} times narrower (as much time of the old inputs: {old})"
         )
-    for name, p in list(told["parameters"].items())[:3]:
-        if math.isfinite(p["now"]) and p["expected"] > 0:
-            gains.append(f"{name} {number(p['now'] / p['expected'], 2)} times surer")
+    surer = {name: p["now"] / p["expected"] for name, p in told["parameters"].items() if p["expected"] > 0}
+    told_most = sorted((name for name, times in surer.items() if times > NOTED), key=lambda name: -surer[name])
+    gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
     for pair in told["apart"]:
         wrong, old = pair["told_wrong"]["expected"], pair["told_wrong"]["same_time_of_old_inputs"]
         gains.append(
             f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
         )
+    gains = gains or ["hardly anything surer: widen [limits], or give more --seconds"]
     what = f"{told['sequences']} sequences of {number(told['seconds_each'])} s"
     return f"{what} should make {listed(gains)}."
 

@@ -115,7 +115,7 @@ def model_file(path: Path) -> Path:
 
 def write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> None:
     """One file per sequence; a value that is no number becomes an empty field, and is told."""
-    states = specs[fitted.rig.system].states
+    states = fitted.model.system.coordinates + fitted.model.system.rates
     for i, file in enumerate(logs.files):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)

@@ -12,7 +12,6 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset, horizon
 from ..data.logs import Logs
 from ..data.rig import Rig, RigError
-from ..data.units import parameter_unit
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
@@ -170,9 +169,10 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = loads(system)
     needed = gravity + mass * scales.acceleration
-    for name, joint, u in zip(rig.input_columns, rig.input_joints, np.moveaxis(np.asarray(data.u), -1, 0), strict=True):
+    inputs = np.moveaxis(np.asarray(data.u), -1, 0)
+    for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
         unit = system.force_unit(joint)
-        given = float(np.percentile(np.abs(u[data.valid]), 99))
+        given = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = given / needed[joint - 1]
         text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
         odd = ratio > 30 or 0 < ratio < 1e-3
@@ -180,7 +180,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     kept = untold(rig, system, data)
     if kept:
-        told = ", ".join(f"{name} = {rig.parameters[name]} {parameter_unit(name)}" for name in kept)
+        told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
         text = (
             "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
             f"kept as declared is {told}, and all else is relative to that"

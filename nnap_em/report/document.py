@@ -11,7 +11,6 @@ import numpy as np
 
 from .. import __version__
 from ..data.logs import Logs
-from ..data.units import parameter_unit
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
@@ -49,7 +48,7 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
 
 def parameters(fitted: Identified) -> dict[str, Any]:
     """Estimated physical parameters."""
-    return {n: {"value": v, "std": s, "unit": parameter_unit(n)} for n, (v, s) in parameter_table(fitted).items()}
+    return {n: {"value": v, "std": s, "unit": fitted.rig.unit(n)} for n, (v, s) in parameter_table(fitted).items()}
 
 
 def noise(fitted: Identified) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
     for finding in torques(rig, system, data, measure_scales(rig, system, data)):
         if finding.mark == BAD:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
-        elif finding.subject == "scale":
+        elif finding.subject in ("scale", "range"):
             warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)
 
 

@@ -1,11 +1,12 @@
 """What rig.toml declares of a machine that stands in a file: its names, its inputs, and what of it is uncertain."""
 
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from .machine import Machine, packed, states
 from .mjcf import read_machine
-from .rig import Declared, SystemSpec, Told, nearest
+from .rig import Declared, RigWarning, SystemSpec, Told, nearest
 
 OF_BODY = ("mass", "com.x", "com.y", "com.z", *(f"inertia.{axes}" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")))
 """In the frame of the body, the inertia about its centre of mass: kg, m, kg m^2."""
@@ -24,10 +25,19 @@ def declare(root: Any) -> Told:
     machine = machine._replace(
         file=str(model.items["file"]), states=_states(machine, root), rubs=model.items.get("friction") == "none"
     )
+    _say_left_out(root, machine)
     columns, joints, gears, motored = _inputs(machine, root)
     spec = SystemSpec(machine.states, (), {}, len(machine.joints))
     parameters = dict(_parameters(machine, model))
     return Told(spec, parameters, columns, joints, packed(machine._replace(gears=gears, motored=motored)))
+
+
+def _say_left_out(root: Any, machine: Machine) -> None:
+    """Friction of the file has no part where it is learned."""
+    names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
+    if names and not machine.rubs:
+        found = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {machine.file}: {found}; friction = "none" takes the file\'s', RigWarning, 2)
 
 
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:
@@ -46,6 +56,10 @@ def _states(machine: Machine, root: Any) -> tuple[str, ...]:
 def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], tuple[float, ...], bool]:
     """Columns, the joint that each drives, counted from 1, its gear, and whether they are the motors of the file."""
     motors = {motor.name: motor for motor in machine.motors}
+    if not motors and "input" not in root.items:
+        found = f"{machine.file} has no actuator"
+        mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", found, mend)
     table = root.table("input", absent={})
     table.check((), ("columns", "joints"))
     columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
@@ -73,7 +87,7 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
     return columns, joints, gears, motored
 
 
-def _place(machine: Machine, table: Any, joint: object) -> int:
+def _place(machine: Machine, table: Any, joint: Any) -> int:
     names = [one.name for one in machine.joints]
     if isinstance(joint, str):
         return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))

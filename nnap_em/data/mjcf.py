@@ -1,7 +1,6 @@
 """A machine from MJCF or URDF: MuJoCo's compiler reads the file, what the physics here has no place for is refused."""
 
 import re
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,17 +9,13 @@ from typing import Any, NoReturn
 import numpy as np
 
 from .machine import Body, Gauge, Joint, Machine, Motor, Rotation, Spot, Vector
-from .rig import RigError, RigWarning
+from .rig import RigError
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
 
 
 class MachineError(RigError):
     """A machine file that cannot be used: the message names the file, what stands in the way, and the mend."""
-
-
-class MachineWarning(RigWarning):
-    """Something in a machine file that has no part in the model."""
 
 
 def read_machine(path: Path) -> Machine:
@@ -105,7 +100,7 @@ def _compiled(path: Path, root: ET.Element) -> Any:
 def _mend(said: str) -> str:
     """What to do about the commonest errors of the compiler."""
     mends = {
-        r"mass and inertia of moving bodies": "give every body that moves an <inertial> with its mass and inertia",
+        r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
         r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
         r"inertia.*(positive|negative)|(positive|negative).*inertia": "masses and inertias are above 0: correct it",
         r"repeated name|already|duplicate": "give every body, joint, motor and sensor a name of its own",
@@ -135,9 +130,7 @@ def _refuse_urdf(path: Path, root: ET.Element) -> None:
         if kind in ("floating", "planar"):
             refuse(path, f"joint {name!r} is {kind}", "fix the base, or model the joint as slides and hinges")
         if joint.find("mimic") is not None:
-            refuse(
-                path, f"joint {name!r} mimics another", "free it of the other: couplings are no tree"
-            )
+            refuse(path, f"joint {name!r} mimics another", "free it of the other: couplings are no tree")
         if kind != "fixed" and links[child].find("inertial") is None and not _carries(child, root):
             mend = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
             refuse(path, f"link {child!r} moves and has no <inertial>", mend)
@@ -231,8 +224,6 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
 def _refuse_all(path: Path, model: Any) -> None:
     for found, mend in _obstacles(model):
         refuse(path, found, mend)
-    if model.nu == 0:
-        warnings.warn(f"{path}: it has no actuator; torques are those that [input] names", MachineWarning, 2)
 
 
 def _obstacles(model: Any) -> Iterator[tuple[str, str]]:

@@ -18,8 +18,10 @@ from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .build import LAG, NO_MACHINE, Scales, loads, measure_scales, reading_noise
+from .felt import felt, sentences
 from .identify import begin
 from .scale import untold
+from .stops import at_stops
 
 OK, LOOK, BAD = "ok", "look", "bad"
 SEQUENCES, SECONDS = 6, 1.0
@@ -178,6 +180,10 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
+    for text in at_stops(rig, data):
+        yield Finding(LOOK, "range", text)
+    for text in sentences(felt(rig, system)):
+        yield Finding(LOOK, "scale", text)
     kept = untold(rig, system, data)
     if kept:
         told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)

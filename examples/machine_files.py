@@ -1,9 +1,9 @@
-"""Friction of a cart and its pole, whose angle nobody reads: the machine from an MJCF file, logs from MuJoCo itself.
+"""Friction of both joints of a machine of which one is read: declared by an MJCF file, logs from MuJoCo itself.
 
     python examples/machine_files.py [--machine cartpole|furuta] [--seed 0]
 
 The plant is MuJoCo's own integrator at a twentieth of the sample interval with a friction law of this script, so that
-nothing of the library made the logs; only the driven joint is read.
+nothing of the library made the logs.  Of the cart and pole the cart is read, of the Furuta pendulum its rod.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import numpy as np
 
 from nnap_em import identify
 from nnap_em.data.dataset import Dataset
+from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
 from nnap_em.systems import specs
 
@@ -45,7 +46,7 @@ CASES = {
     "cartpole": Case((0.8, 0.004), (1.5, 0.003), (0.01, 0.05), 6.0, 0.0005),
     "furuta": Case((0.004, 0.002), (0.002, 0.0008), (0.05, 0.05), 0.04, 0.001),
 }
-"""Friction on the driven joint, then on the one that nobody reads."""
+"""Friction on the driven joint, then on the other one."""
 
 
 def friction(case: Case) -> Law:
@@ -102,14 +103,15 @@ def main() -> None:
     logs, x = recorded(
         text, law, case.push, np.asarray(case.noise), sequences=args.sequences, rows=args.rows, seed=args.seed
     )
-    data = logs._replace(y=logs.y[..., :1])
+    read = [unpacked(rig.machine).states.index(name) for name in rig.measured]
+    data = logs._replace(y=logs.y[..., read])
     fitted = identify(rig, data, key=jax.random.key(args.seed), epochs=args.epochs)
     for j, error in enumerate(errors(fitted.model.unknown, law, x), 1):
         print(f"joint {j}: NRMSE {error:.3f}")
 
 
 def errors(learned: Callable, law: Law, x: np.ndarray) -> list[float]:
-    """Root mean square of learned minus true friction over that of the true one, over 95 % of the visited velocities."""
+    """Root mean square error of the learned friction over that of the true one, where 95 % of the velocities are."""
     dof = x.shape[-1] // 2
     ends = np.percentile(np.abs(x[..., dof:].reshape(-1, dof)), 95, axis=0)
     grid = np.linspace(-1.0, 1.0, 81)[:, None] * ends[None]

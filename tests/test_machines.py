@@ -281,7 +281,7 @@ BAD = {
         + '<geom type="mesh" mesh="hull"/></body></worldbody></mujoco>',
         "", "body 'b' has no <inertial>, and its mesh 'hull' is missing; put the mesh beside",
     ),
-    "negative inertia": (_one(HINGE + WEIGHT.replace(".01 .01 .01", "-1 1 1")), "", "<inertial> with mass and inertia above 0"),
+    "negative inertia": (_one(HINGE + WEIGHT.replace(".01 .01 .01", "-1 1 1")), "", "mass and inertia above 0"),
     "impossible inertia": (_one(HINGE + WEIGHT.replace(".01 .01 .01", "1 1 5")), "", "largest part is at most the sum"),
     "no mass": (_one(HINGE), "", "give every body that moves an <inertial>"),
     "unknown body": (_one(), "bb.mass = {std=1}", "no body or joint of machine.xml is called 'bb'; did you mean 'b'"),

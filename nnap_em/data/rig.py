@@ -103,6 +103,12 @@ class Rig:
         """The SI unit of a parameter or state."""
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
 
+    def pairs(self) -> list[tuple[str, str]] | None:
+        """Every coordinate with its rate, where the names do not tell: the rate of x is dx."""
+        states = unpacked(self.machine).states if self.machine else ()
+        dof = len(states) // 2
+        return list(zip(states[:dof], states[dof:], strict=True)) if states else None
+
     def __str__(self) -> str:
         inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
         noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}

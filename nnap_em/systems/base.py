@@ -81,7 +81,7 @@ class AbstractSystem(eqx.Module):
         """Generalised force B u of the inputs [N m, or N]."""
         force = [jnp.zeros((), u.dtype)] * len(self.coordinates)
         for i, (joint, gear) in enumerate(zip(self.joints, self.gears, strict=True)):
-            force[joint - 1] = force[joint - 1] + (u[i] if gear == 1.0 else gear * u[i])
+            force[joint - 1] = force[joint - 1] + u[i] * gear
         return jnp.stack(force)
 
     def acceleration(

@@ -76,6 +76,38 @@ def test_acceleration_is_that_of_the_mass_matrix(machine_file):
         np.testing.assert_allclose(jnp.stack(system.acceleration(q, v, force)), other, rtol=1e-9, atol=1e-9)
 
 
+def test_derivatives_of_the_acceleration_are_those_of_the_mass_matrix(machine_file):
+    system = tree(machine_file)
+    dof = len(system.coordinates)
+    x = jnp.asarray(np.random.default_rng(1).uniform(-2.0, 2.0, 3 * dof))
+
+    def own(x):
+        return jnp.stack(system.acceleration(*jnp.split(x, 3)))
+
+    def other(x):
+        q, v, force = jnp.split(x, 3)
+        return spd_solve(system.mass(q), force - system.bias(q, v))
+
+    np.testing.assert_allclose(jax.jacfwd(own)(x), jax.jacfwd(other)(x), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(jax.grad(lambda x: own(x)[0])(x), jax.jacfwd(other)(x)[0], rtol=1e-7, atol=1e-7)
+
+
+def test_derivatives_by_uncertain_numbers_are_those_of_the_mass_matrix(tmp_path):
+    system = build_system(read_rig(_rig(tmp_path, arm(3), model=UNCERTAIN), specs))
+    names, q, v = list(system.values), jnp.asarray([0.3, -0.8, 1.1]), jnp.asarray([1.0, 2.0, -3.0])
+
+    def own(values):
+        return jnp.stack(system.with_parameters(values).acceleration(q, v, jnp.ones(3)))
+
+    def other(values):
+        changed = system.with_parameters(values)
+        return spd_solve(changed.mass(q), jnp.ones(3) - changed.bias(q, v))
+
+    found, truth = jax.jacfwd(own)(system.values), jax.jacfwd(other)(system.values)
+    for name in names:
+        np.testing.assert_allclose(found[name], truth[name], rtol=1e-8, atol=1e-8)
+
+
 def test_drive_is_that_of_mujocos_motors(tmp_path):
     path = ROOT / "tests" / "machines" / "branch.xml"
     rig = read_rig(_rig(tmp_path, path, measured=("left",)), specs)

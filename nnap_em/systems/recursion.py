@@ -87,24 +87,29 @@ def posed(frames: Sequence[Frame], q: Sequence[Scalar]) -> list[Pose]:
 
 
 def newton_euler(
-    frames: Sequence[Frame], poses: Sequence[Pose], bodies: Sequence[Inertia], v: Sequence[Scalar], gravity: Three
+    frames: Sequence[Frame],
+    poses: Sequence[Pose],
+    bodies: Sequence[Inertia],
+    v: Sequence[Scalar],
+    a: Sequence[Scalar],
+    gravity: Three,
 ) -> list[Scalar]:
-    """Force at every joint that keeps its velocity: Coriolis, centrifugal and gravity force."""
+    """Force at every joint that gives the acceleration `a`; with `a` zero that of Coriolis, rotation and gravity."""
     spins: list[Three] = []
     turning: list[Three] = []
     rising: list[Three] = []
     forces: list[Three] = []
     moments: list[Three] = []
-    for frame, pose, body, rate in zip(frames, poses, bodies, v, strict=True):
+    for frame, pose, body, rate, more in zip(frames, poses, bodies, v, a, strict=True):
         i = frame.before
         spin, turns, rise = (spins[i], turning[i], rising[i]) if i >= 0 else (ZERO, ZERO, scaled(-1.0, gravity))
         rise = add(rise, add(cross(turns, pose.place), cross(spin, cross(spin, pose.place))))
         spin, turns, rise = apply(pose.back, spin), apply(pose.back, turns), apply(pose.back, rise)
-        own = (0.0, 0.0, rate)
+        own, gain = (0.0, 0.0, rate), (0.0, 0.0, more)
         if frame.slide:
-            rise = add(rise, scaled(2.0, cross(spin, own)))
+            rise = add(rise, add(scaled(2.0, cross(spin, own)), gain))
         else:
-            turns, spin = add(turns, cross(spin, own)), add(spin, own)
+            turns, spin = add(turns, add(cross(spin, own), gain)), add(spin, own)
         for known, new in ((spins, spin), (turning, turns), (rising, rise)):
             known.append(new)
         force = add(scaled(body.mass, rise), add(cross(turns, body.moment), cross(spin, cross(spin, body.moment))))

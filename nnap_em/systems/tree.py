@@ -87,9 +87,20 @@ class Tree(AbstractSystem):
         return _stacked(self._bias(self._poses(q), q, v), q)
 
     def acceleration(self, q, v, force):
-        poses = self._poses(q)
-        net = [minus(force[i], bias) for i, bias in enumerate(self._bias(poses, q, v))]
-        return tuple(solved(self._mass(poses), net))
+        return _acceleration(self, q, v, force)
+
+    def needed(self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Scalar]) -> list[Scalar]:
+        """Generalised force that gives an acceleration [N m, or N]: inverse dynamics, M(q) a + c(q, v)."""
+        held = [times(self._armature(i), one) for i, one in enumerate(a)]
+        return [plus(*pair) for pair in zip(self._bias(self._poses(q), q, v, a), held, strict=True)]
+
+    def solve(self, q: Float[Array, " dof"], force: Sequence[Scalar]) -> tuple[Scalar, ...]:
+        """Solution a of M(q) a = force."""
+        return tuple(solved(self._mass(self._poses(q)), force))
+
+    def _armature(self, i: int) -> Scalar:
+        joint = self.machine.joints[i]
+        return self.values.get(f"{joint.name}.armature", joint.armature)
 
     def _poses(self, q):
         return posed(laid(self.text).frames, [minus(q[i], joint.zero) for i, joint in enumerate(self.machine.joints)])
@@ -99,13 +110,14 @@ class Tree(AbstractSystem):
 
     def _mass(self, poses) -> list[list[Scalar]]:
         rows = composite(laid(self.text).frames, poses, self._bodies())
-        for i, joint in enumerate(self.machine.joints):
-            rows[i][i] = plus(rows[i][i], self.values.get(f"{joint.name}.armature", joint.armature))
+        for i in range(len(rows)):
+            rows[i][i] = plus(rows[i][i], self._armature(i))
         return rows
 
-    def _bias(self, poses, q, v) -> list[Scalar]:
-        rates = [v[i] for i in range(len(self.coordinates))]
-        out = newton_euler(laid(self.text).frames, poses, self._bodies(), rates, self.machine.gravity)
+    def _bias(self, poses, q, v, a: Sequence[Scalar] | None = None) -> list[Scalar]:
+        """Force that gives the acceleration `a`, which is 0 where it is left out; inertia of armatures aside."""
+        rates, still = [v[i] for i in range(len(self.coordinates))], [0.0] * len(self.coordinates)
+        out = newton_euler(laid(self.text).frames, poses, self._bodies(), rates, a or still, self.machine.gravity)
         for i, joint in enumerate(self.machine.joints):
             stiffness = self.values.get(f"{joint.name}.stiffness", joint.stiffness)
             out[i] = plus(out[i], times(stiffness, minus(q[i], joint.rest)))
@@ -113,6 +125,25 @@ class Tree(AbstractSystem):
                 out[i] = plus(out[i], times(joint.damping, v[i]))
                 out[i] = plus(out[i], times(joint.dry, jnp.tanh(v[i] / KNEE)) if joint.dry else 0.0)
         return out
+
+
+@eqx.filter_custom_jvp
+def _acceleration(tree: Tree, q, v, force) -> tuple[Scalar, ...]:
+    poses = tree._poses(q)
+    net = [minus(force[i], bias) for i, bias in enumerate(tree._bias(poses, q, v))]
+    return tuple(solved(tree._mass(poses), net))
+
+
+@_acceleration.def_jvp
+def _acceleration_jvp(primals, tangents):
+    """da = M^-1 (dF - d(M a + c)) at fixed a: neither composite bodies nor the solution are differentiated."""
+    (tree, q, v, force), (dtree, dq, dv, dforce) = primals, tangents
+    a = _acceleration(tree, q, v, force)
+    _, change = eqx.filter_jvp(lambda tree, q, v: tuple(tree.needed(q, v, a)), (tree, q, v), (dtree, dq, dv))
+    zero = jnp.zeros_like(q[0])
+    change = [zero if one is None else one for one in change]
+    net = [(zero if dforce is None else dforce[i]) - one for i, one in enumerate(change)]
+    return a, tree.solve(q, net)
 
 
 def _stacked(values: Sequence[Scalar], like: Float[Array, " dof"]) -> Float[Array, " dof"]:

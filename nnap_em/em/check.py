@@ -183,7 +183,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     for text in at_stops(rig, data):
         yield Finding(LOOK, "range", text)
     for text in sentences(felt(rig, system)):
-        yield Finding(LOOK, "scale", text)
+        yield Finding(LOOK, "untold", text)
     kept = untold(rig, system, data)
     if kept:
         told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)

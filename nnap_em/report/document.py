@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import __version__
 from ..data.logs import Logs
+from ..em.felt import felt, sentences
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
@@ -28,6 +29,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.coordinates + system.rates},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
+        "untold": sentences(felt(fitted.rig, system)),
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .model.state_space import StateSpaceModel
     from .numerics.parallel import all_devices, over
     from .portable.export import ExportError, export
+    from .portable.mjcf import write_mjcf
     from .smoother.gaussian import ExtendedKalmanSmoother
     from .smoother.particle import ParticleSmoother
     from .smoother.posterior import Posterior
@@ -84,6 +85,7 @@ __all__ = [
     "simulate",
     "smooth",
     "specs",
+    "write_mjcf",
     "write_rig",
 ]
 _homes = {
@@ -95,6 +97,7 @@ _homes = {
     "diagnose.findings": ("findings",),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),
+    "portable.mjcf": ("write_mjcf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
     "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),

@@ -35,6 +35,8 @@ WEIGHED = "test_particle.py::test_weights_of_the_blind_filter_by_hand"
 FISHER = "test_mstep.py::test_score_is_the_gradient_of_the_likelihood[slide]"
 DENSE_FISHER = "test_mstep.py::test_information_is_the_dense_fisher_information"
 RIDGE = "test_mstep.py::test_fit_of_parameters_alone_is_ridge_regression"
+MACHINES = "test_machines.py::test_"
+BRANCH = f"{MACHINES}mass_and_bias_are_those_of_mujoco[branch.xml]"
 LEFT_OUT = "test_mstep.py::test_sequences_that_are_not_used_have_no_weight"
 
 MUTANTS = (
@@ -903,6 +905,49 @@ MUTANTS = (
         "back = np.flatnonzero(np.diff(stamp) < 0)",
         "back = np.flatnonzero(np.diff(stamp) < -1e18)",
         "test_recordings.py::test_which_clock_is_taken_and_why[backwards]",
+    ),
+    Mutant("gear left out", "systems/base.py", "+ u[i] * gear", "+ u[i]", f"{MACHINES}drive_is_that_of_mujocos_motors"),
+    Mutant(
+        "Coriolis force of a slide halved",
+        "systems/recursion.py",
+        "scaled(2.0, cross(spin, own))",
+        "scaled(1.0, cross(spin, own))",
+        BRANCH,
+    ),
+    Mutant(
+        "a composite body about another point",
+        "systems/recursion.py",
+        "about(scaled(times(0.5, body.mass), place), place)",
+        "about(scaled(times(0.4, body.mass), place), place)",
+        BRANCH,
+    ),
+    Mutant(
+        "an anchor left out",
+        "systems/frames.py",
+        "place = -turn @ np.asarray(joint.anchor)",
+        "place = np.zeros(3)",
+        BRANCH,
+    ),
+    Mutant(
+        "bodies that cannot be",
+        "systems/bodies.py",
+        "mass = jnp.where(physical(mass, own), mass, jnp.nan)",
+        "mass = jnp.asarray(mass)",
+        f"{MACHINES}unphysical_bodies_have_no_numbers",
+    ),
+    Mutant(
+        "a load in the middle",
+        "systems/bodies.py",
+        "moved = scaled(mass / total, away)",
+        "moved = scaled(0.0, away)",
+        f"{MACHINES}payload_is_a_point_mass_at_the_site",
+    ),
+    Mutant(
+        "friction written back with the other sign",
+        "portable/mjcf.py",
+        "nnls(basis, -torque * weight)",
+        "nnls(basis, torque * weight)",
+        "test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve",
     ),
 )
 

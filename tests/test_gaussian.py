@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.numerics.gaussian import cholesky, cubature, lower, spd_solve, symmetric
+from nnap_em.numerics.gaussian import cholesky, cubature, lower, product, spd_solve, symmetric, upper_solve
 
 EPS = np.finfo(float).eps
 
@@ -17,7 +17,7 @@ def _spd(dim: int, seed: int, condition: float = 1e3) -> np.ndarray:
     return (basis * np.geomspace(1.0, condition, dim)) @ basis.T
 
 
-@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+@pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
 def test_cholesky_is_numpys(dim):
     a = _spd(dim, dim)
     factor = np.asarray(lower(cholesky(jnp.asarray(a))))
@@ -27,7 +27,7 @@ def test_cholesky_is_numpys(dim):
     assert np.all(np.triu(factor, 1) == 0)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+@pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
 def test_spd_solve_is_numpys(dim):
     a = _spd(dim, dim)
     b = np.random.default_rng(9).normal(size=(dim, 3))
@@ -58,7 +58,7 @@ def test_symmetric_keeps_the_quadratic_form():
     np.testing.assert_allclose(np.einsum("i,bij,j->b", x, s, x), np.einsum("i,bij,j->b", x, a, x), rtol=1e-12)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 4, 8])
+@pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
 def test_cubature_has_the_moments_of_a_normal(dim):
     x = np.asarray(cubature(dim, float))
     assert x.shape == (2 * dim, dim)
@@ -67,3 +67,14 @@ def test_cubature_has_the_moments_of_a_normal(dim):
     np.testing.assert_allclose(
         np.einsum("ni,nj,nk->ijk", x, x, x), 0.0, atol=4 * dim**1.5 * EPS
     )  # exact to third order
+
+
+@pytest.mark.parametrize("dim", [4, 12])
+def test_product_and_upper_solve_are_numpys(dim):
+    """Unrolled, and beyond `WIDE` by LAPACK."""
+    a, b = _spd(dim, dim), np.random.default_rng(3).normal(size=(dim, 2))
+    np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b)), a @ b, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b[:, 0])), a @ b[:, 0], rtol=1e-10, atol=1e-10)
+    factor = np.linalg.cholesky(a)
+    found = upper_solve(cholesky(jnp.asarray(a)), jnp.asarray(b))
+    np.testing.assert_allclose(found, np.linalg.solve(factor.T, b), rtol=1e-8, atol=1e-8)  # condition number 1e3

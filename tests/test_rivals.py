@@ -52,3 +52,14 @@ def test_only_what_the_whole_length_cannot_tell_stays_equivalent(weak_drive):
     assert told.found[0].equivalent == (own,)  # the same law in its own place is as likely
     untouched = _closed(bare, full)
     assert apart(untouched, data) is untouched
+
+
+def test_a_rival_that_is_clearly_likelier_takes_the_place(weak_drive):
+    """A delay that the search had named where the drive is weak."""
+    data, bare, full = weak_drive
+    delay = instead(bare, data, None, lambda effect: effect.name == "input_delay")
+    (gain,) = map(key_of, full.model.effects)
+    told = apart(_closed(bare, delay, gain), data)
+    (effect,) = told.after.model.effects
+    assert effect.name == "motor_gain" and abs(float(effect.values()["gain"]) - GAIN) < 0.05
+    assert told.found[0].equivalent == ()

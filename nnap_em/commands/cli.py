@@ -115,6 +115,7 @@ _EXPORT = """\
 examples:
   nnap-em export fit --out exported
   nnap-em export found/after.npz --out exported
+  nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, springs, friction
 
 OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
 python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
@@ -224,7 +225,8 @@ def parser() -> argparse.ArgumentParser:
 
     export = command("export", "write a fitted model for other programs", _EXPORT)
     export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
-    export.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the files")
+    export.add_argument("--out", metavar="OUT", type=Path, help="folder for the files")
+    export.add_argument("--mjcf", metavar="FILE", type=Path, help="write a machine that came from a file back as MJCF")
     return top
 
 
@@ -234,6 +236,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
         arguments.error("--particles goes with --smoother particle")
+    if args.command == "export" and args.out is None and args.mjcf is None:
+        arguments.error("say where to: --out OUT, --mjcf FILE, or both")
     try:
         # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -120,7 +120,7 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
     for finding in torques(rig, system, data, measure_scales(rig, system, data)):
         if finding.mark == BAD:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
-        elif finding.subject == "scale":
+        elif finding.subject in ("scale", "range"):
             warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)
 
 
@@ -133,7 +133,7 @@ def model_file(path: Path) -> Path:
 
 def write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> None:
     """One file per sequence; a value that is no number becomes an empty field, and is told."""
-    states = specs[fitted.rig.system].states
+    states = fitted.model.system.coordinates + fitted.model.system.rates
     for i, file in enumerate(logs.files):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)

@@ -167,7 +167,7 @@ def _sequence(whole: _Table, found: Sequence[Rough], rig: Rig) -> _Sequence:
     for entry in found:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
     inputs, readings = dict(zip(rig.input_columns, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
-    for doubt in doubts(inputs, readings, rig.dt):
+    for doubt in doubts(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, doubt.column, None if doubt.row is None else int(line[doubt.row]))
         if doubt.ruins:
             refuse(path, where, doubt.found, doubt.mend)

@@ -1,11 +1,13 @@
 """What numbers of a right form betray: wrong units and signs, wrapped angles, swapped columns, dead sensors, copies."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from .units import parameter_unit
 
 Columns = Mapping[str, Float[np.ndarray, " time"]]
 IMPLAUSIBLE = 30.0  # rad/s, as the median speed of a joint
@@ -46,8 +48,17 @@ class Repeat(NamedTuple):
     """True where the sequences are the same from end to end."""
 
 
-def doubts(inputs: Columns, readings: Columns, dt: float) -> Iterator[Doubt]:
-    """What is doubtful in the columns of one sequence, sampled every `dt` [s]."""
+def doubts(
+    inputs: Columns,
+    readings: Columns,
+    dt: float,
+    unit: Callable[[str], str] = parameter_unit,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> Iterator[Doubt]:
+    """What is doubtful in the columns of one sequence, sampled every `dt` [s].
+
+    `pairs` are the columns of coordinates and of their rates, where the names do not tell.
+    """
     for name, values in readings.items():
         observed = values[np.isfinite(values)]
         if not observed.size:
@@ -57,13 +68,14 @@ def doubts(inputs: Columns, readings: Columns, dt: float) -> Iterator[Doubt]:
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Doubt(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
     yield from _copies(inputs, readings)
-    for name in readings:
-        if f"d{name}" in readings:
-            yield from _pair(name, {**inputs, **readings}, dt)
+    for name, rate in pairs if pairs is not None else [(name, f"d{name}") for name in readings]:
+        if name in readings and rate in readings:
+            yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
     for name, values in readings.items():
-        if name.startswith("theta"):
+        if unit(name) == "rad":
             yield from _wrapped(name, values)
-        if "theta" in name and (speed := _speed(name, values, dt)) > IMPLAUSIBLE:
+        rate = unit(name) == "rad/s"
+        if (rate or unit(name) == "rad") and (speed := _speed(values, dt, rate)) > IMPLAUSIBLE:
             yield Doubt(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
 
 
@@ -110,15 +122,14 @@ def _copies(inputs: Columns, readings: Columns) -> Iterator[Doubt]:
                 yield Doubt(True, name, None, found, "write what each sensor reads, or take the column out")
 
 
-def _pair(name: str, columns: Columns, dt: float) -> Iterator[Doubt]:
+def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Iterator[Doubt]:
     """A coordinate against the integral of its rate: units, sign, and what is swapped."""
-    rate = f"d{name}"
     fit, ratio = _follows(columns[name], columns[rate], dt)
     found = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
-    for factor, wrong, mend in (*(_ANGLE if name.startswith("theta") else ()), *_ANY):
+    for factor, wrong, mend in (*(_ANGLE if angle else ()), *_ANY):
         close = (0.7, 0.7 < ratio / factor < 1.4) if mend == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
         if fit > close[0] and close[1]:
-            yield Doubt(True, wrong + name, None, found, mend)
+            yield Doubt(True, rate if wrong else name, None, found, mend)
             return
     ways = "units, signs and names of the two"
     if fit > 0.9 and not 0.8 < ratio < 1.25:
@@ -176,9 +187,9 @@ def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
             return
 
 
-def _speed(name: str, values: np.ndarray, dt: float) -> float:
-    """Median speed of an angle or of the rate of one."""
-    if name.startswith("d"):
+def _speed(values: np.ndarray, dt: float, rate: bool) -> float:
+    """Median speed of an angle, or of the rate of one."""
+    if rate:
         return float(np.nanmedian(np.abs(values)))
     span = min(max(round(0.1 / dt), 1), values.size - 1)
     return float(np.median(np.abs(_advance(values, dt)))) / (span * dt)

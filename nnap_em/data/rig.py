@@ -5,13 +5,15 @@ import json
 import math
 import tomllib
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds
+from .machine import machine_unit, unpacked
 from .units import parameter_unit, quantities
 
 _FRICTION = {"unknown": True, "none": False}
@@ -69,6 +71,18 @@ class SystemSpec:
     joints: int
     driven: int = 1
     """The joint that an input drives whose name does not tell it."""
+    declare: "Callable[[_Table], Told] | None" = None
+    """For a system whose names come from a file that rig.toml names: what the file and the whole table declare."""
+
+
+class Told(NamedTuple):
+    """What [model] and [input] declare."""
+
+    spec: SystemSpec
+    parameters: Mapping[str, Declared]
+    input_columns: tuple[str, ...]
+    input_joints: tuple[int, ...]
+    machine: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,17 +101,28 @@ class Rig:
     noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
     start: Mapping[str, Declared]
     limits: Bounds = UNBOUNDED  # what it may be asked to do; what is absent: as far as the logs went
+    machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
+
+    def unit(self, name: str) -> str:
+        """The SI unit of a parameter or state."""
+        return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
+
+    def pairs(self) -> list[tuple[str, str]] | None:
+        """Every coordinate with its rate, where the names do not tell: the rate of x is dx."""
+        states = unpacked(self.machine).states if self.machine else ()
+        dof = len(states) // 2
+        return list(zip(states[:dof], states[dof:], strict=True)) if states else None
 
     def __str__(self) -> str:
         inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
-        noise = {name: f"{std:.2g} {parameter_unit(name)}" for name, std in self.noise_std.items()}
+        noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}
         reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
         lines = [
             f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} s",
-            f"parameters: {quantities(self.parameters)}",
+            f"parameters: {quantities(self.parameters, self.unit) or 'as in the file'}",
             f"inputs: {', '.join(inputs) or 'none'}",
             f"reads: {', '.join(reads)}",
-            f"start: {quantities(self.start) or 'from the readings'}",
+            f"start: {quantities(self.start, self.unit) or 'from the readings'}",
             f"friction: {'to be learned' if self.friction else 'none'}",
         ]
         return "\n  ".join(lines)
@@ -115,38 +140,39 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
     system = model.choice("type", systems)
-    spec = systems[system]
-    reserved = ("type", "friction", "actuated_joint")
-    model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
+    told = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
+    spec = told.spec
     sampling.check(("dt", "input_hold", "clock"))
     sampling.choice("input_hold", ("zero-order",))
     start.check((), spec.states)
-    input_columns, input_joints = _input(root, model, spec)
     measured, noise_std = _measurement(root.table("measurement"), spec)
     return Rig(
         name=root.text("name"),
         system=system,
-        parameters={key: _parameter(model, key) for key in model.items if key not in reserved},
+        parameters=told.parameters,
         friction=_FRICTION[model.choice("friction", _FRICTION)],
-        input_columns=input_columns,
-        input_joints=input_joints,
+        input_columns=told.input_columns,
+        input_joints=told.input_joints,
         dt=sampling.positive("dt"),
         clock=sampling.choice("clock", _CLOCKS),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},
-        limits=read_bounds(root.table("limits", absent={}), input_columns, spec.states),
+        limits=read_bounds(root.table("limits", absent={}), told.input_columns, spec.states),
+        machine=told.machine,
     )
 
 
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    lines = ["format = 1", f"name = {toml_text(rig.name)}"]
-    lines += ["", "[model]", f"type = {toml_text(rig.system)}", *_lines(parameters)]
+    told = [f"{key} = {value}    # {rig.unit(key)}" for key, value in parameters.items()]
+    lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
+    lines += [f"file = {toml_text(unpacked(rig.machine).file)}"] if rig.machine else told
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
+    lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
-    lines += [f"joints = {list(rig.input_joints)}"]
+    lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
     lines += [
         "",
         "[sampling]",
@@ -155,8 +181,9 @@ def write_rig(rig: Rig, path: Path) -> None:
         f"clock = {toml_text(rig.clock)}",
     ]
     lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
-    lines += ["", "[measurement.noise_std]", *_lines({name: repr(std) for name, std in rig.noise_std.items()})]
-    lines += ["", "[start]    # prior of the first row", *_lines({name: _pair(x) for name, x in rig.start.items()})]
+    lines += ["", "[measurement.noise_std]", *(f"{n} = {std!r}    # {rig.unit(n)}" for n, std in rig.noise_std.items())]
+    lines += ["", "[start]    # prior of the first row"]
+    lines += [f"{name} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
     lines += _limits(rig.limits)
     replace_text(path, "\n".join(lines) + "\n")
 
@@ -276,6 +303,15 @@ def _parameter(model: _Table, key: str) -> Declared:
     return value
 
 
+def _declared(root: _Table, spec: SystemSpec) -> Told:
+    """What [model] and [input] say of a system of these parameters."""
+    model = root.table("model")
+    reserved = ("type", "friction", "actuated_joint")
+    model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
+    parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
+    return Told(spec, parameters, *_input(root, model, spec))
+
+
 def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """The torque columns and the joint that each drives."""
     if "input" in root.items:
@@ -308,10 +344,6 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
     noise = table.table("noise_std", absent={})
     noise.check((), columns)
     return columns, {column: noise.positive(column) for column in noise.items}
-
-
-def _lines(values: Mapping[str, str]) -> list[str]:
-    return [f"{name} = {value}    # {parameter_unit(name)}" for name, value in values.items()]
 
 
 def _limits(limits: Bounds) -> list[str]:

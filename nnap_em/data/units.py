@@ -1,7 +1,7 @@
 """SI units: of parameters and states by their names, of what belongs to an angle or to a position."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 _UNITS = {  # of parameters and states, by their names
     r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
@@ -14,10 +14,10 @@ def parameter_unit(name: str) -> str:
     return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
 
 
-def quantities(values: Mapping[str, object]) -> str:
+def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parameter_unit) -> str:
     """Parameters or states as text, with their units."""
     numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
-    return ", ".join(f"{name} = {number} {parameter_unit(name)}" for name, number in numbers.items())
+    return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
 
 
 def state_unit(angle: bool, *, rate: bool) -> str:

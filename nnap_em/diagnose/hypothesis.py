@@ -65,7 +65,7 @@ class Hypothesis(NamedTuple):
         declared = prior.size - sum(a.mean.shape[0] for a in self.additions)
         own = [f"{i}.{name}" for i, a in enumerate(additions) for name in fields(a.effect)]
         joined = ParameterPrior(
-            tuple(name for name in prior.names if "." not in name) + tuple(own),
+            prior.declared + tuple(own),
             jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
             jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
         )

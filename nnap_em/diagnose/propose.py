@@ -39,7 +39,8 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         viscous,
         low,
         high,
-        np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),
+        np.abs(model.system.gears)
+        * np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),
         rig.measured,
         np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
         rig.dt,

@@ -1,16 +1,18 @@
 """A law in the place of another, over the whole length: which of the two the logs speak for."""
 
+import math
 from collections.abc import Callable
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
-from ..em.identify import Identified
+from ..em.identify import Identified, finished
 from .accept import LikelihoodRule
 from .evidence import Question
-from .grow import Loop, asked
+from .grow import Loop, asked, grow
 from .hypothesis import Hypothesis
 from .keys import Key, key_of
 from .look import EFFORT
@@ -49,7 +51,7 @@ def instead(
         full = question.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
         path = extended(full.model, question.path, question.data)
         trials.append(refit(full.model, full.m_step.early(), path, question.data, question.used, passes=PASSES))
-    return _with(fitted, max(trials, key=_total)) if trials else None
+    return _with(fitted, max(trials, key=lambda trial: float(np.nansum(trial.loglik)))) if trials else None
 
 
 def again(fitted: Identified, data: Dataset) -> Identified:
@@ -60,24 +62,44 @@ def again(fitted: Identified, data: Dataset) -> Identified:
 
 
 def apart(closed: Closed, data: Dataset) -> Closed:
-    """`closed`, its effects without equivalents that the whole length of the logs tells from them.
+    """`closed` after its effects and their equivalents were compared over the whole length of the logs.
 
-    A playoff on the way ends where the search does, and what it leaves even more rows may tell.
+    A playoff on the way ends where the search does, and what it leaves even more rows may tell: an equivalent that is
+    clearly less likely goes, and one that is clearly likelier takes the place of its effect.
     """
-    after, found = closed.after, list(closed.found)
-    if not any(one.equivalent for one in found):
-        return closed
-    own = float(np.nansum(np.asarray(again(after, data).state.top)))
-    for place, one in enumerate(found):
-        even = [key for key in one.equivalent if not _behind(after, data, place, key, own)]
-        found[place] = one._replace(equivalent=tuple(even))
-    return closed._replace(found=tuple(found))
+    for place, found in enumerate(closed.found):
+        if not found.equivalent:
+            continue
+        fitted, held = closed.after, key_of(closed.after.model.effects[place])
+        own, *others = ((key, instead(fitted, data, place, partial(_is, key))) for key in (held, *found.equivalent))
+        own = max(_total(one) for one in (again(fitted, data), own[1]) if one is not None)
+        leads = {key: _total(other) - own for key, other in others if other is not None}
+        best, other = max(others, key=lambda entry: leads.get(entry[0], -math.inf))
+        if other is not None and leads[best] > EVEN:
+            rest = [one for i, one in enumerate(closed.found) if i != place]
+            even = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EVEN]
+            found = found._replace(equivalent=tuple(even))
+            return closed._replace(after=_settled(other, data), found=(*rest, found))
+        even = [key for key in found.equivalent if leads.get(key, 0.0) >= -EVEN]
+        both = closed.found[:place], closed.found[place + 1 :]
+        closed = closed._replace(found=(*both[0], found._replace(equivalent=tuple(even)), *both[1]))
+    return closed
 
 
-def _behind(fitted: Identified, data: Dataset, place: int, key: Key, own: float) -> bool:
-    """Whether a rival is clearly less likely."""
-    other = instead(fitted, data, place, lambda effect: key_of(effect) == key)
-    return other is not None and own - float(np.nansum(np.asarray(other.state.top))) > EVEN
+def _is(key: Key, effect: AbstractEffect) -> bool:
+    return key_of(effect) == key
+
+
+def _settled(fitted: Identified, data: Dataset) -> Identified:
+    """A quick refit after EM over the whole length."""
+    data = Dataset(*map(jnp.asarray, data))
+    loop = _loop(fitted, data)
+    now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
+    return finished(fitted._replace(state=grow(loop, now, loop.longest, loop.longest)), data)
+
+
+def _loop(fitted: Identified, data: Dataset) -> Loop:
+    return Loop(fitted, {}, data, LikelihoodRule(), EFFORT, lambda text: None)
 
 
 def _question(fitted: Identified, data: Dataset, place: int | None) -> Question:
@@ -85,12 +107,13 @@ def _question(fitted: Identified, data: Dataset, place: int | None) -> Question:
     data = Dataset(*map(jnp.asarray, data))
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     now = now if place is None else now.without(place)
-    loop = Loop(fitted, {}, data, LikelihoodRule(), EFFORT, lambda text: None)
+    loop = _loop(fitted, data)
     return asked(loop, now, loop.longest)[0]._replace(bare=now.having(()))
 
 
-def _total(trial: Trial) -> float:
-    return float(np.nansum(trial.loglik))
+def _total(fitted: Identified) -> float:
+    """Log-likelihood of all sequences [nat]."""
+    return float(np.nansum(np.asarray(fitted.state.top)))
 
 
 def _with(fitted: Identified, trial: Trial) -> Identified:

@@ -48,7 +48,7 @@ class Around(NamedTuple):
     """Smallest and largest coordinate on the smoothed paths [rad]."""
     high: Float[np.ndarray, " dof"]
     drive: Float[np.ndarray, " input"]
-    """Largest input [N m]."""
+    """Largest torque of every input [N m]."""
     measured: tuple[str, ...]
     reading: Float[np.ndarray, " obs"]
     """Typical size of each reading."""

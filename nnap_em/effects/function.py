@@ -48,6 +48,10 @@ class AbstractAxis(eqx.Module):
         """The joint where a function of it may act; None: at any."""
         return None
 
+    def of_states(self, system: AbstractSystem) -> set[str]:
+        """The states that it reads."""
+        return set(self.names) & {*system.coordinates, *system.rates}
+
     def centres(self) -> Float[Array, " basis"]:
         """Places of the basis functions."""
         return jnp.linspace(self.low, self.high, self.count, endpoint=not self.turns)
@@ -120,9 +124,12 @@ class UnknownFunction(JointEffect):
         states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
         pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
+        near = {j: _signals_near(system, j) for j in around.joints}
         places = [(j, grid) for j in around.joints for grid in grids]
         return [
-            _function(j, grid, around) for j, grid in places if all(axis.acts(system) in (None, j) for axis in grid)
+            _function(j, grid, around)
+            for j, grid in places
+            if all(axis.acts(system) in (None, j) and axis.of_states(system) <= near[j] for axis in grid)
         ]
 
     def values(self):
@@ -169,6 +176,12 @@ class UnknownFunction(JointEffect):
         std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
         units, mean = (axis.unit(system), system.force_unit(self.joint)), basis @ np.asarray(self.weights)
         return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std, basis)
+
+
+def _signals_near(system: AbstractSystem, joint: int) -> set[str]:
+    """States of a joint and of those next to it: what a force at it may be a function of."""
+    places = [j - 1 for j in system.neighbours(joint)]
+    return {names[i] for names in (system.coordinates, system.rates) for i in places}
 
 
 def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:

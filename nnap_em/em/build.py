@@ -1,6 +1,5 @@
 """From what the owner declares and the logs to the model that EM starts from; every scale comes from one of the two."""
 
-import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -46,11 +45,9 @@ def build_system(rig: Rig) -> AbstractSystem:
 
     Raises RigError where its mass matrix is not positive definite.
     """
-    kind = systems[rig.system]
-    names = [f.name for f in dataclasses.fields(kind) if f.name != "joints"]
-    values = {n: rig.parameters[n].mean if n in rig.parameters else kind.optional[n] for n in names}
-    system = kind(**{n: jnp.asarray(v, float) for n, v in values.items()}, joints=rig.input_joints)
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(kind.coordinates)))
+    values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.parameters.items()}
+    system = systems[rig.system].declared(values, rig.input_joints, rig.machine)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(system.coordinates)))
     if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, float)))).min() <= 0:
         raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
     return system
@@ -111,7 +108,7 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
         scale[np.isnan(scale)] = np.sqrt(energy / mass[np.isnan(scale)])
     drive = np.zeros(dof)
     for i, joint in enumerate(rig.input_joints):
-        drive[joint - 1] = np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
+        drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 

@@ -12,15 +12,16 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset, horizon
 from ..data.logs import Logs
 from ..data.rig import Rig, RigError
-from ..data.units import parameter_unit
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .build import LAG, NO_MACHINE, Scales, loads, measure_scales, reading_noise
+from .felt import felt, sentences
 from .identify import begin
 from .scale import untold
+from .stops import at_stops
 
 OK, LOOK, BAD = "ok", "look", "bad"
 SEQUENCES, SECONDS = 6, 1.0
@@ -170,17 +171,22 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = loads(system)
     needed = gravity + mass * scales.acceleration
-    for name, joint, u in zip(rig.input_columns, rig.input_joints, np.moveaxis(np.asarray(data.u), -1, 0), strict=True):
+    inputs = np.moveaxis(np.asarray(data.u), -1, 0)
+    for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
         unit = system.force_unit(joint)
-        given = float(np.percentile(np.abs(u[data.valid]), 99))
+        given = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = given / needed[joint - 1]
         text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
+    for text in at_stops(rig, data):
+        yield Finding(LOOK, "range", text)
+    for text in sentences(felt(rig, system)):
+        yield Finding(LOOK, "untold", text)
     kept = untold(rig, system, data)
     if kept:
-        told = ", ".join(f"{name} = {rig.parameters[name]} {parameter_unit(name)}" for name in kept)
+        told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
         text = (
             "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
             f"kept as declared is {told}, and all else is relative to that"

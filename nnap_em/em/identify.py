@@ -47,7 +47,7 @@ class Identified(NamedTuple):
 
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
-        found = f"\n  estimated: {quantities(estimated)}" if estimated else ""
+        found = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
         return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{found}\n  {self.model}"
 
 
@@ -192,5 +192,4 @@ def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
     cov = jnp.linalg.inv(fitted.state.hessian)[-prior.size :, -prior.size :]
     std = prior.std * jnp.sqrt(jnp.diag(cov))
     value = prior.mean + prior.std * prior.read(fitted.model)
-    declared = [name for name in prior.names if "." not in name]  # they stand first
-    return {n: (float(v), float(s)) for n, v, s in zip(declared, value, std, strict=False)}
+    return {n: (float(v), float(s)) for n, v, s in zip(prior.declared, value, std, strict=False)}

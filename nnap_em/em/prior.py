@@ -10,14 +10,21 @@ class ParameterPrior(eqx.Module):
     """Physical parameters to be estimated, with the owner's belief; estimated in its standard deviations."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    """Of the system, "m2", or of an effect by its place, "0.k"."""
+    """Of the system, "m2" or "forearm.mass", or of an effect by its place, "0.k"."""
     mean: Float[Array, " param"]
     std: Float[Array, " param"]
 
+    @property
+    def declared(self) -> tuple[str, ...]:
+        """Those of the system, which stand first."""
+        return tuple(name for name in self.names if not name.partition(".")[0].isdigit())
+
     def places(self, model) -> list:
         """The parameters in the model."""
-        pairs = [name.rpartition(".") for name in self.names]
-        return [getattr(model.effects[int(at)] if at else model.system, name) for at, _, name in pairs]
+        return [
+            getattr(model.effects[int(at)], own) if at.isdigit() else model.system.parameter(name)
+            for name, (at, _, own) in ((name, name.partition(".")) for name in self.names)
+        ]
 
     def read(self, model) -> Float[Array, " param"]:
         """The model's values as (value - mean) / std."""
@@ -37,8 +44,8 @@ class ParameterPrior(eqx.Module):
 
     def held(self, model) -> Bool[np.ndarray, " param"]:
         """Which of the numbers act as forces held over a step."""
-        pairs = [name.rpartition(".") for name in self.names]
-        kinds = [bool(at) and model.effects[int(at)].held for at, _, _ in pairs]
+        places = [name.partition(".")[0] for name in self.names]
+        kinds = [at.isdigit() and model.effects[int(at)].held for at in places]
         flags = [np.full(np.size(a), k) for a, k in zip(self.places(model), kinds, strict=True)]
         return np.concatenate([np.zeros(0, bool), *flags])
 

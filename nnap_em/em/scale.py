@@ -28,7 +28,7 @@ def untold(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
     names = [name for name, declared in rig.parameters.items() if declared.std > 0]
 
     def terms(values):
-        changed = dataclasses.replace(system, **dict(zip(names, values, strict=True)))
+        changed = system.with_parameters(dict(zip(names, values, strict=True)))
         return jnp.concatenate([jax.vmap(changed.mass)(q).ravel(), jax.vmap(changed.bias)(q, v).ravel()])
 
     values = [jnp.asarray(rig.parameters[name].mean, float) for name in names]

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.base import AbstractEffect, Scalar, Scene
-from ..numerics.gaussian import spd_solve
 from ..systems.base import AbstractSystem
 
 Effects = Sequence[AbstractEffect]
@@ -32,10 +31,9 @@ def machine(effects: Effects, system: AbstractSystem, time: Scalar) -> AbstractS
 
 def acceleration(
     effects: Effects, scene: Scene, memory: Float[Array, " memory"], force: Float[Array, " dof"]
-) -> Float[Array, " dof"]:
-    """Of the joints, under the inputs, all that acts in the scene, and an extra generalised force [N m]."""
-    known = scene.drive + force - scene.system.bias(scene.q, scene.v)
-    return spd_solve(scene.system.mass(scene.q), _total(effects, scene, memory, known))
+) -> tuple[Scalar, ...]:
+    """Of every joint, under the inputs, all that acts in the scene, and an extra generalised force [N m]."""
+    return scene.system.acceleration(scene.q, scene.v, _total(effects, scene, memory, scene.drive + force))
 
 
 def added(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
-from ..effects.base import AbstractEffect, Scene
+from ..effects.base import AbstractEffect, Scalar, Scene
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
 from ..systems.base import AbstractSystem
@@ -86,16 +86,20 @@ class StateSpaceModel(AbstractModel):
 
     def rate(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> Float[Array, " state"]:
         """Time derivative of the state under inputs u and an extra generalised force [N m]."""
+        return jnp.stack(self.slopes(x, u, force))
+
+    def slopes(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> tuple[Scalar, ...]:
+        """`rate`, entry by entry."""
         memory, scene = x[2 * force.shape[0] :], self.scene(x, u)
         acceleration = hooks.acceleration(self.effects, scene, memory, force)
-        return jnp.concatenate([scene.v, acceleration, hooks.drift(self.effects, scene, memory)])
+        return *scene.v, *acceleration, *hooks.drift(self.effects, scene, memory)
 
     def transition(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " state"]:
         """Mean of the state one sample later."""
         extra = jnp.zeros(len(self.system.coordinates), x.dtype) if force is None else force
-        return integrate(lambda x: self.rate(x, u, extra), x, self.dt, self.steps)
+        return integrate(lambda x: self.slopes(x, u, extra), x, self.dt, self.steps)
 
     @property
     def steps(self) -> int:

@@ -1,7 +1,8 @@
-"""Small dense Gaussian algebra, unrolled so that it vectorises over sequences and particles."""
+"""Small dense Gaussian algebra, unrolled so that it vectorises over sequences and particles; LAPACK if it is large."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,9 +16,17 @@ class Gaussian(NamedTuple):
     cov: Float[Array, "*batch dim dim"]
 
 
-def cholesky(a: Float[Array, "dim dim"]) -> list[list[Float[Array, ""]]]:
-    """Lower factor L of a = L L' as rows of scalars (`dim` is small and static)."""
+WIDE = 8
+"""States beyond which nothing is unrolled: a program of the machine's own loops compiles in seconds, not in minutes."""
+Factor = list[list[Float[Array, ""]]] | Float[Array, "dim dim"]
+"""Rows of scalars, or beyond `WIDE` states a matrix."""
+
+
+def cholesky(a: Float[Array, "dim dim"]) -> Factor:
+    """Lower factor L of a = L L' (`dim` is static)."""
     n = a.shape[0]
+    if n > WIDE:
+        return jnp.linalg.cholesky(a)
     rows: list[list[Float[Array, ""]]] = []
     for i in range(n):
         row = []
@@ -30,8 +39,10 @@ def cholesky(a: Float[Array, "dim dim"]) -> list[list[Float[Array, ""]]]:
     return rows
 
 
-def lower(rows: list[list[Float[Array, ""]]]) -> Float[Array, "dim dim"]:
+def lower(rows: Factor) -> Float[Array, "dim dim"]:
     """The factor of `cholesky` as a matrix."""
+    if not isinstance(rows, list):
+        return rows
     n, zero = len(rows), jnp.zeros_like(rows[0][0])
     return jnp.stack([jnp.stack(row + [zero] * (n - len(row))) for row in rows])
 
@@ -40,14 +51,18 @@ def product(a: Float[Array, "row inner"], b: Float[Array, "inner *column"]) -> F
     """a @ b as a sum over the inner axis: it fuses with what stands around it, a small batched matrix product does not
     and takes some 5 times as long on a CPU.
     """
+    if b.shape[0] > WIDE:
+        return a @ b
     out = a[:, 0, None] * b[0][None] if b.ndim == 2 else a[:, 0] * b[0]
     for k in range(1, b.shape[0]):
         out = out + (a[:, k, None] * b[k][None] if b.ndim == 2 else a[:, k] * b[k])
     return out
 
 
-def upper_solve(rows: list[list[Float[Array, ""]]], b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
+def upper_solve(rows: Factor, b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
     """Solution x of L' x = b for the factor of `cholesky`."""
+    if not isinstance(rows, list):
+        return jax.scipy.linalg.solve_triangular(rows, b, trans=1, lower=True)
     n = len(rows)
     x: list = [None] * n
     for i in reversed(range(n)):
@@ -64,6 +79,8 @@ def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Fl
     By a = L D L' with ones on the diagonal of L: one reciprocal a row and no root [Golub & Van Loan 2013, sec. 4.1].
     """
     n = a.shape[0]
+    if n > WIDE:
+        return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(a), True), b)
     factor: list[list] = []  # L D by rows
     inverse: list = []  # of D
     z: list = []

@@ -1,6 +1,6 @@
 """One sample interval of an ordinary differential equation, through diffrax, differentiable forward and backward."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import diffrax
@@ -33,41 +33,42 @@ class RK4(diffrax.AbstractSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The value after one step; `terms` is a function of time and value."""
-        h = t1 - t0
-        times = t0 + h * jnp.asarray([0.0, 0.5, 0.5, 1.0], y0.dtype)
-        ahead = h * jnp.asarray([0.5, 0.5, 1.0, 0.0], y0.dtype)
-        share = h / 6 * jnp.asarray([1.0, 2.0, 2.0, 1.0], y0.dtype)
+        h = jnp.asarray(t1 - t0)
+        times = t0 + h * jnp.asarray([0.0, 0.5, 0.5, 1.0], h.dtype)
+        ahead = h * jnp.asarray([0.5, 0.5, 1.0, 0.0], h.dtype)
+        share = h / 6 * jnp.asarray([1.0, 2.0, 2.0, 1.0], h.dtype)
 
         def stage(carry, slices):
             y, y1 = carry
             t, ahead, share = slices
-            slope = terms.vf(t, jnp.stack(y), args)
+            slope = terms.vf(t, tuple(y) if isinstance(y0, tuple) else jnp.stack(y), args)
             now = [a + ahead * slope[i] for i, a in enumerate(start)]
             return (now, [a + share * slope[i] for i, a in enumerate(y1)]), None
 
         start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
         (_, y1), _ = jax.lax.scan(stage, (start, start), (times, ahead, share))
-        y1 = jnp.stack(y1)
+        y1 = tuple(y1) if isinstance(y0, tuple) else jnp.stack(y1)
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
 def integrate(
-    rate: Callable[[Float[Array, " state"]], Float[Array, " state"]],
+    rate: Callable[[Float[Array, " state"]], Float[Array, " state"] | Sequence[Float[Array, ""]]],
     x: Float[Array, " state"],
     dt: float,
     substeps: int,
 ) -> Float[Array, " state"]:
     """State after `dt` [s] of x' = rate(x), by `substeps` equal steps of `RK4`.
 
-    The input is held over the interval (zero-order hold), so the rate does not depend on time.
+    The input is held over the interval (zero-order hold), so the rate does not depend on time.  A rate may be handed
+    over entry by entry: an array of many joints' accelerations is computed anew for every entry that is read.
     """
     solver = RK4()
-    term = diffrax.ODETerm(lambda t, y, args: rate(y))
-    h = dt / substeps
+    term = diffrax.ODETerm(lambda t, y, args: tuple(rate(jnp.stack(y))))
+    zero, h = jnp.zeros((), x.dtype), jnp.asarray(dt / substeps, x.dtype)
 
     def body(x, _):
-        x, *_ = solver.step(term, jnp.zeros((), x.dtype), jnp.asarray(h, x.dtype), x, None, None, made_jump=False)
+        x, *_ = solver.step(term, zero, h, x, None, None, made_jump=False)
         return x, None
 
-    x, _ = jax.lax.scan(body, x, None, length=substeps)
-    return x
+    entries, _ = jax.lax.scan(body, tuple(x), None, length=substeps)
+    return jnp.stack(entries)

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import __version__
-from ..data.units import parameter_unit
 from ..effects import AbstractEffect
 from ..em.identify import Identified, friction_table, parameter_table
 from ..em.weights import Weights
@@ -61,8 +60,7 @@ def parameters(fitted: Identified) -> dict[str, Any]:
         "measured": list(rig.measured),
         "dt": {"value": model.dt, "unit": "s"},
         "parameters": {
-            n: {"value": v, "std": s, "unit": parameter_unit(n), "estimated": n in estimated}
-            for n, (v, s) in values.items()
+            n: {"value": v, "std": s, "unit": rig.unit(n), "estimated": n in estimated} for n, (v, s) in values.items()
         },
         "noise": {
             "measurement_std": _pairs(rig.measured, np.exp(0.5 * np.asarray(model.log_r))),

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import __version__
 from ..data.logs import Logs
-from ..data.units import parameter_unit
+from ..em.felt import felt, sentences
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
@@ -29,6 +29,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.coordinates + system.rates},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
+        "untold": sentences(felt(fitted.rig, system)),
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),
@@ -49,7 +50,7 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
 
 def parameters(fitted: Identified) -> dict[str, Any]:
     """Estimated physical parameters."""
-    return {n: {"value": v, "std": s, "unit": parameter_unit(n)} for n, (v, s) in parameter_table(fitted).items()}
+    return {n: {"value": v, "std": s, "unit": fitted.rig.unit(n)} for n, (v, s) in parameter_table(fitted).items()}
 
 
 def noise(fitted: Identified) -> dict[str, Any]:

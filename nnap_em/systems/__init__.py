@@ -2,8 +2,9 @@
 
 import dataclasses
 
+from ..data.from_file import declare
 from ..data.rig import SystemSpec
-from . import acrobot, pendubot, pendulum, slide
+from . import acrobot, pendubot, pendulum, slide, tree
 from .base import AbstractSystem
 
 systems: dict[str, type[AbstractSystem]] = {
@@ -28,6 +29,8 @@ def spec(system: type[AbstractSystem], driven: int = 1) -> SystemSpec:
 
 specs: dict[str, SystemSpec] = {name: spec(system) for name, system in systems.items()}
 specs["acrobot"] = spec(acrobot.Acrobot, *acrobot.drives)
+systems["mjcf"] = tree.Tree
+specs["mjcf"] = SystemSpec((), (), {}, 0, declare=declare)  # the file names states and parameters
 
 
 def register(name: str, system: type[AbstractSystem]) -> None:

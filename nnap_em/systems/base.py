@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..data.units import force_unit, quantities, state_unit
+from ..numerics.gaussian import spd_solve
 
 
 class AbstractSystem(eqx.Module):
@@ -29,6 +30,30 @@ class AbstractSystem(eqx.Module):
 
     joints: eqx.AbstractVar[tuple[int, ...]]
     """The joint (counted from 1) that each input drives."""
+
+    @classmethod
+    def declared(cls, parameters: Mapping[str, Array], joints: tuple[int, ...], machine: str) -> "AbstractSystem":
+        """The machine of these numbers; `machine` is that of a file, where the rig names one."""
+        names = [f.name for f in dataclasses.fields(cls) if f.name != "joints"]
+        left = {n: jnp.asarray(v, float) for n, v in cls.optional.items()}
+        return cls(**{n: parameters[n] if n in parameters else left[n] for n in names}, joints=joints)
+
+    def parameter(self, name: str) -> Array:
+        """A parameter by the name that `rig.toml` gives it."""
+        return getattr(self, name)
+
+    def with_parameters(self, values: Mapping[str, Array]) -> "AbstractSystem":
+        """The machine with other values of some parameters."""
+        return dataclasses.replace(self, **values)
+
+    @property
+    def gears(self) -> tuple[float, ...]:
+        """Generalised force of a unit of every input."""
+        return (1.0,) * len(self.joints)
+
+    def neighbours(self, joint: int) -> tuple[int, ...]:
+        """Joints, counted from 1, that share a body with this one, and itself."""
+        return tuple(j for j in (joint - 1, joint, joint + 1) if 1 <= j <= len(self.coordinates))
 
     def __str__(self) -> str:
         values = {f.name: float(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "joints"}
@@ -55,9 +80,15 @@ class AbstractSystem(eqx.Module):
     def drive(self, u: Float[Array, " input"]) -> Float[Array, " dof"]:
         """Generalised force B u of the inputs [N m, or N]."""
         force = [jnp.zeros((), u.dtype)] * len(self.coordinates)
-        for i, joint in enumerate(self.joints):
-            force[joint - 1] = force[joint - 1] + u[i]
+        for i, (joint, gear) in enumerate(zip(self.joints, self.gears, strict=True)):
+            force[joint - 1] = force[joint - 1] + u[i] * gear
         return jnp.stack(force)
+
+    def acceleration(
+        self, q: Float[Array, " dof"], v: Float[Array, " dof"], force: Float[Array, " dof"]
+    ) -> tuple[Float[Array, ""], ...]:
+        """Of every joint under a generalised force [N m, or N], one by one (`integrate` says why)."""
+        return tuple(spd_solve(self.mass(q), force - self.bias(q, v)))
 
     def vary(self, kind: str, joint: int, amount: Float[Array, ""]) -> "AbstractSystem":
         """The machine with one body changed by `amount` (an entry of `variations`)."""

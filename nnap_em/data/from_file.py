@@ -1,0 +1,142 @@
+"""What rig.toml declares of a machine that stands in a file: its names, its inputs, and what of it is uncertain."""
+
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from .machine import Machine, packed, states
+from .mjcf import read_machine
+from .rig import Declared, RigWarning, SystemSpec, Told, nearest
+
+OF_BODY = ("mass", "com.x", "com.y", "com.z", *(f"inertia.{axes}" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")))
+"""In the frame of the body, the inertia about its centre of mass: kg, m, kg m^2."""
+OF_JOINT = ("armature", "stiffness")
+_FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
+_UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
+
+
+def declare(root: Any) -> Told:
+    """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
+    model = root.table("model")
+    model.check(("type", "friction"), ("file", "uncertain"))
+    if not isinstance(model.items.get("file"), str) or not model.items["file"]:
+        model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
+    machine = read_machine(root.path.parent / str(model.items["file"]))
+    machine = machine._replace(
+        file=str(model.items["file"]), states=_states(machine, root), rubs=model.items.get("friction") == "none"
+    )
+    _say_left_out(root, machine)
+    columns, joints, gears, motored = _inputs(machine, root)
+    spec = SystemSpec(machine.states, (), {}, len(machine.joints))
+    parameters = dict(_parameters(machine, model))
+    return Told(spec, parameters, columns, joints, packed(machine._replace(gears=gears, motored=motored)))
+
+
+def _say_left_out(root: Any, machine: Machine) -> None:
+    """Friction of the file has no part where it is learned."""
+    names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
+    if names and not machine.rubs:
+        found = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {machine.file}: {found}; friction = "none" takes the file\'s', RigWarning, 2)
+
+
+def _states(machine: Machine, root: Any) -> tuple[str, ...]:
+    """Every joint by its name, or by that of the sensor whose column is measured."""
+    names, dof = list(states(machine.joints)), len(machine.joints)
+    wanted = root.table("measurement").items.get("columns")
+    for gauge in machine.gauges:
+        if isinstance(wanted, list) and gauge.name in wanted:
+            names[gauge.joint + dof * gauge.rate] = gauge.name
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
+    return tuple(names)
+
+
+def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], tuple[float, ...], bool]:
+    """Columns, the joint that each drives, counted from 1, its gear, and whether they are the motors of the file."""
+    motors = {motor.name: motor for motor in machine.motors}
+    if not motors and "input" not in root.items:
+        found = f"{machine.file} has no actuator"
+        mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", found, mend)
+    table = root.table("input", absent={})
+    table.check((), ("columns", "joints"))
+    columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
+    for column in columns:
+        if column in ("time", *machine.states):
+            mend = "give the motor another name than the joint's, or name torque columns and joints in [input]"
+            table.refuse("columns", f"{column!r} is a state, and no torque", mend)
+    if "joints" in table.items:
+        joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
+        if len(joints) != len(columns):
+            table.refuse("joints", f"found {len(joints)} joints for {len(columns)} columns")
+        gears, motored = (1.0,) * len(columns), False
+    else:
+        for column in columns:
+            if column not in motors:
+                mend = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+                table.refuse("columns", f"{column!r} is no motor of {machine.file}", mend)
+        joints = tuple(motors[column].joint + 1 for column in columns)
+        gears, motored = tuple(motors[column].gear for column in columns), True
+    for joint in joints:
+        if joints.count(joint) > 1:
+            found = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
+            found += f", {machine.joints[joint - 1].name!r}"
+            table.refuse("columns", found, "name one of them in [input] columns, and log their sum")
+    return columns, joints, gears, motored
+
+
+def _place(machine: Machine, table: Any, joint: Any) -> int:
+    names = [one.name for one in machine.joints]
+    if isinstance(joint, str):
+        return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))
+    if not isinstance(joint, int) or not 1 <= joint <= len(names):
+        table.refuse("joints", None, f"write names of joints, or numbers from 1 to {len(names)}: {', '.join(names)}")
+    return joint
+
+
+def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
+    """Every number of [model.uncertain], its mean that of the file where none is written."""
+    table = model.table("uncertain", absent={})
+    given = {f"{body.name}.{what}": _of_body(body, what) for body in machine.bodies for what in OF_BODY}
+    given |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
+    owners = [one.name for one in (*machine.bodies, *machine.joints)]
+    for name, value in _flat(table.items):
+        owner, _, own = name.partition(".")
+        if owner not in owners:
+            table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
+        if name not in given:
+            known = [key.partition(".")[2] for key in given if key.partition(".")[0] == owner]
+            table.refuse(name, f"{owner!r} has no {own!r}" if own else "names no number", nearest(own, known))
+        yield name, _declared(table, name, value, given[name])
+
+
+def _of_body(body: Any, what: str) -> float:
+    if what == "mass":
+        return body.mass
+    kind, _, axes = what.partition(".")
+    places = ["xyz".index(axis) for axis in axes]
+    return body.centre[places[0]] if kind == "com" else body.inertia[places[0]][places[1]]
+
+
+def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
+    pair = value if isinstance(value, dict) else {"mean": value, "std": 0.0}
+    numbers = [pair.get("mean", mean), pair.get("std")]
+    if set(pair) - {"mean", "std"} or not all(type(x) in (int, float) and abs(x) < float("inf") for x in numbers):
+        table.refuse(name, f"found {value!r}", _UNCERTAIN)
+    if numbers[1] < 0:
+        table.refuse(name, f"found std = {numbers[1]}", "write a standard deviation of 0 (trusted) or more")
+    own = name.partition(".")[2]
+    if (own in ("mass", *OF_JOINT) and numbers[0] < 0) or (own == "mass" and not numbers[0]):
+        table.refuse(name, f"found mean = {numbers[0]}", "write a number above 0")
+    return Declared(float(numbers[0]), float(numbers[1]))
+
+
+def _flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
+    """Dotted keys are tables inside tables."""
+    for key, value in items.items():
+        if isinstance(value, dict) and value and not set(value) & {"mean", "std"}:
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value

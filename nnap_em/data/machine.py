@@ -1,0 +1,142 @@
+"""A machine from its owner's file as plain numbers: all that the physics needs, without the file and its parser."""
+
+import json
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from .units import state_unit
+
+Vector = tuple[float, float, float]
+Rotation = tuple[Vector, Vector, Vector]
+"""Rows; takes a vector of the inner frame to the outer one."""
+
+
+class Body(NamedTuple):
+    """A rigid body in its own frame, which stands in that of its parent as declared when all joints are at zero."""
+
+    name: str
+    parent: int
+    """Place of the parent in the list of bodies; -1: the world."""
+    place: Vector
+    """Origin in the frame of the parent [m]."""
+    turn: Rotation
+    mass: float
+    """[kg]"""
+    centre: Vector
+    """Centre of mass [m]."""
+    inertia: Rotation
+    """About the centre of mass, along the axes of the frame [kg m^2]."""
+
+
+class Joint(NamedTuple):
+    """A hinge or a slide, and what stands about it in the file."""
+
+    name: str
+    body: int
+    """The body that it moves; several joints of one body act in the order of the list."""
+    slide: bool
+    axis: Vector
+    """Of unit length, in the frame of the body."""
+    anchor: Vector
+    """A point of the axis in the frame of the body [m]."""
+    zero: float
+    """Coordinate at which the body stands as declared [rad or m]."""
+    stiffness: float
+    """Of its spring [N m/rad or N/m]."""
+    rest: float
+    """Coordinate at which the spring is at rest."""
+    armature: float
+    """Inertia of what turns with it, as of a rotor [kg m^2 or kg]."""
+    damping: float
+    """[N m s/rad or N s/m]"""
+    dry: float
+    """Dry friction of the file [N m or N]."""
+    range: tuple[float, float] | None
+    """Where its stops are."""
+
+
+class Motor(NamedTuple):
+    """An actuator whose input is a torque: gear times the input acts on the joint."""
+
+    name: str
+    joint: int
+    gear: float
+
+
+class Gauge(NamedTuple):
+    """A sensor that reads a joint."""
+
+    name: str
+    joint: int
+    rate: bool
+    """True where it reads the velocity."""
+
+
+class Spot(NamedTuple):
+    """A marked point of a body."""
+
+    name: str
+    body: int
+    place: Vector
+    """[m]"""
+
+
+class Machine(NamedTuple):
+    """A tree of bodies on a fixed base."""
+
+    file: str
+    gravity: Vector
+    """[m/s^2]"""
+    bodies: tuple[Body, ...]
+    joints: tuple[Joint, ...]
+    motors: tuple[Motor, ...]
+    gauges: tuple[Gauge, ...]
+    spots: tuple[Spot, ...]
+    states: tuple[str, ...] = ()
+    """What the coordinates, then the rates, are called in the logs."""
+    gears: tuple[float, ...] = ()
+    """Torque of a unit of every input column."""
+    motored: bool = False
+    """True where the inputs are motors of the file; False where rig.toml names joints."""
+    rubs: bool = False
+    """True where friction of the file acts, because none is learned."""
+
+
+def packed(machine: Machine) -> str:
+    """The machine as one text, the same for the same machine."""
+    return json.dumps(machine, separators=(",", ":"))
+
+
+@lru_cache(maxsize=64)
+def unpacked(text: str) -> Machine:
+    """The machine in a text of `packed`."""
+    told = json.loads(text, parse_int=int)
+    fields = [_tuples(part) for part in told]
+    kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "gauges": Gauge, "spots": Spot}
+    named = dict(zip(Machine._fields, fields, strict=True))
+    whole: dict[str, Any] = {
+        name: tuple(kinds[name](*one) for one in value) if name in kinds else value for name, value in named.items()
+    }
+    return Machine(**whole)
+
+
+def _tuples(value):
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def machine_unit(text: str, name: str) -> str:
+    """The SI unit of a state or parameter of the machine in a text of `packed`."""
+    machine = unpacked(text)
+    dof, (owner, _, own) = len(machine.joints), name.partition(".")
+    if name in machine.states:
+        place = machine.states.index(name)
+        return state_unit(not machine.joints[place % dof].slide, rate=place >= dof)
+    slide = next((joint.slide for joint in machine.joints if joint.name == owner), False)
+    per_joint = {"armature": "kg" if slide else "kg m^2", "stiffness": "N/m" if slide else "N m/rad"}
+    return per_joint.get(own) or {"mass": "kg", "com": "m"}.get(own.partition(".")[0], "kg m^2")
+
+
+def states(joints: tuple[Joint, ...]) -> tuple[str, ...]:
+    """Coordinates and rates as the file names the joints."""
+    names = tuple(joint.name for joint in joints)
+    return names + tuple(f"d{name}" for name in names)

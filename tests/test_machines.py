@@ -1,0 +1,393 @@
+"""Machines from files: the physics against MuJoCo's own, names and numbers as the file has them, bad files refused."""
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from machines import arm, tree
+
+from nnap_em.data.machine import packed, unpacked
+from nnap_em.data.mjcf import read_machine
+from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig, write_rig
+from nnap_em.em.build import build_system
+from nnap_em.em.felt import felt, sentences
+from nnap_em.model.simulate import examples
+from nnap_em.numerics.gaussian import spd_solve
+from nnap_em.systems import specs
+from nnap_em.systems.bodies import physical
+
+ROOT = Path(__file__).resolve().parents[1]
+OWN = sorted((ROOT / "tests" / "machines").iterdir())
+SHIPPED = sorted((ROOT / "examples" / "machines").glob("*.xml"))
+ARMS = range(1, 8)
+
+
+@pytest.fixture(params=[*OWN, *SHIPPED, *ARMS], ids=lambda p: p.name if isinstance(p, Path) else f"arm{p}")
+def machine_file(request, tmp_path) -> Path:
+    """A machine of each kind: chain, branch, slide, gear, armature, rotated frames, offset joints, URDF."""
+    if isinstance(request.param, Path):
+        return request.param
+    (tmp_path / "arm.xml").write_text(arm(request.param))
+    return tmp_path / "arm.xml"
+
+
+def _mujoco(path: Path) -> mujoco.MjModel:
+    if path.suffix != ".urdf":
+        return mujoco.MjModel.from_xml_path(str(path))
+    return mujoco.MjModel.from_xml_string(re.sub(r"(?s)<visual>.*?</visual>", "", path.read_text()))
+
+
+def _states(model: mujoco.MjModel, count: int = 6):
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = rng.uniform(-3.0, 3.0, (2, model.nv))
+        mujoco.mj_forward(model, data)
+        yield data
+
+
+def _full(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    return mass
+
+
+def test_mass_and_bias_are_those_of_mujoco(machine_file):
+    model, system = _mujoco(machine_file), tree(machine_file)
+    for data in _states(model):
+        q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+        np.testing.assert_allclose(system.mass(q), _full(model, data), atol=1e-12, rtol=1e-12)
+        np.testing.assert_allclose(system.bias(q, v), data.qfrc_bias - data.qfrc_spring, atol=1e-11, rtol=1e-12)
+
+
+def test_acceleration_is_that_of_the_mass_matrix(machine_file):
+    model, system = _mujoco(machine_file), tree(machine_file)
+    for data in _states(model, 2):
+        q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+        force = jnp.linspace(-1.0, 1.0, model.nv)
+        other = spd_solve(system.mass(q), force - system.bias(q, v))
+        np.testing.assert_allclose(jnp.stack(system.acceleration(q, v, force)), other, rtol=1e-9, atol=1e-9)
+
+
+def test_derivatives_of_the_acceleration_are_those_of_the_mass_matrix(machine_file):
+    system = tree(machine_file)
+    dof = len(system.coordinates)
+    x = jnp.asarray(np.random.default_rng(1).uniform(-2.0, 2.0, 3 * dof))
+
+    def own(x):
+        return jnp.stack(system.acceleration(*jnp.split(x, 3)))
+
+    def other(x):
+        q, v, force = jnp.split(x, 3)
+        return spd_solve(system.mass(q), force - system.bias(q, v))
+
+    np.testing.assert_allclose(jax.jacfwd(own)(x), jax.jacfwd(other)(x), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(jax.grad(lambda x: own(x)[0])(x), jax.jacfwd(other)(x)[0], rtol=1e-7, atol=1e-7)
+
+
+def test_derivatives_by_uncertain_numbers_are_those_of_the_mass_matrix(tmp_path):
+    system = build_system(read_rig(_rig(tmp_path, arm(3), model=UNCERTAIN), specs))
+    names, q, v = list(system.values), jnp.asarray([0.3, -0.8, 1.1]), jnp.asarray([1.0, 2.0, -3.0])
+
+    def own(values):
+        return jnp.stack(system.with_parameters(values).acceleration(q, v, jnp.ones(3)))
+
+    def other(values):
+        changed = system.with_parameters(values)
+        return spd_solve(changed.mass(q), jnp.ones(3) - changed.bias(q, v))
+
+    found, truth = jax.jacfwd(own)(system.values), jax.jacfwd(other)(system.values)
+    for name in names:
+        np.testing.assert_allclose(found[name], truth[name], rtol=1e-8, atol=1e-8)
+
+
+def test_drive_is_that_of_mujocos_motors(tmp_path):
+    path = ROOT / "tests" / "machines" / "branch.xml"
+    rig = read_rig(_rig(tmp_path, path, measured=("left",)), specs)
+    system, model = build_system(rig), _mujoco(path)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = u = np.array([0.3, -0.2, 0.7])
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(system.drive(jnp.asarray(u)), data.qfrc_actuator, atol=1e-14)
+
+
+def test_acrobot_of_the_file_is_the_built_in_one():
+    own, built = tree(ROOT / "examples" / "machines" / "acrobot.xml"), examples["acrobot"]().model.system
+    q, v = jnp.asarray([0.7, -1.9]), jnp.asarray([2.0, 5.0])
+    np.testing.assert_allclose(own.mass(q), built.mass(q), rtol=1e-13)
+    np.testing.assert_allclose(own.bias(q, v), built.bias(q, v), rtol=1e-12)
+
+
+# --- rig.toml
+
+
+def _rig(folder: Path, machine: Path | str, *, measured=("joint1",), model: str = "", rest: str = "") -> Path:
+    """A rig.toml beside a machine file, which is copied or written."""
+    name = machine.name if isinstance(machine, Path) else "machine.xml"
+    (folder / name).write_text(machine.read_text() if isinstance(machine, Path) else machine)
+    columns = ", ".join(f'"{column}"' for column in measured)
+    (folder / "rig.toml").write_text(
+        f'format = 1\nname = "bench"\n[model]\ntype = "mjcf"\nfile = "{name}"\nfriction = "unknown"\n{model}\n{rest}\n'
+        f'[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n[measurement]\ncolumns = [{columns}]\n'
+    )
+    return folder / "rig.toml"
+
+
+UNCERTAIN = """[model.uncertain]
+link2.mass = { std = 0.1 }
+link2.com.x = { mean = 0.012, std = 0.01 }
+"link3.inertia.yy" = { std = 0.001 }
+joint3.armature = 0.02
+"""
+
+
+def test_names_inputs_and_uncertain_numbers_are_those_of_the_file(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(3), model=UNCERTAIN), specs)
+    system = build_system(rig)
+    assert system.coordinates == ("joint1", "joint2", "joint3")
+    assert system.rates == ("djoint1", "djoint2", "djoint3")
+    assert (rig.input_columns, rig.input_joints) == (("tau1", "tau2", "tau3"), (1, 2, 3))
+    assert rig.parameters["link2.mass"] == Declared(2.5, 0.1)
+    assert rig.parameters["link2.com.x"] == Declared(0.012, 0.01)
+    assert rig.parameters["joint3.armature"] == Declared(0.02, 0.0)
+    assert [rig.unit(n) for n in ("djoint2", "link2.mass", "link2.com.x", "joint3.armature")] == [
+        "rad/s", "kg", "m", "kg m^2",
+    ]  # fmt: skip
+    assert float(system.parameter("link3.inertia.yy")) == pytest.approx(0.9 * 0.015)
+
+
+def test_written_rig_reads_the_same(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(3), model=UNCERTAIN), specs)
+    write_rig(rig, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == rig
+    named = read_rig(_rig(tmp_path, arm(3), rest='[input]\ncolumns = ["u"]\njoints = ["joint2"]'), specs)
+    assert (named.input_columns, named.input_joints) == (("u",), (2,))
+    write_rig(named, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == named
+
+
+def test_a_state_is_called_as_the_sensor_that_is_measured(tmp_path):
+    path = _rig(tmp_path, ROOT / "tests" / "machines" / "branch.xml", measured=("left_pos", "right"))
+    system = build_system(read_rig(path, specs))
+    assert system.coordinates == ("trunk_x", "trunk_turn", "left_pos", "right", "grip")
+    assert system.unit("trunk_x") == "m" and system.force_unit(5) == "N"
+
+
+def test_changed_numbers_move_the_physics_as_in_mujoco(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(3), model=UNCERTAIN), specs)
+    system = build_system(rig).with_parameters({"link2.mass": jnp.asarray(2.0)})
+    model = mujoco.MjModel.from_xml_string(arm(3))
+    model.body_mass[2] = 2.0
+    model.body_ipos[2][0], model.dof_armature[2] = 0.012, 0.02
+    for data in _states(model):
+        np.testing.assert_allclose(system.mass(jnp.asarray(data.qpos)), _full(model, data), atol=1e-12)
+
+
+def test_friction_of_the_file_acts_where_none_is_learned_and_is_left_out_where_it_is(tmp_path):
+    text = arm(2).replace('armature="0.05"', 'armature="0.05" damping="0.3" frictionloss="0.2"')
+    with pytest.warns(RigWarning, match="damping and frictionloss of joint1 are left out"):
+        learned = build_system(read_rig(_rig(tmp_path, text), specs))
+    path = _rig(tmp_path, text)
+    path.write_text(path.read_text().replace('"unknown"', '"none"'))
+    known, q, v = build_system(read_rig(path, specs)), jnp.zeros(2), jnp.asarray([2.0, 1.0])
+    np.testing.assert_allclose(known.bias(q, v) - learned.bias(q, v), [0.3 * 2.0 + 0.2, 0.0], atol=1e-12)
+
+
+def test_payload_is_a_point_mass_at_the_site(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(3)), specs)
+    system = build_system(rig)
+    assert list(system.variations) == [("payload", 3)]
+    loaded = system.vary("payload", 3, jnp.asarray(0.4))
+    hung = arm(3).replace(
+        '<site name="hand" pos="0 0 0.05"/>',
+        '<body pos="0 0 0.05"><inertial pos="0 0 0" mass="0.4" diaginertia="1e-12 1e-12 1e-12"/></body>',
+    )
+    model = mujoco.MjModel.from_xml_string(hung)
+    for data in _states(model):
+        q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+        np.testing.assert_allclose(loaded.mass(q), _full(model, data), atol=1e-10)
+        np.testing.assert_allclose(loaded.bias(q, v), data.qfrc_bias, atol=1e-9)
+
+
+def test_unphysical_bodies_have_no_numbers(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(2), model="[model.uncertain]\nlink2.mass = {std = 0.1}"), specs)
+    system = build_system(rig)
+    assert bool(jnp.all(jnp.isfinite(system.mass(jnp.zeros(2)))))
+    negative = system.with_parameters({"link2.mass": jnp.asarray(-0.1)})
+    assert bool(jnp.isnan(negative.mass(jnp.zeros(2))[1, 1]))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_physical_says_the_same_as_the_pseudo_inertia(seed):
+    rng = np.random.default_rng(seed)
+    s = rng.normal(size=(3, 3))
+    own = s @ s.T + rng.uniform(-1.0, 1.0) * np.eye(3)
+    half = 0.5 * np.trace(own) * np.eye(3) - own
+    told = bool(physical(jnp.asarray(1.0), tuple(map(tuple, own))))
+    assert told == bool(np.linalg.eigvalsh(half).min() > 0)
+
+
+def test_what_no_motion_feels_is_told(tmp_path):
+    uncertain = (
+        "[model.uncertain]\nlink1.mass = {std = 0.1}\nlink1.inertia.zz = {std = 0.1}\njoint1.armature = {std=1.0}"
+    )
+    rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
+    found = felt(rig, build_system(rig))
+    assert found.never == ()
+    assert found.together == (("link1.mass", "link1.inertia.zz", "joint1.armature"),)  # one axis, upright
+    uncertain = "[model.uncertain]\nlink1.com.z = {std=0.1}\nlink2.mass = {std=0.1}"
+    rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
+    assert felt(rig, build_system(rig)) == (("link1.com.z",), ())
+    assert "no motion feels link1.com.z" in sentences(felt(rig, build_system(rig)))[0]
+
+
+def test_neighbours_share_a_body():
+    system = tree(ROOT / "tests" / "machines" / "branch.xml")
+    assert [system.neighbours(j) for j in range(1, 6)] == [(1, 2), (1, 2, 3, 4), (2, 3), (2, 4, 5), (4, 5)]
+
+
+def test_machine_is_the_same_from_its_text(machine_file):
+    machine = read_machine(machine_file)
+    assert unpacked(packed(machine)) == machine
+
+
+def test_without_mujoco_the_message_says_what_to_install(tmp_path, monkeypatch):
+    path = _rig(tmp_path, arm(1))
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(RigError, match=re.escape('pip install "nnap-em[robots]"')):
+        read_rig(path, specs)
+
+
+# --- what is refused
+
+HINGE = '<joint name="a" axis="0 1 0"/>'
+WEIGHT = '<inertial pos="0 0 -.1" mass="1" diaginertia=".01 .01 .01"/>'
+
+
+def _one(body: str = HINGE + WEIGHT, rest: str = "<actuator><motor name='m' joint='a'/></actuator>") -> str:
+    return f'<mujoco><worldbody><body name="b">{body}</body></worldbody>{rest}</mujoco>'
+
+
+def _actuator(line: str) -> str:
+    return _one(rest=f"<actuator>{line}</actuator>")
+
+
+def _urdf(joints: str, *links: str) -> str:
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    named = "".join(f'<link name="{name}">{mass if name != "light" else ""}</link>' for name in links)
+    return f'<robot name="r">{named}{joints}</robot>'
+
+
+def _turning(name: str, parent: str, child: str, more: str = "", kind: str = "continuous") -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{more}</joint>'
+
+
+TWO = f'<body name="c"><joint name="b2" axis="0 1 0"/>{WEIGHT}</body>'
+SECOND = "<motor name='m' joint='a'/><motor name='n' joint='a'/>"
+BAD = {
+    "free joint": (_one('<freejoint name="base"/>' + WEIGHT, ""), "", "joint 'base' is free; the base is fixed"),
+    "ball joint": (_one('<joint type="ball" name="hip"/>' + WEIGHT, ""), "", "'hip' is a ball joint; write it as"),
+    "equality": (
+        _one(HINGE + WEIGHT + TWO, "<equality><joint joint1='a' joint2='b2'/></equality>"),
+        "", "1 equality constraints; a loop or coupling is no tree",
+    ),
+    "tendon": (
+        _one(rest="<tendon><fixed name='t'><joint joint='a' coef='1'/></fixed></tendon>"),
+        "", "1 tendons; put their springs and motors on joints",
+    ),
+    "position servo": (_actuator("<position name='p' joint='a' kp='3'/>"), "", "actuator 'p' is a servo"),
+    "velocity servo": (_actuator("<velocity name='p' joint='a' kv='3'/>"), "", "actuator 'p' is a servo"),
+    "muscle": (_actuator("<muscle name='p' joint='a' lengthrange='0 1'/>"), "", "actuator 'p' is a muscle"),
+    "state": (_actuator("<intvelocity name='p' joint='a' kp='3' actrange='-1 1'/>"), "", "actuator 'p' has a state"),
+    "two motors": (_actuator(SECOND), "", r"m and n drive one joint, 'a'; name one of them in \[input\] columns"),
+    "no actuator": (_one(rest=""), "", "no actuator; write the torque columns and their joints"),
+    "missing mesh": (
+        '<mujoco><asset><mesh name="hull" file="hull.stl"/></asset><worldbody><body name="b">' + HINGE
+        + '<geom type="mesh" mesh="hull"/></body></worldbody></mujoco>',
+        "", "body 'b' has no <inertial>, and its mesh 'hull' is missing; put the mesh beside",
+    ),
+    "negative inertia": (_one(HINGE + WEIGHT.replace(".01 .01 .01", "-1 1 1")), "", "mass and inertia above 0"),
+    "impossible inertia": (_one(HINGE + WEIGHT.replace(".01 .01 .01", "1 1 5")), "", "largest part is at most the sum"),
+    "no mass": (_one(HINGE), "", "give every body that moves an <inertial>"),
+    "unknown body": (_one(), "bb.mass = {std=1}", "no body or joint of machine.xml is called 'bb'; did you mean 'b'"),
+    "unknown number": (_one(), "b.mas = {std=1}", "'b' has no 'mas'; did you mean 'mass'"),
+    "no std": (_one(), "b.mass = {mean=1.0}", r"found \{'mean': 1.0\}; write forearm.mass = "),
+    "negative std": (_one(), "b.mass = {std=-1.0}", "found std = -1.0; write a standard deviation of 0"),
+    "negative mean": (_one(), "b.mass = {mean=-1, std=1.0}", "found mean = -1; write a number above 0"),
+    "no name": (_one(HINGE.replace('name="a"', "") + WEIGHT, ""), "", "a joint of body 'b' has no name; name it"),
+    "unusable name": (_one(HINGE.replace('"a"', '"a b"') + WEIGHT, ""), "", "'a b': unusable name; write letters"),
+    "reserved name": (_one(HINGE.replace('"a"', '"time"') + WEIGHT, ""), "", "'time' has a name that logs"),
+    "a name that is a rate": (
+        _one(HINGE + WEIGHT + TWO.replace('"b2"', '"da"')), "", "'da' is called as the rate of joint 'a'; rename",
+    ),
+    "same name twice": (_one(HINGE + WEIGHT + TWO.replace('"b2"', '"a"')), "", "a name of its own"),
+    "motor called as its joint": (_actuator("<motor name='a' joint='a'/>"), "", "'a' is a state, and no torque; give"),
+    "fluid": (_one(rest="<option density='1000'/>"), "", "bodies move in a fluid; set density and viscosity to 0"),
+    "gravity compensation": (
+        '<mujoco><worldbody><body name="b" gravcomp="1">' + HINGE + WEIGHT + "</body></worldbody></mujoco>",
+        "", "body 'b' has gravcomp; log the torque",
+    ),
+    "nothing moves": (_one(WEIGHT, ""), "", "it has no joint; give the bodies hinges or slides"),
+    "not XML": ("<mujoco><worldbody>", "", "not XML .*; give the MJCF or URDF file as it was written, whole"),
+    "another root": ("<sdf/>", "", "its root element is <sdf>; give MJCF"),
+    "URDF without inertia": (
+        _urdf(_turning("j", "a", "light"), "a", "light"), "", "'light' moves and has no <inertial>; add <inertial>",
+    ),
+    "URDF loop": (
+        _urdf(_turning("j", "a", "c") + _turning("k", "b", "c"), "a", "b", "c"), "", "'c' hangs on two joints",
+    ),
+    "URDF ring": (_urdf(_turning("j", "a", "b") + _turning("k", "b", "a"), "a", "b"), "", "links form a ring"),
+    "URDF mimic": (
+        _urdf(_turning("j", "a", "b") + _turning("k", "b", "c", '<mimic joint="j"/>'), "a", "b", "c"),
+        "", "'k' mimics another",
+    ),
+    "URDF floating": (_urdf(_turning("j", "a", "b", kind="floating"), "a", "b"), "", "'j' is floating; fix the base"),
+    "URDF lost link": (_urdf(_turning("j", "a", "z"), "a", "b"), "", "names a link 'z' that is not there"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text, uncertain, said", BAD.values(), ids=BAD)
+def test_bad_files_are_refused_by_name_with_the_mend(tmp_path, text, uncertain, said):
+    path = _rig(tmp_path, text, measured=("a",), model=f"[model.uncertain]\n{uncertain}" if uncertain else "")
+    with pytest.raises(RigError, match=said) as refused:
+        read_rig(path, specs)
+    assert "; " in str(refused.value)  # what is wrong; what to do
+    assert str(tmp_path) in str(refused.value)  # and where
+
+
+def test_missing_files_are_refused(tmp_path):
+    path = _rig(tmp_path, arm(1))
+    (tmp_path / "machine.xml").unlink()
+    with pytest.raises(RigError, match=r"machine.xml: cannot be read .*; file = names an MJCF or URDF file"):
+        read_rig(path, specs)
+    path.write_text(path.read_text().replace('file = "machine.xml"', ""))
+    with pytest.raises(RigError, match=r"\[model\] file: missing; write file = "):
+        read_rig(path, specs)
+
+
+def test_missing_meshes_do_not_matter_where_inertials_are_there(tmp_path):
+    shape = '<geom type="mesh" mesh="hull" material="grey"/>'
+    asset = '<asset><mesh name="hull" file="hull.stl"/><material name="grey" texture="t"/></asset>'
+    inner = f'<mujoco><worldbody><body name="b">{HINGE}{WEIGHT}{shape}</body></worldbody></mujoco>'
+    (tmp_path / "inner.xml").write_text(inner)
+    (tmp_path / "outer.xml").write_text(f'<mujoco>{asset}<include file="inner.xml"/></mujoco>')
+    (tmp_path / "plain.xml").write_text(inner.replace(shape, ""))
+    found, plain = (read_machine(tmp_path / name) for name in ("outer.xml", "plain.xml"))
+    assert found._replace(file="") == plain._replace(file="")
+
+
+# --- what is stored and handed on
+
+
+def test_program_of_a_machine_with_seven_joints_has_its_numbers_inside(tmp_path):
+    (tmp_path / "arm.xml").write_text(arm(7))
+    system = tree(tmp_path / "arm.xml")
+    leaves = jax.tree.leaves(eqx.filter(system, eqx.is_array))
+    assert leaves == [] and dataclasses.is_dataclass(system)

@@ -1,0 +1,198 @@
+"""A model whose machine came from a file: stored and exported without that file, and written back for MuJoCo."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import machine_files
+import mujoco
+import numpy as np
+import pytest
+from machine_files import CASES, errors, friction, recorded
+
+from nnap_em import identify
+from nnap_em.data.machine import unpacked
+from nnap_em.data.mjcf import read_machine
+from nnap_em.data.rig import Declared, Rig, read_rig
+from nnap_em.effects.body import Payload
+from nnap_em.effects.position import Cogging, TorsionalSpring
+from nnap_em.em.identify import Identified, begin
+from nnap_em.em.store import load, save
+from nnap_em.model.simulate import declared, paper_model
+from nnap_em.portable.export import ExportError, export
+from nnap_em.portable.mjcf import coulomb_viscous, write_mjcf
+from nnap_em.systems import specs
+
+MACHINES = Path(machine_files.__file__).parent / "machines"
+
+
+def _rig(**changes) -> Rig:
+    rig = read_rig(MACHINES / "cartpole.toml", specs)
+    return dataclasses.replace(rig, **changes)
+
+
+def _logs(rig: Rig, sequences: int = 2, rows: int = 40, seed: int = 0):
+    case, text = CASES["cartpole"], (MACHINES / "cartpole.xml").read_text()
+    noise = np.asarray([case.noise, 0.002])
+    logs, x = recorded(text, friction(case), case.push, noise, sequences=sequences, rows=rows, seed=seed)
+    places = [unpacked(rig.machine).states.index(name) for name in rig.measured]
+    return logs._replace(y=logs.y[..., places]), x
+
+
+def _begun(effects=(), **changes) -> Identified:
+    rig = _rig(**changes)
+    fitted = begin(rig, _logs(rig)[0], key=jax.random.key(0), effects=effects)
+    return fitted._replace(state=fitted.state._replace(hessian=jnp.eye(fitted.state.hessian.shape[0])))
+
+
+# --- stored and exported
+
+ALONE = """
+import sys
+sys.modules["mujoco"] = None
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+from nnap_em.em.store import load
+fitted = load(sys.argv[1])
+x = np.asarray([0.1, 0.4, -0.3, 1.0])
+u = fitted.model.inputs(__import__("nnap_em").Dataset(np.zeros(1), np.ones((1, 1)), np.zeros((1, 1)), np.ones(1, bool)))
+print(*map(repr, np.asarray(fitted.model.transition(x, jax.tree.map(lambda a: a[0], u))).tolist()))
+"""
+
+
+def test_a_saved_model_needs_neither_the_file_nor_mujoco(tmp_path):
+    uncertain = {"pole.mass": Declared(0.2, 0.05), "pole.com.z": Declared(-0.25, 0.02)}
+    fitted = _begun(parameters=uncertain)
+    save(tmp_path / "model.npz", fitted)
+    assert load(tmp_path / "model.npz").rig == fitted.rig
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE, str(tmp_path / "model.npz")], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    rows = _logs(fitted.rig)[0]
+    seq = jax.tree.map(lambda a: a[0], rows)._replace(u=np.ones((40, 1)))
+    u = jax.tree.map(lambda a: a[1], fitted.model.inputs(seq))
+    expected = fitted.model.transition(jnp.asarray([0.1, 0.4, -0.3, 1.0]), u)
+    np.testing.assert_array_equal([float(v) for v in done.stdout.split()], expected)
+
+
+def test_a_machine_from_a_file_is_exported(tmp_path):
+    export(_begun(parameters={"pole.mass": Declared(0.2, 0.05)}), tmp_path)  # compares NumPy's numbers with JAX's
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model.stablehlo", "parameters.json", "predictor.py"]
+    assert '"unit": "kg"' in (tmp_path / "parameters.json").read_text()
+
+
+# --- written back
+
+
+def _physics(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = q, v
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    return mass, data.qfrc_bias - data.qfrc_spring
+
+
+@pytest.mark.parametrize("file", ["branch.xml", "arm.urdf"])
+def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
+    path = Path(__file__).parent / "machines" / file
+    machine = read_machine(path)
+    (tmp_path / file).write_text(path.read_text())
+    joints = [joint.name for joint in machine.joints]
+    (tmp_path / "rig.toml").write_text(
+        f'format = 1\nname = "b"\n[model]\ntype = "mjcf"\nfile = "{file}"\nfriction = "none"\n[input]\n'
+        f'columns = ["u"]\njoints = [1]\n[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n'
+        f'[measurement]\ncolumns = ["{joints[0]}"]\n'
+    )
+    rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
+    logs = machine_files.Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
+    assert write_mjcf(begin(rig, logs, key=jax.random.key(0)), tmp_path / "out.xml") == []
+    written, rng = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), np.random.default_rng(0)
+    system = begin(rig, logs, key=jax.random.key(0)).model.system
+    for _ in range(3):
+        q, v = rng.uniform(-2.0, 2.0, (2, len(joints)))
+        mass, _ = _physics(written, q, v)
+        np.testing.assert_allclose(mass, system.mass(jnp.asarray(q)), rtol=1e-9, atol=1e-9)
+        still = np.zeros_like(v)
+        bias = system.bias(jnp.asarray(q), jnp.asarray(still))
+        np.testing.assert_allclose(_physics(written, q, still)[1], bias, atol=1e-8)
+    np.testing.assert_allclose(written.dof_damping, [joint.damping for joint in machine.joints])
+    np.testing.assert_allclose(written.dof_frictionloss, [joint.dry for joint in machine.joints])
+    again = read_machine(tmp_path / "out.xml")
+    assert [motor[:2] for motor in again.motors] == [motor[:2] for motor in machine.motors]
+    assert again.gauges == machine.gauges
+
+
+def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_told(tmp_path):
+    spring = TorsionalSpring.of(0.8, 0.4, 0.0, 0.0, joint=2)
+    effects = (spring, Payload(jnp.asarray(0.1), joint=2), Cogging.of(0.1, 0.0, 6.0, joint=1))
+    fitted = _begun(effects, parameters={"cart.mass": Declared(1.3, 0.1), "rail.armature": Declared(0.2, 0.1)})
+    told = write_mjcf(fitted, tmp_path / "out.xml")
+    assert any(line.startswith("cogging at joint 1: amplitude = 0.1") for line in told)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert model.body("pole").mass[0] == pytest.approx(0.3)
+    assert model.body("cart").mass[0] == pytest.approx(1.3)
+    np.testing.assert_allclose([model.jnt_stiffness[1], model.qpos_spring[1]], [0.8, 0.5])
+    assert model.dof_armature[0] == pytest.approx(0.2)
+    assert "cogging" in (tmp_path / "out.xml").read_text()
+
+
+def test_coulomb_and_viscous_friction_are_read_off_a_curve():
+    v = np.linspace(-2.0, 2.0, 80)
+    dry, damping, left = coulomb_viscous(v, -0.3 * np.sign(v) - 0.2 * v, np.full(80, 0.01))
+    np.testing.assert_allclose([dry, damping, left], [0.3, 0.2, 0.0], atol=1e-9)
+    dry, damping, left = coulomb_viscous(v, 0.1 * v, np.full(80, 0.01))
+    assert (dry, damping) == (0.0, 0.0) and left == pytest.approx(1.0)  # friction never pushes
+
+
+def test_a_built_in_machine_has_no_file(tmp_path):
+    rig = declared("acrobot", paper_model())
+    t = 0.01 * np.arange(30.0)
+    logs = machine_files.Dataset(
+        t[None], np.sin(t)[None, :, None], np.stack([np.sin(t), np.cos(t)], -1)[None], np.ones((1, 30), bool)
+    )
+    with pytest.raises(ExportError, match="'acrobot' is built in, and has no file to be written back to; "):
+        write_mjcf(begin(rig, logs, key=jax.random.key(0)), tmp_path / "out.xml")
+
+
+# --- identified, from logs that MuJoCo made
+
+
+def _ahead(text: str, x: np.ndarray, u: np.ndarray, rows: int = 100) -> float:
+    """Error of the coordinates over a second, of MuJoCo with this file, from the true state of the first row."""
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep = machine_files.DT / machine_files.FINE
+    model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    model.jnt_limited[:] = 0
+    wrong = []
+    for path, push in zip(x, u, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = np.split(path[0], 2)
+        for k in range(rows):
+            data.ctrl[:] = push[k]
+            for _ in range(machine_files.FINE):
+                mujoco.mj_step(model, data)
+            wrong.append(data.qpos - path[k + 1][: model.nv])
+    return float(np.sqrt(np.mean(np.square(wrong))))
+
+
+@pytest.mark.slow
+def test_friction_of_an_unread_pole_is_found_and_the_written_file_predicts_better(tmp_path):
+    rig = _rig(parameters={"pole.mass": Declared(0.23, 0.05)})  # the owner's belief is off; the plant has 0.2
+    data, x = _logs(rig, sequences=8, rows=400)
+    fitted = identify(rig, data, key=jax.random.key(0), epochs=20)
+    cart, pole = errors(fitted.model.unknown, friction(CASES["cartpole"]), x)
+    assert cart < 0.03 and pole < 0.1
+    assert abs(float(fitted.model.system.parameter("pole.mass")) - 0.2) < 0.01
+    before = (MACHINES / "cartpole.xml").read_text().replace('mass="0.2"', 'mass="0.23"')
+    write_mjcf(fitted, tmp_path / "identified.xml")
+    logs, x = _logs(rig, sequences=4, rows=110, seed=7)
+    after = _ahead((tmp_path / "identified.xml").read_text(), x, logs.u)
+    assert after < 0.3 * _ahead(before, x, logs.u)
+    assert eqx.is_array(fitted.model.system.values["pole.mass"])

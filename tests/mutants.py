@@ -832,8 +832,8 @@ MUTANTS = (
     Mutant(
         "information of steps outside the data",
         "design/information.py",
-        "jnp.where(here.seq.active[:, None, None], columns, 0.0)",
-        "jnp.where(here.seq.active[:, None, None], 2 * columns, 0.0)",
+        "jnp.where(here.seq.active[:, None, None], jnp.concatenate(",
+        "jnp.where(~here.seq.active[:, None, None], jnp.concatenate(",
         "test_design.py::test_information_is_the_mean_square_of_the_score",
     ),
     Mutant(

@@ -17,7 +17,7 @@ from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
 from nnap_em.design.experiment import design_experiment
-from nnap_em.design.information import Contrast, Fit, contrast, information, known
+from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
 from nnap_em.design.limits import DesignError, Limits, limits_of
 from nnap_em.design.play import motions
 from nnap_em.design.questions import Apart, Told, after, share
@@ -28,6 +28,8 @@ from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import drawn_paths
 from nnap_em.em.store import load
 from nnap_em.em.weights import Weights
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs
 
 LIMITS = Limits(
@@ -106,19 +108,12 @@ def test_information_is_the_mean_square_of_the_score(fit):
 
     The torque of the node near 1 rad/s at joint 1 moves; all else stays, and the model is linear about the path.
     """
-    from nnap_em.em.local import local
-    from nnap_em.em.quadratic import friction_columns
-    from nnap_em.numerics.gaussian import Gaussian
-    from nnap_em.smoother.kalman import TANGENT, kalman_filter
-
     known_fit, data, path = fit
     model, nodes = known_fit.model, known_fit.nodes
-    seq = jax.tree.map(lambda a: jnp.asarray(a)[0], data)
+    seq, x = jax.tree.map(lambda a: jnp.asarray(a)[0], data), jnp.asarray(path[0])
     place = int(np.argmin(np.abs(np.asarray(nodes[0]) - 1.0)))
-    x = jnp.asarray(path[0])
-    here = local(model, known_fit.prior, Gaussian(x, jnp.zeros((*x.shape, 4))), seq, TANGENT)
-    column = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b)[:, place])(x[:, 2:4], here.by_force)
-    start = Gaussian(x[0], model.start.cov)
+    here, _, wide = linearised(known_fit, seq, x)
+    column, start = columns_of(known_fit, here, wide)[..., place], Gaussian(x[0], model.start.cov)
 
     def innovations(amount):
         affine = here.affine._replace(offset=here.affine.offset + amount * column)

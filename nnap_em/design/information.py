@@ -1,5 +1,6 @@
 """What a sequence would tell: expected information by the sensitivities that the fit itself uses."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..smoother.kalman import TANGENT, Filtered, ekf, kalman_filter
+from ..smoother.kalman import CUBATURE, TANGENT, Filtered, ekf, kalman_filter, linear_reading, rts
 
 
 class Fit(NamedTuple):
@@ -58,23 +59,46 @@ def _information(fit: Fit, one) -> Float[Array, "phi phi"]:
     seq, motions = one
 
     def along(x):
-        path = Gaussian(x, jnp.zeros((*x.shape, x.shape[-1])))
-        here = local(fit.model, fit.prior, path, seq, TANGENT)
-        start = Gaussian(x[0], fit.model.start.cov)
-        filtered = kalman_filter(fit.model.log_q, fit.model.log_r, start, here.affine, here.reading, here.seq)
-        jac = _sensitivities(fit, here, filtered, x)
+        here, filtered, path = linearised(fit, seq, x)
+        jac = _sensitivities(fit, here, filtered, path)
         return jac.T @ jac
 
     return jnp.mean(jax.vmap(along)(motions), axis=0)
 
 
-def _sensitivities(fit: Fit, here: Local, filtered: Filtered, x: Float[Array, "time state"]) -> Float[Array, "row phi"]:
-    """Of the whitened readings to phi."""
+def linearised(fit: Fit, seq: Dataset, x: Float[Array, "time state"]) -> tuple[Local, Filtered, Gaussian]:
+    """The model along a motion, as wide as it will be known from its readings, and the filter there.
+
+    Near rest a friction map bends within that width: a tangent would see more of it than a fit then does.
+    """
+    model, start = fit.model, Gaussian(x[0], fit.model.start.cov)
+    thin = Gaussian(x, jnp.zeros((*x.shape, x.shape[-1])))
+    tangents = jax.vmap(lambda state, u: TANGENT(model, state, u))(thin, model.inputs(seq))
+    readings = jax.vmap(lambda x, u: linear_reading(model, x, u))(x, model.inputs(seq))
+    cov = rts(kalman_filter(model.log_q, model.log_r, start, tangents, readings, prepare(model, seq))).state.cov
+    path = Gaussian(x, cov)
+    here = local(model, fit.prior, path, seq, CUBATURE)
+    return here, kalman_filter(model.log_q, model.log_r, start, here.affine, here.reading, here.seq), path
+
+
+POINTS = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
+"""Three points of the same mean and variance as a normal distribution [standard deviations]."""
+
+
+def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time state phi"]:
+    """Sensitivity of the next state to phi; friction is felt at all speeds that the path may have."""
     dof = fit.nodes.shape[0]
-    torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v[None], b))(x[:, dof : 2 * dof], here.by_force)
-    columns = jnp.concatenate([torque, here.by_parameter], axis=-1)
-    columns = jnp.where(here.seq.active[:, None, None], columns, 0.0)
-    still = jnp.zeros((*here.seq.y.shape, torque.shape[-1]), x.dtype)
+    v = path.mean[:, None, dof : 2 * dof]
+    std = jnp.sqrt(jnp.maximum(jnp.diagonal(path.cov, axis1=1, axis2=2), 0.0))[:, None, dof : 2 * dof]
+    speeds = v + std * jnp.asarray(POINTS, v.dtype)[None, :, None]
+    torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, here.by_force)
+    return jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter], axis=-1), 0.0)
+
+
+def _sensitivities(fit: Fit, here: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
+    """Of the whitened readings to phi."""
+    columns = columns_of(fit, here, path)
+    still = jnp.zeros((*here.seq.y.shape, fit.nodes.size), columns.dtype)
     readings = jnp.concatenate([still, here.reading_by_parameter], axis=-1)
     jac = whitened_sensitivities(filtered, columns, readings, here.seq.observed)
     return jac.reshape(-1, jac.shape[-1])
@@ -109,10 +133,11 @@ def _contrast(common, one):
     prepared = prepare(rival.model, seq._replace(y=jnp.where(jnp.isnan(seq.y), jnp.nan, y)))
     model, begin = rival.model, Gaussian(_with_memory(rival.model, start), rival.model.start.cov)
     about = ekf(model, begin, prepared).state.mean
-    here = local(model, rival.prior, Gaussian(about, jnp.zeros((*about.shape, about.shape[-1]))), seq, TANGENT)
+    path = Gaussian(about, jnp.zeros((*about.shape, about.shape[-1])))
+    here = local(model, rival.prior, path, seq, TANGENT)
     filtered = kalman_filter(model.log_q, model.log_r, begin, here.affine, here.reading, prepared)
     here = here._replace(seq=prepared)
-    jac, r = _sensitivities(rival, here, filtered, about), filtered.innovation.ravel()
+    jac, r = _sensitivities(rival, here, filtered, path), filtered.innovation.ravel()
     return jac.T @ jac, jac.T @ r, r @ r
 
 

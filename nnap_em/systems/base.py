@@ -38,7 +38,7 @@ class AbstractSystem(eqx.Module):
         left = {n: jnp.asarray(v, float) for n, v in cls.optional.items()}
         return cls(**{n: parameters[n] if n in parameters else left[n] for n in names}, joints=joints)
 
-    def parameter(self, name: str) -> Array:
+    def parameter(self, name: str) -> Any:
         """A parameter by the name that `rig.toml` gives it."""
         return getattr(self, name)
 

@@ -2,7 +2,7 @@
 
     python benchmarks/design.py friction --seeds 5 --out OUT     # some three minutes a seed, 2 cores
     python benchmarks/design.py apart --seeds 5 --out OUT        # some eight minutes a seed
-    python benchmarks/design.py table --out OUT > docs/design_table.md
+    python benchmarks/design.py table --out OUT                  # the tables of docs/design.md
 
 friction: an acrobot whose joint 1 is measured alone, 30 s of sines.  Then 30 s more, designed or of the same sines: how
 wide is the friction band near rest (the lowest fifth of the velocities in the first logs) as stated, and how far is it
@@ -203,13 +203,54 @@ def _told_apart(seed: int, name: str, laws: tuple[Law, Law], out: Path) -> dict[
 JOBS = {"friction": friction, "apart": apart}
 
 
+def table(out: Path) -> str:
+    """What the files in `out` say, as Markdown."""
+    rows = [json.loads(path.read_text()) for path in sorted(out.glob("friction_*.json"))]
+    lines = [
+        "| seed | joint | stated: 30 s, 30 s more, designed [mN m] | ratio | promised "
+        "| true: the same [mN m] | ratio |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    stated, true = [], []
+    for row in rows:
+        for j in range(len(row["first"]["stated"])):
+            sides = {
+                kind: [1e3 * row[s][kind][j] for s in ("first", "more", "designed")] for kind in ("stated", "true")
+            }
+            ratios = {kind: values[2] / values[1] for kind, values in sides.items()}
+            stated.append(ratios["stated"])
+            true.append(ratios["true"])
+            text = {kind: ", ".join(f"{v:.2g}" for v in values) for kind, values in sides.items()}
+            promised = 1e3 * row["expected"]["designed"][j]
+            lines.append(
+                f"| {row['seed']} | {j + 1} | {text['stated']} | {ratios['stated']:.2f} | {promised:.2g} "
+                f"| {text['true']} | {ratios['true']:.2f} |"
+            )
+    if rows:
+        broken, plays = (sum(row[name] for row in rows) for name in ("broken", "plays"))
+        means = f"Mean ratio: stated {np.mean(stated):.2f}, true {np.mean(true):.2f}."
+        lines += ["", f"{means} Limits broken: {broken} of {plays} sequences played.", ""]
+    lines += [
+        "| seed | pair | true | lead of the true law [nat]: 30 s, 30 s more, designed |",
+        "| --- | --- | --- | --- |",
+    ]
+    for path in sorted((out / "apart").glob("*.json")):
+        row = json.loads(path.read_text())
+        leads = ", ".join("-" if math.isnan(row[s]) else f"{row[s]:.1f}" for s in ("first", "more", "designed"))
+        lines.append(f"| {path.name.split('_')[0]} | {row['pair']} | {row['true']} | {leads} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Run a job for some seeds; what is done is kept."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("job", choices=[*JOBS])
+    arguments.add_argument("job", choices=[*JOBS, "table"])
     arguments.add_argument("--seeds", type=int, default=5)
     arguments.add_argument("--out", type=Path, required=True)
     args = arguments.parse_args()
+    if args.job == "table":
+        print(table(args.out))
+        return
     common.set_up()
     for seed in range(1, args.seeds + 1):
         file = args.out / f"{args.job}_{seed}.json"

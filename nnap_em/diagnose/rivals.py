@@ -22,7 +22,7 @@ from .refit import Trial, refit
 from .screen import score_test
 
 STARTS = 3
-"""Places from which a law is fitted."""
+"""Places from which a law is fitted; one that is not linear, from all that there are."""
 PASSES = 10
 """Passes of a fit from one of them, more than in a search: rivals are compared closely."""
 EVEN = 5.0
@@ -47,7 +47,8 @@ def instead(
     around = surroundings(fitted.rig, question.model, question.data, question.path, question.rows)
     same = [one for one in proposals(around, question.model.effects) if means(one.start)]
     trials = []
-    for entry in sorted(score_test(question, same).screened, key=lambda s: -s.gain)[:STARTS] if same else ():
+    screened = sorted(score_test(question, same).screened, key=lambda s: -s.gain) if same else []
+    for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
         full = question.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
         path = extended(full.model, question.path, question.data)
         trials.append(refit(full.model, full.m_step.early(), path, question.data, question.used, passes=PASSES))

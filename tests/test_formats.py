@@ -17,7 +17,7 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig
-from nnap_em.em.identify import Identified
+from nnap_em.systems import specs
 
 RIG = Rig("bench", "acrobot", {}, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
 
@@ -167,5 +167,5 @@ def test_predictions_of_such_logs_are_csv_files(tmp_path):
     _parquet(tmp_path / "logs/01.parquet", _log())
     logs = read_logs(tmp_path / "logs", RIG)
     values = np.zeros((1, 50, 4))
-    write_states(tmp_path / "out", logs, Identified(RIG, *[None] * 4), values, values)
+    write_states(tmp_path / "out", logs, specs["acrobot"].states, values, values)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["01.csv"]

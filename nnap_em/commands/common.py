@@ -21,7 +21,6 @@ from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..design.limits import DesignError
 from ..em.build import build_system, measure_scales
 from ..em.check import BAD, torques
-from ..em.identify import Identified
 from ..em.loop import FitError
 from ..em.predict import GIVEN
 from ..em.store import fingerprint
@@ -101,16 +100,14 @@ def read_bench(folder: Path, trust: bool, more: Sequence[Path] = ()) -> Bench:
 
 
 def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
-    """The training logs of some folders: those in train/, or in the folder itself where it has none."""
-    parts = {folder.name: read_logs(within(folder), rig, trust=trust) for folder in folders}
+    """The training logs of a data set, and of further folders: those in train/, or in the folder itself."""
+    first, *more = folders
+    places = [first / "train", *(folder if has_logs(folder) else folder / "train" for folder in more)]
+    names = (folder.resolve().name for folder in folders)
+    parts = {name: read_logs(place, rig, trust=trust) for name, place in zip(names, places, strict=True)}
     if len(parts) < len(folders):
         raise DataError(f"{folders[0]}: two of the folders have one name; rename one: files are told by their folders")
     return together(parts)
-
-
-def within(folder: Path) -> Path:
-    """Where the training logs of a folder are."""
-    return folder if has_logs(folder) and not (folder / "train").is_dir() else folder / "train"
 
 
 def warn_of_torques(folder: Path, bench: Bench) -> None:
@@ -131,9 +128,8 @@ def model_file(path: Path) -> Path:
     return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
 
 
-def write_states(folder: Path, logs: Logs, fitted: Identified, mean, std) -> None:
+def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:
     """One file per sequence; a value that is no number becomes an empty field, and is told."""
-    states = fitted.model.system.coordinates + fitted.model.system.rates
     for i, file in enumerate(logs.files):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)

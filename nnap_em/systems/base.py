@@ -38,6 +38,11 @@ class AbstractSystem(eqx.Module):
         left = {n: jnp.asarray(v, float) for n, v in cls.optional.items()}
         return cls(**{n: parameters[n] if n in parameters else left[n] for n in names}, joints=joints)
 
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Coordinates, then rates."""
+        return self.coordinates + self.rates
+
     def parameter(self, name: str) -> Any:
         """A parameter by the name that `rig.toml` gives it."""
         return getattr(self, name)

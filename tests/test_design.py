@@ -24,11 +24,13 @@ from nnap_em.design.questions import Apart, Told, after, share
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
+from nnap_em.diagnose.residual import names_of
 from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import drawn_paths
 from nnap_em.em.store import load
 from nnap_em.em.weights import Weights
 from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.report.design_plots import motion_figure
 from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs
 
@@ -339,3 +341,12 @@ def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
     path.write_text((slide[0] / "rig.toml").read_text() + "\n" + lines + "\n")
     with pytest.raises(RigError, match=reason):
         read_rig(path, specs)
+
+
+def test_the_figure_shows_all_of_every_input(slide):
+    """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
+    *_, data, fitted = slide
+    design = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], design.u.shape)
+    low, high = motion_figure(design._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
+    assert low < 0.01 and high > 3.0

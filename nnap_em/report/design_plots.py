@@ -46,11 +46,9 @@ def motion_figure(design: Design, names: Names, which: Sequence[int]) -> Figure:
     figure = Figure(figsize=(3.3 * max(len(which), 2), 0.6 + 1.35 * rows), layout="constrained")
     grid = figure.subplots(rows, len(which), sharex=True, sharey="row", squeeze=False)
     for column, i in enumerate(which):
-        for ax, u, low, high in zip(
-            grid[:, column], design.u[i].T, design.limits.low, design.limits.high, strict=False
-        ):
-            ax.step(design.t, u, where="post", color=ZERO, label="to be played")
-            _fence(ax, low, high, [u])
+        for k, ax in enumerate(grid[: len(inputs), column]):
+            ax.step(design.t, design.u[i, :, k], where="post", color=ZERO, label="to be played")
+            _fence(ax, design.limits.low[k], design.limits.high[k], [design.u[..., k]])
         for s, ax in enumerate(grid[len(inputs) :, column]):
             low, middle, high = (band[i, :, s] for band in (design.low, design.middle, design.high))
             ax.fill_between(design.t, low, high, color=AFTER, alpha=0.25, lw=0, label="98 % of motions")

@@ -2,8 +2,8 @@
 
 The rig is simulated by `plant.py`, which shares no code with the library: an acrobot whose second joint nobody
 measures and whose drive acts a little late.  Six sequences of sines hardly tell a delay of .4 samples from a lag: by
-some 5 nats.  `nnap-em design` proposes six more, the plant plays them, and old and new logs are diagnosed together.  Written into
-`out/next_experiment/`: the logs, both reports and the design.
+some 5 nats.  `nnap-em design` proposes six more, the plant plays them, and old and new logs are diagnosed together.
+Written into `out/next_experiment/`: the logs, both reports and the design.
 
     python examples/next_experiment.py                             # some six minutes on two cores
     python examples/next_experiment.py --effect actuator_lag       # the other law as the true one

@@ -1,6 +1,7 @@
 """Topics with clocks of their own on one grid: closed forms, round trips, gaps, delays; what cannot be is refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2,
 from nnap_em.commands import cli
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
+from nnap_em.data.machine import unpacked
 from nnap_em.data.recordings.delays import Pair, delay
 from nnap_em.data.recordings.pieces import cut
 from nnap_em.data.recordings.signals import Signal, averaged, held, integrals, interpolated
@@ -460,3 +462,23 @@ def test_what_is_left_of_a_cut_log_is_imported_and_told(tmp_path, capsys):
     u = _table(tmp_path / "out/train/000.csv")[:, 1]
     assert 50 < u.size < 300
     np.testing.assert_allclose(u, np.cos(T[: u.size]), rtol=1e-11)
+
+
+def test_a_machine_from_a_file_is_imported_and_found_from_the_new_folder(tmp_path):
+    """Its states are those of the file, which the new rig.toml reaches where it is."""
+    examples = Path(__file__).resolve().parents[1] / "examples" / "machines"
+    for name in ("cartpole.toml", "cartpole.xml"):
+        (tmp_path / name).write_text((examples / name).read_text())
+    rig = read_rig(tmp_path / "cartpole.toml", specs)
+    t = rig.dt * np.arange(200)
+    names = (*rig.input_columns, *rig.measured)
+    rows = np.column_stack([t, *(np.sin((i + 1) * t) for i in range(len(names)))])
+    header = ",".join(("time", *names))
+    np.savetxt(tmp_path / "log.csv", rows, fmt="%.9g", delimiter=",", header=header, comments="")
+    out = tmp_path / "deep" / "bench"
+    words = ("import", tmp_path / "log.csv", "--rig", tmp_path / "cartpole.toml", "--out", out, "--test", "0")
+    assert cli.main([str(word) for word in words]) == 0
+    again = read_rig(out / "rig.toml", specs)
+    one, other = unpacked(again.machine), unpacked(rig.machine)
+    assert (Path(one.file).name, one._replace(file="")) == (other.file, other._replace(file=""))
+    assert read_logs(out / "train", again).data.y.shape[-1] == len(rig.measured)

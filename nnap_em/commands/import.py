@@ -1,12 +1,17 @@
 """nnap-em import: logs as machines write them, brought to one grid as a data set."""
 
 import argparse
+import os
+import re
 import time
+import tomllib
+from pathlib import Path
 
 from ..data.recordings.bring import Brought, bring
 from ..data.recordings.declared import read_plan
 from ..data.recordings.folder import completed, places, write_sequences
-from ..data.rig import read_rig
+from ..data.rig import read_rig, toml_text
+from ..em.build import build_system
 from ..report.imported import describe, write_page
 from ..storage.files import replace_text, whole_folder
 from ..systems import specs
@@ -22,11 +27,12 @@ def run(args: argparse.Namespace, say: Say) -> None:
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:
-            logs.append(bring(path, rig, specs[rig.system].states, plan, shifts))
+            logs.append(bring(path, rig, build_system(rig).states, plan, shifts))
             say(f"{path}: {_told(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
-        replace_text(part / "rig.toml", completed(args.rig.read_text(encoding="utf-8-sig"), logs[0].addresses))
+        text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
+        replace_text(part / "rig.toml", completed(text, logs[0].addresses))
         document = describe(logs, files, rig, plan, shifts, seconds=time.perf_counter() - began)
         write_page(part, document)
     for line in document["look"]:
@@ -35,6 +41,15 @@ def run(args: argparse.Namespace, say: Say) -> None:
     say(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
 
 
+def _reaching(text: str, here: Path, out: Path) -> str:
+    """A rig.toml that finds its machine file, which stays where it is, from another folder."""
+    file = tomllib.loads(text)["model"].get("file")
+    if file is None:
+        return text
+    path = toml_text(os.path.relpath(here / file, out))
+    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda found: found[1] + path, text, count=1)
+
+
 def _told(log: Brought) -> str:
     used = [stretch for stretch in log.sequences if not stretch.why]
-    return f"{len(used)} sequences, {sum(stretch.rows for stretch in used)} of {log.rows} rows"
+    return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

@@ -747,10 +747,17 @@ MUTANTS = (
     ),
     Mutant(
         "a posterior wider than its prior",
-        "em/multistep.py",
+        "em/stated.py",
         "prior + half @ np.linalg",
         "half @ np.linalg",
-        "test_fit.py::test_recordings_that_disagree_widen_a_posterior_but_not_its_prior",
+        "test_fit.py::test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_its_prior",
+    ),
+    Mutant(
+        "forces unsaid larger than the errors tell",
+        "em/stated.py",
+        "noise = np.maximum(whole -",
+        "noise = np.maximum(whole - 0 *",
+        "test_fit.py::test_the_size_of_forces_unsaid_is_that_which_made_the_errors",
     ),
     Mutant(
         "shape of friction pushed away from",

@@ -12,7 +12,7 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnose import refit as refits
-from nnap_em.em import identify, loop, multistep
+from nnap_em.em import identify, loop, multistep, stated
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import ScoringMStep
@@ -173,19 +173,63 @@ def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(mo
 
 
 @pytest.mark.parametrize(("apart", "slope"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.1), (2.0, 30.0)])
-def test_recordings_that_disagree_widen_a_posterior_but_not_its_prior(monkeypatch, apart, slope):
+@pytest.mark.parametrize("force", [0.0, 0.3])
+def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_its_prior(
+    monkeypatch, apart, slope, force
+):
     """One parameter of prior precision 1 and likelihood precision L: H = 1 + 1 / (1 / L + V), in closed form."""
     errors = apart * np.array([1.0, -1.0, 2.0, -2.0])[:, None, None, None] * np.ones((4, 3, 2, 1))
     nodes = RULE.weights(MODEL).nodes.size
     columns = slope * np.concatenate([np.zeros((*errors.shape, nodes)), np.ones((*errors.shape, 1))], axis=-1)
-    told, every, likelihood = Forks(errors, columns, np.ones(2)), np.ones(4, bool), 50.0
-    monkeypatch.setattr(multistep, "forks", lambda *_: told)
-    found = multistep.robust_hessian(MODEL, RULE, PATH, DATA, every, jnp.full((1, 1), 1.0 + likelihood))
+    pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
+    told, every, likelihood = (
+        Forks(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2)),
+        np.ones(4, bool),
+        50,
+    )
+    monkeypatch.setattr(stated, "unsaid", lambda *_, **__: None)
+    monkeypatch.setattr(stated, "forks", lambda *_: told)
+    monkeypatch.setattr(stated, "size", lambda *_: force)
+    hessian = jnp.full((1, 1), 1.0 + likelihood)
+    found = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     weight = multistep.weighed(told, every)
     scores = slope * np.sum(weight * errors, axis=(1, 2, 3))
-    spread = np.sum((scores - scores.mean()) ** 2) * 4 / 3 / (1.0 + slope**2 * weight.sum()) ** 2
+    disagree = np.sum((scores - scores.mean()) ** 2) * 4 / 3
+    shared = force**2 * (1 + 4) * (slope * weight.sum()) ** 2
+    spread = (disagree + shared) / (1.0 + slope**2 * weight.sum()) ** 2
     assert float(found[0, 0]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
     assert 1.0 <= float(found[0, 0]) <= 1.0 + likelihood + 1e-9
+
+
+def _left(rng, tau: float) -> stated.Errors:
+    """Errors of one parameter, forces of a size, and noise of weight 4."""
+    own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
+    error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
+    return stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
+
+
+@pytest.mark.parametrize("tau", [0.03, 0.3])
+def test_the_size_of_forces_unsaid_is_that_which_made_the_errors(tau):
+    rng = np.random.default_rng(0)
+    sizes = [stated.size(here, 1.0 + 4.0 * here.own.T @ here.own) for here in (_left(rng, tau) for _ in range(8))]
+    assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
+
+
+def test_noise_alone_tells_of_no_forces():
+    rng = np.random.default_rng(1)
+    sizes = [stated.size(here, 1.0 + 4.0 * here.own.T @ here.own) for here in (_left(rng, 0.0) for _ in range(8))]
+    assert min(sizes) == 0.0  # in half of the cases some is likelier by chance
+    assert max(sizes) < 3 * 0.5 / np.sqrt(2000)  # how well the size of one force is told
+
+
+def test_forces_unsaid_are_as_large_as_asked_at_every_state():
+    """They are features of a Gaussian process of unit variance, in units of the scale of each joint."""
+    rng = np.random.default_rng(2)
+    path = Gaussian(jnp.asarray(rng.normal(size=(4, 9, 2))), PATH.cov)
+    weights = RULE.weights(MODEL)
+    many = [stated.unsaid(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i)).force for i in range(20)]
+    variance = np.mean([np.sum(np.square(force), axis=1) for force in many], axis=0)
+    np.testing.assert_allclose(variance, float(weights.asymmetry[0]) ** 2, rtol=0.2)
 
 
 class _CurvatureRule(NamedTuple):
@@ -212,7 +256,7 @@ def _finished(monkeypatch, error):
 
     fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
     fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
-    fakes["robust_hessian"] = lambda *args: 2 * args[-1]
+    fakes["widened"] = lambda *args, key: 2 * args[-1]
     for name, value in fakes.items():
         monkeypatch.setattr(identify, name, value)
     smoother = SimpleNamespace(tolerant=lambda: None)

@@ -46,7 +46,7 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     """Share of the expected information of the `logs` of a fit that the fit itself owns up to.
 
     Where noise is what the model says it is one; on a real machine recordings disagree, the fit says so by a wider
-    posterior (`em.multistep.robust_hessian`), and new logs will tell as much less.
+    posterior (`em.stated.widened`), and new logs will tell as much less.
     """
     before, now = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
     counts = now > 1e-12 * now.max()

@@ -20,9 +20,10 @@ from ..smoother.start import StartBank
 from .build import build, build_system
 from .loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
 from .mstep import ScoringMStep, kept
-from .multistep import FALLS, errors, finish, ratio, robust_hessian
+from .multistep import FALLS, errors, finish, ratio
 from .noise import white_readings
 from .scale import holding, untold
+from .stated import widened
 from .weights import Weights
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]
@@ -144,7 +145,8 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
-    hessian = robust_hessian(fitted.model, fitted.m_step, path, data, used, fitted.state.hessian)
+    now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
+    hessian = widened(*now, key=jax.random.key(0))
     return fitted._replace(state=fitted.state._replace(hessian=hessian))
 
 

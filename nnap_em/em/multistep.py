@@ -5,7 +5,6 @@ filter up to the start and of the open loop from there on, so that the errors ar
 """
 
 import itertools
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -282,41 +281,6 @@ def finish(
         else:
             break
     return model
-
-
-def robust_hessian(
-    model: StateSpaceModel,
-    m_step: ScoringMStep,
-    path: Gaussian,
-    data: Dataset,
-    used: Bool[np.ndarray, " seq"],
-    hessian: Float[Array, "weight weight"],
-) -> Float[Array, "weight weight"]:
-    """Posterior precision that owns up to how much recordings disagree: where noise is not what the model says, a
-    likelihood is too sure of itself.
-
-        H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s') A^-1
-
-    with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s and A its information,
-    that of the prior with it. Nothing becomes less certain than the prior.
-    [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters;
-    Muller 2013, Econometrica 81, 1805, for the prior]
-    """
-    weights = m_step.weights(model)
-    now = forks(model, weights, path, data)
-    weight = weighed(now, used)
-    rows = np.where(weight[..., None] > 0, now.columns, 0.0).astype(float)
-    pulled = weight * np.where(weight > 0, now.error, 0.0)
-    scores = np.einsum("skhoc,skho->sc", rows, pulled)[used]
-    flat = rows.reshape(-1, rows.shape[-1])
-    information = (flat * weight.reshape(-1, 1)).T @ flat
-    prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
-    moved = np.linalg.solve(prior + jac.T @ information @ jac, jac.T @ (scores - scores.mean(axis=0)).T)
-    count = scores.shape[0]
-    told, turn = np.linalg.eigh(np.asarray(hessian) - prior)
-    half = turn * np.sqrt(np.maximum(told, 0.0))  # L = half half'
-    across = half.T @ moved * math.sqrt(count / max(count - 1, 1))
-    return jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
 
 
 @eqx.filter_jit

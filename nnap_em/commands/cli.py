@@ -44,6 +44,7 @@ examples:
   nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
   nnap-em init log.csv --out bench
   nnap-em init run.mcap --system acrobot --out bench    with a table [import] of what was found where
+  nnap-em init run.mcap --model arm.xml --out bench     joints, motors and sensors by the names of the file
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
@@ -157,7 +158,11 @@ def parser() -> argparse.ArgumentParser:
 
     init = command("init", "write a first rig.toml for a log", _INIT)
     init.add_argument("log", metavar="LOG", type=Path, help="a CSV file with a header, MCAP or HDF5")
-    init.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    machine = init.add_mutually_exclusive_group()
+    machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    machine.add_argument(
+        "--model", metavar="FILE", type=Path, help="the machine as MJCF or URDF, which stays where it is"
+    )
     init.add_argument(
         "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
     )

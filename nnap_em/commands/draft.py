@@ -1,7 +1,7 @@
 """A first rig.toml from the header and the numbers of a log; what cannot be read stands as a commented line."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,7 +38,7 @@ _PARAMETERS = {
     "Ir": "rotor inertia of the drives",
     "gr": "gear ratio of the drives",
 }
-_HEAD = """\
+HEAD = """\
 format = 1
 name = {name}
 
@@ -75,14 +75,14 @@ def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Dr
 
     Raises DataError where the log cannot be read or the system not be told.
     """
-    return drafted(path, _numbers(path), system, specs)
+    return drafted(path, numbers(path), system, specs)
 
 
 def drafted(
     path: Path, table: Mapping[str, Float[np.ndarray, " time"]], system: str | None, specs: Mapping[str, SystemSpec]
 ) -> Draft:
     """The rig.toml that columns of a log call for."""
-    columns = _from_one([meaning(name) for name in table])
+    columns = from_one([meaning(name) for name in table])
     system = system or _system(path, columns, specs)
     spec = specs[system]
     measured = [name for name in table if name in spec.states]
@@ -90,13 +90,13 @@ def drafted(
     lines = [
         *_model(system, spec),
         *_input(spec, columns),
-        *_sampling(table, columns),
-        *_measurement(table, measured, spec),
+        *sampling(table, columns),
+        *measurement(table, measured, spec),
     ]
-    return Draft("\n".join([_HEAD.format(name=name), *lines]) + "\n", tuple(_notes(columns, spec)))
+    return Draft("\n".join([HEAD.format(name=name), *lines]) + "\n", tuple(_notes(columns, spec)))
 
 
-def _numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
+def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns of a CSV file that hold numbers; NaN where a field is empty."""
     if path.suffix.lower() != ".csv":
         raise DataError(f"{path}: its name does not end in .csv; give a CSV file")
@@ -125,7 +125,7 @@ def meaning(name: str) -> _Column:
     return _Column(name, "", None, "")
 
 
-def _from_one(columns: Sequence[_Column]) -> list[_Column]:
+def from_one(columns: Sequence[_Column]) -> list[_Column]:
     """The joints of states, and those of inputs, counted from 1 where names count them from 0."""
     shift = {c.kind == "input" for c in columns if c.number == 0}
 
@@ -180,7 +180,8 @@ def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
     yield f"{mark}joints = {joints}    # the joint that each drives, counted from 1; such as [1]"
 
 
-def _sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Iterator[str]:
+def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Iterator[str]:
+    """The interval of the rows, where they have one, and the clock."""
     yield from ("", "[sampling]")
     time = next((column for column in columns if column.kind == "time"), None)
     t = table[time.name] * {"ms": 1e-3, "us": 1e-6}.get(time.unit, 1.0) if time else np.zeros(2)
@@ -196,7 +197,13 @@ def _sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> It
     yield f'clock = "{clock}"    # "sequence": time starts at 0 in each file; "session": it runs on over all files'
 
 
-def _measurement(table: Mapping[str, np.ndarray], measured: Sequence[str], spec: SystemSpec) -> Iterator[str]:
+def measurement(
+    table: Mapping[str, np.ndarray],
+    measured: Sequence[str],
+    spec: SystemSpec,
+    unit: Callable[[str], str] = parameter_unit,
+) -> Iterator[str]:
+    """What is read, its noise, and the state in the first row."""
     yield from ("", "[measurement]")
     names = f"[{', '.join(map(toml_text, measured))}]"
     states = ", ".join(map(toml_text, spec.states))
@@ -205,11 +212,11 @@ def _measurement(table: Mapping[str, np.ndarray], measured: Sequence[str], spec:
     for name in measured:
         noise = reading_noise(table[name][None])
         sure = 0 < noise < 0.3 * np.nanstd(table[name])
-        yield f"{'' if sure else '# '}{name} = {noise:.2g}    # {parameter_unit(name)}"
+        yield f"{'' if sure else '# '}{name} = {noise:.2g}    # {unit(name)}"
     yield from ("", "[start]    # the state in the first row, where it is known but not measured")
     for name in spec.states:
         if name not in measured:
-            yield f"# {name} = {{ mean = 0.0, std = 0.5 }}    # {parameter_unit(name)}; may be left out"
+            yield f"# {name} = {{ mean = 0.0, std = 0.5 }}    # {unit(name)}; may be left out"
 
 
 def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:

@@ -15,7 +15,7 @@ from .draft import Draft, drafted, meaning
 
 ROWS = 100_000
 """Of the log that are looked at for its interval and its noise."""
-_COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
+COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
 
 
 def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
@@ -29,8 +29,8 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
         names = ", ".join(topic.name for topic in topics) or "none"
         mend = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {mend}")
-    made = drafted(path, _table(path, found), system, specs)
-    lines = [f"# not used: {each}" for each in _others(topics, found)]
+    made = drafted(path, columns_table(path, found), system, specs)
+    lines = [f"# not used: {each}" for each in others(topics, found)]
     lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if f'"{name}"' in made.text]
     head = "\n[import.columns]    # where each column is in the log\n"
     return made._replace(text=made.text + head + "\n".join(lines) + "\n")
@@ -44,9 +44,9 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
         names = {joint: f"theta{i}" for i, joint in enumerate(joints, 1)}
         for column, at in (*joint_columns(topic, names).items(), *_called(topic)):
             out.setdefault(column, at)
-    commands = {f"tau{i}": at for i, at in enumerate(_commands(topics), 1)}
+    told = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
     efforts = {f"tau{i}": at for i, at in enumerate(_efforts(topics), 1)}
-    return out | ({} if any(meaning(name).kind == "input" for name in out) else commands or efforts)
+    return out | ({} if any(meaning(name).kind == "input" for name in out) else told or efforts)
 
 
 def joints_of(topic: Topic) -> list[str]:
@@ -61,9 +61,9 @@ def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Add
     return {column: Address(topic.name, field) for column, field in wanted if field in topic.fields}
 
 
-def _commands(topics: Sequence[Topic]) -> list[Address]:
+def commands(topics: Sequence[Topic]) -> list[Address]:
     """Entries of an array on a topic whose name is that of torques."""
-    return [Address(t.name, field) for t in topics if _COMMAND.search(t.name) for field in t.fields
+    return [Address(t.name, field) for t in topics if COMMAND.search(t.name) for field in t.fields
             if re.fullmatch(r"data(\[\d+\])?", field)]  # fmt: skip
 
 
@@ -80,14 +80,14 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
             yield (word if told.kind == "input" else told.kind), Address(topic.name, field)
 
 
-def _others(topics: Sequence[Topic], found: Mapping[str, Address]) -> list[str]:
+def others(topics: Sequence[Topic], found: Mapping[str, Address]) -> list[str]:
     """Topics of numbers that no column is from."""
     used = {at.topic for at in found.values()}
     return [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in topics if t.fields and
             t.name not in used][:10]  # fmt: skip
 
 
-def _table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+def columns_table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
     wanted: dict[str, list[str]] = {}
     for at in found.values():

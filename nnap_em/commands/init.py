@@ -7,6 +7,7 @@ from ..storage.files import replace_text
 from ..systems import specs
 from .common import Say
 from .draft import draft
+from .draft_machine import draft_machine
 from .draft_recorded import draft_recorded
 
 
@@ -16,7 +17,10 @@ def run(args: argparse.Namespace, say: Say) -> None:
     path = (args.out or home) / "rig.toml"
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
-    found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
+    if args.model is not None:
+        found = draft_machine(args.log, args.model, path.parent)
+    else:
+        found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
     replace_text(path, found.text)
     for note in found.notes:
         say(f"in the log: {note}")

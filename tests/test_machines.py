@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from machines import arm, tree
 
+from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
 from nnap_em.data.mjcf import read_machine
 from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig, write_rig
-from nnap_em.em.build import build_system
+from nnap_em.em.build import build, build_system
 from nnap_em.em.felt import felt, sentences
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
@@ -161,6 +162,18 @@ def test_names_inputs_and_uncertain_numbers_are_those_of_the_file(tmp_path):
         "rad/s", "kg", "m", "kg m^2",
     ]  # fmt: skip
     assert float(system.parameter("link3.inertia.yy")) == pytest.approx(0.9 * 0.015)
+
+
+@pytest.mark.parametrize(
+    ("joints", "read", "starts"), [(2, 2, 25), (2, 1, 325), (3, 3, 1), (3, 2, 65), (6, 6, 1), (6, 5, 65)]
+)
+def test_starts_that_are_tried_do_not_grow_with_the_joints_that_are_read(joints, read, starts, tmp_path):
+    """5 for a rate, 13 for an angle; of two joints the whole grid."""
+    rig = read_rig(_rig(tmp_path, arm(joints), measured=[f"joint{i + 1}" for i in range(read)]), specs)
+    t = 0.01 * np.arange(50.0)
+    y = np.tile(2.0 * np.sin(4.0 * t)[None, :, None], (2, 1, read))
+    logs = Dataset(np.tile(t, (2, 1)), np.zeros((2, 50, joints)), y, np.ones((2, 50), bool))
+    assert build(rig, logs, key=jax.random.key(0)).bank.offsets.shape == (starts, 2 * joints)
 
 
 def test_written_rig_reads_the_same(tmp_path):

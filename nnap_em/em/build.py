@@ -1,5 +1,6 @@
 """From what the owner declares and the logs to the model that EM starts from; every scale comes from one of the two."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -178,12 +179,23 @@ def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
     )
 
 
+FEW, MOST = 25, 325
+"""Hypotheses of the rates of joints that are read, and of all states, at most: two rows of readings tell such a rate as
+well, and n joints would have 5^n of them."""
+
+
 def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:
-    """Hypotheses for each unmeasured state that the prior leaves wide: angles beyond .1 rad, rates that move as far."""
+    """Hypotheses for each unmeasured state that the prior leaves wide: angles beyond .1 rad, rates that move as far.
+
+    None for the rates of joints that are read, where they would be more than `FEW`, or all more than `MOST`.
+    """
     spread = np.sqrt(np.diag(np.asarray(model.start.cov)))
     dof = len(system.coordinates)
     counts = []
     for i, name in enumerate(states):
         wide = spread[i] * (0.2 if i >= dof else 1.0) > 0.1
         counts.append((5 if i >= dof else 13) if wide and name not in rig.measured and system.angles[i % dof] else 1)
+    told = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
+    if math.prod(counts[i] for i in told) > FEW or math.prod(counts) > MOST:
+        counts = [1 if i in told else count for i, count in enumerate(counts)]
     return StartBank(tuple(counts))

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from nnap_em.numerics.parallel import each
 from nnap_em.numerics.profile import profiling
 
 
@@ -24,3 +25,17 @@ def test_what_is_compiled_afterwards_is_not_counted():
         pass
     jax.jit(lambda x: x + 1)(jnp.arange(7))
     assert not profile.spent
+
+
+def _scaled(common, one):
+    return common * one
+
+
+def test_a_program_for_every_sequence_is_compiled_once_whether_or_not_its_arrays_are_bound_to_a_device():
+    free, batch = jnp.asarray(2.0), jnp.arange(3.0)
+    bound = jax.device_put(free, jax.local_devices()[0])  # as the M-step hands its model back
+    first = each(_scaled, free, batch)
+    with profiling() as profile:
+        again = each(_scaled, bound, batch)
+    assert not profile.spent
+    assert jnp.array_equal(first, again)

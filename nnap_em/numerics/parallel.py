@@ -79,6 +79,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         index = np.minimum(np.arange(whole), count - 1)
         batch = jax.tree.map(lambda a: a[index], batch)
     if mesh is None:
+        common, batch = at_home((common, batch))
         out = _program(function)(None, group, common, batch)
     else:
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))

@@ -58,6 +58,18 @@ def test_symmetric_keeps_the_quadratic_form():
     np.testing.assert_allclose(np.einsum("i,bij,j->b", x, s, x), np.einsum("i,bij,j->b", x, a, x), rtol=1e-12)
 
 
+@pytest.mark.parametrize("dim", [4, 12])
+def test_nothing_asks_lapack(dim):
+    """Two batches of its Cholesky factors at once hang on two cores (jaxlib 0.10)."""
+
+    def all_of_it(a):
+        factor = cholesky(a)
+        return lower(factor), upper_solve(factor, a), spd_solve(a, a)
+
+    told = str(jax.make_jaxpr(jax.vmap(all_of_it))(jnp.zeros((3, dim, dim))))
+    assert "cholesky[" not in told and "triangular_solve[" not in told
+
+
 @pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
 def test_cubature_has_the_moments_of_a_normal(dim):
     x = np.asarray(cubature(dim, float))
@@ -71,7 +83,7 @@ def test_cubature_has_the_moments_of_a_normal(dim):
 
 @pytest.mark.parametrize("dim", [4, 12])
 def test_product_and_upper_solve_are_numpys(dim):
-    """Unrolled, and beyond `WIDE` by LAPACK."""
+    """Unrolled, and beyond `WIDE` in loops."""
     a, b = _spd(dim, dim), np.random.default_rng(3).normal(size=(dim, 2))
     np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b)), a @ b, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b[:, 0])), a @ b[:, 0], rtol=1e-10, atol=1e-10)

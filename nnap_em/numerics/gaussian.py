@@ -1,4 +1,8 @@
-"""Small dense Gaussian algebra, unrolled so that it vectorises over sequences and particles; LAPACK if it is large."""
+"""Small dense Gaussian algebra that vectorises over sequences and particles: unrolled, or in loops if it is large.
+
+Not by LAPACK: two batches of `jnp.linalg.cholesky` at once wait for ever for each other's threads on a machine of two
+cores (jaxlib 0.10), and each matrix by itself is slow.
+"""
 
 from typing import NamedTuple
 
@@ -17,7 +21,7 @@ class Gaussian(NamedTuple):
 
 
 WIDE = 8
-"""States beyond which nothing is unrolled: a program of the machine's own loops compiles in seconds, not in minutes."""
+"""States beyond which nothing is unrolled: a loop over the columns compiles in seconds, not in minutes."""
 Factor = list[list[Float[Array, ""]]] | Float[Array, "dim dim"]
 """Rows of scalars, or beyond `WIDE` states a matrix."""
 
@@ -26,7 +30,7 @@ def cholesky(a: Float[Array, "dim dim"]) -> Factor:
     """Lower factor L of a = L L' (`dim` is static)."""
     n = a.shape[0]
     if n > WIDE:
-        return jnp.linalg.cholesky(a)
+        return _factor(a)
     rows: list[list[Float[Array, ""]]] = []
     for i in range(n):
         row = []
@@ -62,7 +66,7 @@ def product(a: Float[Array, "row inner"], b: Float[Array, "inner *column"]) -> F
 def upper_solve(rows: Factor, b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
     """Solution x of L' x = b for the factor of `cholesky`."""
     if not isinstance(rows, list):
-        return jax.scipy.linalg.solve_triangular(rows, b, trans=1, lower=True)
+        return _backward(rows, b)
     n = len(rows)
     x: list = [None] * n
     for i in reversed(range(n)):
@@ -80,7 +84,7 @@ def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Fl
     """
     n = a.shape[0]
     if n > WIDE:
-        return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(a), True), b)
+        return _eliminated(a, b)
     factor: list[list] = []  # L D by rows
     inverse: list = []  # of D
     z: list = []
@@ -101,6 +105,42 @@ def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Fl
         for m in range(i + 1, n):
             z[i] = z[i] - inverse[i] * factor[m][i] * z[m]
     return jnp.stack(z)
+
+
+def _factor(a: Float[Array, "dim dim"]) -> Float[Array, "dim dim"]:
+    """`cholesky`, a column at a time off what is left."""
+    place = jnp.arange(a.shape[0])
+
+    def step(left, k):
+        column = jnp.where(place < k, 0.0, left[:, k] / jnp.sqrt(left[k, k]))
+        return left - column[:, None] * column[None, :], column
+
+    return jax.lax.scan(step, a, place)[1].T
+
+
+def _backward(factor: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
+    """`upper_solve`, an entry at a time off what is left."""
+    wide = b.reshape(b.shape[0], -1)
+
+    def step(left, slices):
+        row, k = slices
+        x = left[k] / row[k]
+        return left - row[:, None] * x[None, :], x
+
+    return jax.lax.scan(step, wide, (factor, jnp.arange(b.shape[0])), reverse=True)[1].reshape(b.shape)
+
+
+def _eliminated(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Float[Array, "dim *columns"]:
+    """`spd_solve` by Gauss-Jordan elimination, which needs no pivots here [Higham 2002, sec. 14.4]."""
+    place = jnp.arange(a.shape[0])
+
+    def step(both, k):
+        row = both[k] / both[k, k]
+        rest = both - both[:, k][:, None] * row[None, :]
+        return jnp.where((place == k)[:, None], row[None, :], rest), None
+
+    both = jnp.concatenate([a, b.reshape(b.shape[0], -1)], axis=1)
+    return jax.lax.scan(step, both, place)[0][:, a.shape[0] :].reshape(b.shape)
 
 
 def symmetric(a: Float[Array, "*batch dim dim"]) -> Float[Array, "*batch dim dim"]:

@@ -1,0 +1,196 @@
+"""Friction of every joint of an industrial arm of which all joints are read: declared by its file, logs from MuJoCo.
+
+    python benchmarks/arm.py [--joints 6] [--seeds 3]
+    python benchmarks/arm.py --lacks payload --out OUT      # logs for `nnap-em diagnose OUT`, and no fit
+
+The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
+of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
+where the cache of compiled programs (XDG_CACHE_HOME) is empty.
+"""
+
+import argparse
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+from machines import arm
+
+from nnap_em import identify
+from nnap_em.commands.common import set_up
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.formats import write_csv
+from nnap_em.data.rig import Rig, read_rig
+from nnap_em.systems import specs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+from machine_files import DT, FINE, errors
+
+SEQUENCES, ROWS = 10, 501
+NOISE = 1e-3
+"""Of the readings [rad]."""
+BANDWIDTH = 12.0
+"""Of the controller [rad/s]."""
+
+
+class Joint(NamedTuple):
+    """Friction of a joint [N m, rad/s, N m s/rad], and how fast it moves [rad/s]."""
+
+    coulomb: float
+    breakaway: float
+    stribeck: float
+    knee: float
+    viscous: float
+    speed: float
+
+
+JOINTS = (
+    Joint(1.5, 2.2, 0.30, 0.06, 0.80, 3.0),
+    Joint(3.0, 3.9, 0.40, 0.06, 1.50, 2.5),
+    Joint(2.0, 3.2, 0.25, 0.05, 1.00, 3.5),
+    Joint(0.5, 0.7, 0.30, 0.06, 0.20, 5.0),
+    Joint(0.3, 0.36, 0.50, 0.08, 0.12, 5.0),
+    Joint(0.1, 0.15, 0.40, 0.06, 0.04, 8.0),
+)
+
+
+class Lack(NamedTuple):
+    """What the machine has and its file does not say."""
+
+    payload: float = 0.0
+    """At the hand [kg]."""
+    late: int = 0
+    """Steps of the plant by which the input of joint 3 is late."""
+    spring: float = 0.0
+    """At joint 5 [N m/rad]."""
+
+
+LACKS = {"payload": Lack(payload=0.4), "late": Lack(late=2 * FINE), "spring": Lack(spring=0.8)}
+
+
+def friction(joints: tuple[Joint, ...]) -> Callable[[np.ndarray], np.ndarray]:
+    """Torque at velocities [N m]."""
+    coulomb, breakaway, stribeck, knee, viscous, _ = map(np.asarray, zip(*joints, strict=True))
+
+    def law(v: np.ndarray) -> np.ndarray:
+        level = coulomb + (breakaway - coulomb) * np.exp(-((v / stribeck) ** 2))
+        return -level * np.tanh(v / knee) - viscous * v
+
+    return law
+
+
+def plant(text: str) -> mujoco.MjModel:
+    """The machine of a file without friction, stops and contacts."""
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep, model.opt.integrator = DT / FINE, int(mujoco.mjtIntegrator.mjINT_RK4)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    return model
+
+
+def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None) -> tuple[Dataset, np.ndarray]:
+    """Logs of the arm, and all its states."""
+    lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
+    model = plant(text)
+    if lack.payload:
+        load = f'<body pos="0 0 0.05"><inertial pos="0 0 0" mass="{lack.payload}" diaginertia="1e-6 1e-6 1e-6"/></body>'
+        model_true = plant(text.replace('<site name="hand"', load + '<site name="hand"'))
+    else:
+        model_true = model
+    inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
+    t = DT * np.arange(ROWS)
+    u, x = np.zeros((SEQUENCES, ROWS, dof)), np.zeros((SEQUENCES, ROWS, 2 * dof))
+    for s in range(SEQUENCES):
+        tones, phases = rng.uniform(0.15, 1.2, (dof, 4)), rng.uniform(0, 2 * np.pi, (dof, 4))
+        turn = 2 * np.pi * tones[None] * t[:, None, None] + phases[None]
+        rate = speed * np.sum(np.cos(turn), axis=-1) / 2.5
+        goal = np.sum(speed[:, None] / 2.5 * np.sin(turn) / (2 * np.pi * tones), axis=-1)
+        data, known = mujoco.MjData(model_true), mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = goal[0], rate[0]
+        sent = [np.zeros(dof)] * (lack.late + 1)
+        for k in range(ROWS):
+            x[s, k] = np.concatenate([data.qpos, data.qvel])
+            known.qpos[:], known.qvel[:] = data.qpos, data.qvel
+            mujoco.mj_forward(model, known)
+            miss, slip = goal[k] - data.qpos, rate[k] - data.qvel
+            u[s, k] = known.qfrc_bias + inertia * (BANDWIDTH**2 * miss + 1.4 * BANDWIDTH * slip)
+            for _ in range(FINE):
+                sent = [*sent[1:], u[s, k]]
+                data.ctrl[:] = u[s, k]
+                if lack.late:
+                    data.ctrl[2] = sent[0][2]
+                data.qfrc_applied[:] = law(data.qvel)
+                if lack.spring:
+                    data.qfrc_applied[4] -= lack.spring * data.qpos[4]
+                mujoco.mj_step(model_true, data)
+    y = x[..., :dof] + NOISE * rng.normal(size=(SEQUENCES, ROWS, dof))
+    return Dataset(np.tile(t, (SEQUENCES, 1)), u, y, np.ones((SEQUENCES, ROWS), bool)), x
+
+
+def _inertia(model: mujoco.MjModel) -> np.ndarray:
+    """Of every joint at zero [kg m^2]."""
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    return np.diag(mass)
+
+
+def declared(folder: Path, joints: int) -> Rig:
+    """The rig of the arm, written to a folder with its file."""
+    (folder / "arm.xml").write_text(arm(joints))
+    names = ", ".join(f'"joint{i + 1}"' for i in range(joints))
+    noise = "".join(f"joint{i + 1} = {NOISE}\n" for i in range(joints))
+    (folder / "rig.toml").write_text(
+        'format = 1\nname = "arm"\n[model]\ntype = "mjcf"\nfile = "arm.xml"\nfriction = "unknown"\n'
+        f'[sampling]\ndt = {DT}\ninput_hold = "zero-order"\nclock = "sequence"\n'
+        f"[measurement]\ncolumns = [{names}]\n[measurement.noise_std]\n{noise}"
+    )
+    return read_rig(folder / "rig.toml", specs)
+
+
+def written(rig: Rig, data: Dataset, folder: Path) -> None:
+    """The logs as files beside the rig."""
+    for i, (t, u, y) in enumerate(zip(data.t, data.u, data.y, strict=True)):
+        columns = dict(zip((*rig.input_columns, *rig.measured), (*np.asarray(u).T, *np.asarray(y).T), strict=True))
+        write_csv(folder / "train" / f"{i:03d}.csv", {"time": np.asarray(t)} | columns)
+
+
+def main() -> None:
+    """Print the table, or write logs."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--joints", type=int, default=6, choices=range(1, 7))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--lacks", choices=LACKS)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    set_up()
+    joints = JOINTS[: args.joints]
+    if args.lacks:
+        (args.out / "train").mkdir(parents=True, exist_ok=True)
+        rig = declared(args.out, args.joints)
+        written(rig, recorded(arm(args.joints), joints, 0, LACKS[args.lacks])[0], args.out)
+        return
+    print(f"{date.today()}, {platform.machine()}, {jax.device_count()} devices, JAX {jax.__version__}, ", end="")
+    print(f"load {os.getloadavg()[0]:.1f} before: {' '.join(['python', *sys.argv])}\n")
+    print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s |")
+    print("| --- " * (args.joints + 3) + "|")
+    with TemporaryDirectory() as folder:
+        rig = declared(Path(folder), args.joints)
+        for seed in range(args.seeds):
+            data, x = recorded(arm(args.joints), joints, seed)
+            began = time.perf_counter()
+            fitted = identify(rig, data, key=jax.random.key(seed))
+            took = time.perf_counter() - began
+            found = " | ".join(f"{e:.3f}" for e in errors(fitted.model.unknown, friction(joints), x))
+            print(f"| {seed} | {found} | {fitted.state.epoch} | {took:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -179,17 +179,17 @@ def main() -> None:
         return
     print(f"{date.today()}, {platform.machine()}, {jax.device_count()} devices, JAX {jax.__version__}, ", end="")
     print(f"load {os.getloadavg()[0]:.1f} before: {' '.join(['python', *sys.argv])}\n")
-    print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s |")
-    print("| --- " * (args.joints + 3) + "|")
+    print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
+    print("| --- " * (args.joints + 4) + "|")
     with TemporaryDirectory() as folder:
         rig = declared(Path(folder), args.joints)
         for seed in range(args.seeds):
             data, x = recorded(arm(args.joints), joints, seed)
-            began = time.perf_counter()
+            began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))
-            took = time.perf_counter() - began
+            took, spent = time.perf_counter() - began, time.process_time() - spent
             found = " | ".join(f"{e:.3f}" for e in errors(fitted.model.unknown, friction(joints), x))
-            print(f"| {seed} | {found} | {fitted.state.epoch} | {took:.0f} |", flush=True)
+            print(f"| {seed} | {found} | {fitted.state.epoch} | {took:.0f} | {spent:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

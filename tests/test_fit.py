@@ -153,6 +153,23 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
     assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
 
 
+def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
+    """Errors at .25 and .5 s fall to a half with the step, those at 1 s grow by three halves."""
+    size = lambda model: float(RULE.prior.read(model)[0])  # noqa: E731
+
+    def many(model, horizons):
+        scale = np.array([1 - 0.5 * size(model), 1 - 0.5 * size(model), 1 + 1.5 * size(model)])[: len(horizons)]
+        return np.broadcast_to(scale[:, None], (4, 3, len(horizons), 1))
+
+    one = np.ones((4, 3, 2, 1, RULE.weights(MODEL).nodes.size + 1))
+    monkeypatch.setattr(multistep, "forks", lambda model, *_: Forks(many(model, (0, 0)), one, np.ones(2)))
+    monkeypatch.setattr(multistep, "errors", lambda model, *given: many(model, given[3]))
+    monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
+    begun = RULE.prior.write(MODEL, jnp.zeros(1))
+    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool))
+    assert float(RULE.prior.read(done)[0]) == 0.0
+
+
 @pytest.mark.parametrize("shaped", [False, True])
 def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
     nodes, asked = RULE.weights(MODEL).nodes.size, []

@@ -255,11 +255,13 @@ def finish(
     *,
     shaped: bool = False,
 ) -> StateSpaceModel:
-    """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until they fall.
+    """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until it predicts
+    better over all horizons at which a model is judged.
 
     Friction, parameters and effects move, where it is `shaped` friction under the prior of its shape; noise and start
     stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
     """
+    here = errors(model, m_step.prior, path, data, JUDGED)
     for _ in range(STEPS):
         weights = m_step.weights(model)
         now = forks(model, weights, path, data)
@@ -275,8 +277,9 @@ def finish(
         goal = _goal(weights, model.unknown, start, score, information)
         for share in (1.0, 0.5, 0.25):
             trial = weights.write(model, start + share * (goal - start))
-            if ratio(now.error, errors(trial, m_step.prior, path, data), used) < 1 - FALLS:
-                model = trial
+            there = errors(trial, m_step.prior, path, data, JUDGED)
+            if ratio(here, there, used) < 1 - FALLS:
+                model, here = trial, there
                 break
         else:
             break

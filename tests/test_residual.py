@@ -12,6 +12,7 @@ from statsmodels.stats.stattools import jarque_bera
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.data.units import with_names
 from nnap_em.diagnose.residual import Names, Residual, names_of, residual
 from nnap_em.diagnose.residual import tests as run_tests
 from nnap_em.diagnose.statistics import LEVEL, bias, dependence, holm, normality, spread, whiteness
@@ -251,6 +252,14 @@ def test_there_is_an_innovation_where_there_is_a_reading():
     found = residual(fitted, data._replace(y=y))
     assert np.isnan(y).any()
     np.testing.assert_array_equal(np.isfinite(found.innovation), np.isfinite(y))
+
+
+def test_joints_are_called_by_number_and_by_the_name_of_their_own():
+    names = NAMES._replace(coordinates=("theta1", "elbow", "x3"), rates=("dtheta1", "delbow", "dx3"))
+    assert [names.joint(j) for j in (1, 2, 3)] == ["joint 1", "joint 2 (elbow)", "joint 3"]
+    text = "motor gain at joint 2: joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
+    told = "motor gain at joint 2 (elbow): joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
+    assert with_names(text, names.coordinates) == told
 
 
 def test_names_carry_units():

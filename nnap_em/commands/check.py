@@ -10,9 +10,10 @@ from .common import Say, read_bench
 
 def run(args: argparse.Namespace, say: Say) -> int:
     """A line per question; 1 where they cannot."""
-    found = check(*read_bench(args.folder, args.trust_readings), key=jax.random.key(0))
+    bench = read_bench(args.folder, args.trust_readings)
+    found = check(*bench, key=jax.random.key(0))
     for finding in found:
-        print(f"{finding.mark:4}  {finding.subject:8}  {finding.text}")
+        print(f"{finding.mark:4}  {finding.subject:8}  {bench.rig.named(finding.text)}")
     bad = sum(finding.mark == BAD for finding in found)
     say(f"{bad} of {len(found)} answers are bad" if bad else "nothing speaks against a fit")
     return int(bad > 0)

@@ -18,11 +18,12 @@ def run(args: argparse.Namespace, say: Say) -> None:
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
     with resumable(args, bench, say):
-        closed = close_the_loop(bench.rig, bench.train.data, key=jax.random.key(args.seed), say=say)
+        told = lambda text: say(bench.rig.named(text))  # noqa: E731
+        closed = close_the_loop(bench.rig, bench.train.data, key=jax.random.key(args.seed), say=told)
         found, mark = findings(closed), fingerprint(bench.train.data)
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, say=say)
+        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, say=told)

@@ -14,7 +14,7 @@ from typing import NamedTuple, NoReturn
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds
 from .machine import machine_unit, unpacked
-from .units import parameter_unit, quantities
+from .units import parameter_unit, quantities, with_names
 
 _FRICTION = {"unknown": True, "none": False}
 _CLOCKS = ("sequence", "session")
@@ -112,6 +112,10 @@ class Rig:
         states = unpacked(self.machine).states if self.machine else ()
         dof = len(states) // 2
         return list(zip(states[:dof], states[dof:], strict=True)) if states else None
+
+    def named(self, text: str) -> str:
+        """`text` with the name that the machine's file gives a joint behind its number."""
+        return with_names(text, [coordinate for coordinate, _ in self.pairs() or ()])
 
     def __str__(self) -> str:
         inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]

@@ -1,7 +1,7 @@
 """SI units: of parameters and states by their names, of what belongs to an angle or to a position."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 _UNITS = {  # of parameters and states, by their names
     r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
@@ -18,6 +18,18 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
     """Parameters or states as text, with their units."""
     numbers = {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
     return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
+
+
+def joint_called(coordinates: Sequence[str], joint: int) -> str:
+    """A joint, counted from 1, as a reader finds it: by its number, and its name where it has one of its own."""
+    name = coordinates[joint - 1] if 0 < joint <= len(coordinates) else ""
+    own = name and not re.fullmatch(r"(theta|x|q|joint)\d*", name)
+    return f"joint {joint}" + (f" ({name})" if own else "")
+
+
+def with_names(text: str, coordinates: Sequence[str]) -> str:
+    """`text` with the name of every joint behind its number."""
+    return re.sub(r"\bjoint (\d+)\b(?! \()", lambda found: joint_called(coordinates, int(found[1])), text)
 
 
 def state_unit(angle: bool, *, rate: bool) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
-from ..data.units import force_unit, state_unit
+from ..data.units import force_unit, joint_called, state_unit
 from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import smooth
@@ -52,6 +52,10 @@ class Names(NamedTuple):
         place = (self.coordinates + self.rates).index(name)
         dof = len(self.coordinates)
         return state_unit(self.rotary[place % dof], rate=place >= dof)
+
+    def joint(self, joint: int) -> str:
+        """A joint, counted from 1, as a reader finds it."""
+        return joint_called(self.coordinates, joint)
 
     def force_unit(self, joint: int) -> str:
         """Unit of the generalised force at a joint, counted from 1."""

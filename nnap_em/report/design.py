@@ -41,10 +41,10 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
         "seconds": time.perf_counter() - began,
         "versions": versions(),
     }
-    write_json(out / "design.json", document)
-    replace_text(
-        out / "design.html", rendered("design.html.j2", document=document, pictures=_pictures(design, document))
-    )
+    named = design.fitted.rig.named
+    write_json(out / "design.json", document, named)
+    text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
+    replace_text(out / "design.html", named(text))
     say(document["verdict"])
     say(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
 

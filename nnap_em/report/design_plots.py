@@ -33,7 +33,7 @@ def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
             xlabel=f"velocity {symbol(rate)} [{names.unit(rate)}]",
             ylabel=f"std of friction [{names.force_unit(told['joint'])}]",
         )
-        ax.set_title(f"Joint {told['joint']}" if len(friction) > 1 else "")
+        ax.set_title(names.joint(told["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
     head(figure, "How well friction is known", list(grid))
     return figure
 

@@ -58,7 +58,7 @@ def write_diagnosis(
         *_error_pictures(error, predicted, tables, names, test),
         *_residual_pictures(left, lacked, names),
         *_found_pictures(found),
-        *_search_pictures(closed.steps),
+        *_search_pictures(closed.steps, closed.before.rig.named),
     ]
     disputed, rivals = disputes(closed, train.files), undecided(closed)
     document = shared(closed.before, train, test, seed=seed, began=began) | {
@@ -76,8 +76,9 @@ def write_diagnosis(
         "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
         "next": [*advice(found, disputed, rivals), *_experiment(closed.before.rig)],
     }
-    write_json(out / "report.json", document)
-    replace_text(out / "report.html", page(document, figures))
+    named = closed.before.rig.named
+    write_json(out / "report.json", document, named)
+    replace_text(out / "report.html", named(page(document, figures)))
     say(document["verdict"])
     say(f"wrote {out / 'report.html'} and report.json")
 
@@ -144,12 +145,12 @@ def _found_pictures(found: list[Finding]) -> list[Picture]:
     return out
 
 
-def _search_pictures(steps: tuple[Step, ...]) -> list[Picture]:
+def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> list[Picture]:
     if not steps:
         return []
     first = next((step for step in steps if step.accepted), steps[0])
-    chosen = words(first.accepted) if first.accepted else None
-    entries = [(words(key), promise) for key, promise in first.screened[:10]]
+    chosen = named(words(first.accepted)) if first.accepted else None
+    entries = [(named(words(key)), promise) for key, promise in first.screened[:10]]
     figure = screen_figure(entries, first.measure, chosen=chosen)
     caption = f"What each candidate promises, before any refit: {first.measure}."
     return [picture("details", "The first look", caption, figure)]

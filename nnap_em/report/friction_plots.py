@@ -34,7 +34,7 @@ def friction_figure(
         if len(tables) > 1:  # a band that is wide where nothing moved hides neither
             ax.set_ylim(*limits([np.asarray(table.torque)[j] for table in tables.values()], 0.2))
         ax.axhline(0, color="#BBBBBB", lw=0.8, zorder=0)
-        ax.set_title(f"Joint {j + 1}" if dof > 1 else "")
+        ax.set_title(names.joint(j + 1).replace("j", "J", 1) if dof > 1 else "")
         ax.set_ylabel(f"friction [{names.force_unit(j + 1)}]")
         if visited is not None:
             density(grid[1, j], visited[j], *ax.get_xlim())

@@ -66,8 +66,8 @@ def write_identification(
         "model": "model.npz",
     }
     _tell(document, say)
-    write_json(out / "report.json", document)
-    replace_text(out / "report.html", page(document, figures))
+    write_json(out / "report.json", document, fitted.rig.named)
+    replace_text(out / "report.html", fitted.rig.named(page(document, figures)))
     say(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
 
 

@@ -139,7 +139,7 @@ def residual_figure(
             if c % columns:
                 ax.tick_params(labelleft=False)
             else:
-                where = f"joint {j + 1}\n" if dof > 1 else ""
+                where = f"{names.joint(j + 1)}\n" if dof > 1 else ""
                 ax.set_ylabel(f"{where}missing force [{names.force_unit(j + 1)}]", fontsize=8.5)
         for ax in grid[j, len(row) :]:
             ax.set_axis_off()

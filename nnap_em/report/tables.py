@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,16 @@ from ..data.formats import write_csv
 from ..storage.files import replace_text
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all; what is no finite number becomes null."""
+def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], str] = str) -> None:
+    """Write JSON whole or not at all, texts as they are `told`; what is no finite number becomes null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):
             return {name: clean(item) for name, item in value.items()}
         if isinstance(value, list | tuple):
             return [clean(item) for item in value]
+        if isinstance(value, str):
+            return told(value)
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")

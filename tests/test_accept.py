@@ -9,12 +9,16 @@ import pytest
 from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
 from nnap_em.diagnose.evidence import Evidence, Screened, Share, price
 from nnap_em.effects import Candidate, catalogue
+from nnap_em.effects.function import Axis
 
 READINGS = 4000
 GAIN = catalogue["motor_gain"](jnp.zeros(()), joint=1)
 LINEAR = Candidate(GAIN, (GAIN,), GAIN)
 ZONE = catalogue["dead_zone"](jnp.ones(()), joint=1)
 BENT = Candidate(ZONE, (ZONE,), ZONE)
+AXIS = Axis(("x",), -2.0, 2.0, False, 20)
+CURVE = catalogue["unknown_function"](AXIS.centres(), (AXIS,), joint=1)
+FREE = Candidate(CURVE, (CURVE,), CURVE)
 
 
 @dataclass
@@ -29,6 +33,7 @@ class Numbers(Evidence):
     held_out: float = 50.0
     error: float = 0.6
     unseen: float = 0.7
+    foretold: float = 0.95
 
 
 def _screened(
@@ -117,6 +122,15 @@ def test_a_refit_keeps_what_the_share_promised(numbers, believed):
 @pytest.mark.parametrize(("unseen", "believed"), [(0.7, True), (0.92, False), (9.7, False)])
 def test_what_the_refit_gains_has_to_be_there_on_motions_that_it_left_out(unseen, believed):
     assert ShareRule().believes(Numbers(_screened(), error=0.2, unseen=unseen)).believed == believed
+
+
+@pytest.mark.parametrize(
+    ("law", "foretold", "believed"),
+    [(LINEAR, 0.84, True), (LINEAR, 0.86, False), (LINEAR, 3.0, False), (FREE, 0.2, False)],
+)
+def test_a_named_law_may_be_foretold_where_half_of_the_motions_say_nothing_of_the_others(law, foretold, believed):
+    evidence = Numbers(_screened(candidate=law), error=0.2, unseen=1.2, foretold=foretold)
+    assert ShareRule().believes(evidence).believed == believed
 
 
 def test_recordings_disagree_where_what_would_be_enough_harms_some():

@@ -11,10 +11,11 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import case as case_of
 from nnap_em.diagnose import grow, loop, undo
 from nnap_em.diagnose import look as search
 from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
-from nnap_em.diagnose.case import Case, significance, trimmed
+from nnap_em.diagnose.case import Case, left_out_error, significance, trimmed
 from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Share
 from nnap_em.diagnose.grow import Loop
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
@@ -27,6 +28,7 @@ from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
+from nnap_em.em.multistep import Forks, ratio
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 
@@ -124,6 +126,31 @@ def test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other(monkeypatch):
     found = Case(_screened(_law("motor_gain", 1.0)), now, path, null, question, fit, halves)
     assert found.unseen == 2.0
     assert len(fitted) == 5  # once on all, twice on either half
+
+
+def test_what_is_left_out_is_foretold_by_the_numbers_of_the_effect_that_the_others_ask_for(monkeypatch):
+    """Errors of one number that differs by sequence: what is left is that of the other half, in closed form."""
+    now, true = _with("motor_gain"), np.array([1.0, 1.2, 3.0, 3.2])
+    nodes, size = RULE.weights(now.model).nodes.size, now.m_step.prior.size
+    slopes = np.random.default_rng(0).uniform(1.0, 2.0, (4, 9, 2, 1))
+    columns = np.zeros((4, 9, 2, 1, nodes + size))
+    columns[..., -1] = slopes
+    error = slopes * true[:, None, None, None]
+    monkeypatch.setattr(case_of, "forks", lambda *_: Forks(error, columns, np.ones(2)))
+    monkeypatch.setattr(case_of, "errors", lambda *_: error)
+    monkeypatch.setattr(case_of, "weighed", lambda *_: np.full(error.shape, 1e9))  # the prior says nothing beside
+    every = np.ones(4, bool)
+    question = Question(now, now, None, DATA, every, 9)
+    first = np.array([True, True, False, False])
+    trial = Trial(now.model, now.m_step, None, np.zeros(4), None)
+    told = left_out_error(trial, trial, slice(size - 1, size), question, [(first, ~first), (~first, first)])
+    sides = []
+    for left in (first, ~first):
+        by = slopes[~left]
+        number = np.sum(by * error[~left]) / np.sum(by**2)
+        sides.append(ratio(error, error - number * slopes, left))
+    assert told == pytest.approx(np.mean(sides), rel=1e-6)
+    assert sides[0] > 2 > 1 > sides[1]  # 3 is too much for 1, and 1 a part of 3
 
 
 def test_a_sixth_is_trimmed_at_either_end():
@@ -325,7 +352,7 @@ def test_one_nearly_as_good_is_believed_where_the_best_is_not(unseen, rule, take
     laws = (_law("motor_gain"), _law("dead_zone"), _spring())
     cases = [_case(law, gain) for law, gain in zip(laws, (200.0, 190.0, 100.0), strict=True)]
     for case, own, error in zip(cases, unseen, (0.4, 0.45, 0.7), strict=True):
-        case.__dict__ |= {"_unseen": own, "_error": error, "_held_out": 1e3}
+        case.__dict__ |= {"_unseen": own, "_foretold": 2.0, "_error": error, "_held_out": 1e3}
     found = loop._believed(cases[0], cases, rule, lambda text: None)
     assert (found and found.effect.name) == taken
 

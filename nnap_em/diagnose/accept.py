@@ -219,8 +219,16 @@ class ShareRule(AbstractRule):
         return self._falls(evidence.error)
 
     def believes(self, evidence: Evidence) -> Verdict:
-        """Whether the error falls on what was left out of the refit, too."""
-        return self._falls(evidence.unseen, " of motions left out")
+        """Whether the error falls on what was left out of the refit, too.
+
+        A fit to half of chaotic recordings may say nothing of the others. A named law, which is few numbers, is then
+        believed by the whole of the least share on motions that these were not fitted to.
+        """
+        verdict = self._falls(evidence.unseen, " of motions left out")
+        if verdict.believed or not evidence.screened.candidate.start.named:
+            return verdict
+        gone = 1.0 - evidence.foretold
+        return Verdict(gone >= self.least, f"{verdict.reason}, {gone:.0%} where its own numbers alone are left out")
 
     def even(self, winner: Evidence, rival: Evidence) -> bool:
         """Nearly the same share."""

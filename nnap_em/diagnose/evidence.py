@@ -145,6 +145,8 @@ class Evidence(Worth):
     unseen: float
     """Squared open-loop error over that without it, on motions that had no part in either fit; on the only one, if
     there are no others."""
+    foretold: float
+    """The same on motions that had no part in the fit of its own numbers alone."""
 
 
 def readings(data: Dataset) -> int:

@@ -580,8 +580,8 @@ MUTANTS = (
     Mutant(
         "finish takes steps that raise the error",
         "em/multistep.py",
-        "data), used) < 1 - FALLS:",
-        "data), used) > 1 - FALLS:",
+        "there, used) < 1 - FALLS:",
+        "there, used) > 1 - FALLS:",
         "test_fit.py::test_a_gauss_newton_step_is_halved_until_the_errors_fall",
     ),
     Mutant(

@@ -720,8 +720,8 @@ MUTANTS = (
     Mutant(
         "a law judged on the motions of its fit",
         "diagnose/case.py",
-        "(used & half, used & ~half)",
-        "(used & half, used)",
+        "(self.question.used & half, self.question.used & ~half)",
+        "(self.question.used & half, self.question.used)",
         "test_search.py::test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other",
     ),
     Mutant(

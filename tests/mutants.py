@@ -557,6 +557,13 @@ MUTANTS = (
         "test_forks.py::test_weights_are_one_over_the_variance_and_less_for_outliers",
     ),
     Mutant(
+        "loud recordings decide alone",
+        "em/multistep.py",
+        "np.sqrt(whole * own)",
+        "np.sqrt(whole * whole)",
+        "test_forks.py::test_a_loud_recording_counts_by_the_root_of_its_loudness",
+    ),
+    Mutant(
         "weights of sequences that are not used",
         "em/multistep.py",
         "error = np.where(used[:, None, None, None], found.error, np.nan)",

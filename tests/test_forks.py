@@ -18,7 +18,7 @@ from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.propose import proposals, surroundings
 from nnap_em.diagnose.shares import Rows, fold_of, motions, project, share, times
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, weighed
+from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, robust_scale, weighed
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.shape import friction_prior
@@ -290,6 +290,18 @@ def test_logs_too_short_for_a_fork_say_nothing():
     assert ratio(nothing, nothing, np.ones(3, bool)) == 1.0
     empty = Rows(np.zeros(0), np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int), 1.0, np.zeros(0))
     assert share(empty, slice(0, 2), np.zeros(2))[:2] == (0.0, 0.0)
+
+
+def test_a_loud_recording_counts_by_the_root_of_its_loudness():
+    """Errors of constant size 1, 1, 1, 4 and one recording without any: scales by hand."""
+    size = np.array([1.0, 1.0, 1.0, 4.0, np.nan])
+    error = size[:, None, None, None] * np.sign(np.random.default_rng(0).normal(size=(5, 30, 2, 1)))
+    assert robust_scale(error)[:, 0, 0, 0] == pytest.approx(1.4826 * np.array([1.0, 1.0, 1.0, 2.0, 1.0]))
+    after = error.copy()
+    after[:3] *= 0.5  # three of four recordings are predicted twice as well
+    inside = np.array([1.0, 1.0, 1.0, 4.0]) / 1.4826**2  # squared errors in scales: none is an outlier
+    left = ((0.25 * inside[:3]).sum() + inside[3]) / inside.sum()
+    assert ratio(error, after, np.ones(5, bool)) == pytest.approx(left)
 
 
 def test_an_outlier_counts_as_a_line():

@@ -199,11 +199,19 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
 # --- how large
 
 
-def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "horizon obs"]:
-    """Standard deviation at every horizon, by the median; 1 where there is no error to tell."""
-    seen = np.isfinite(error).any(axis=(0, 1))
-    filled = np.where(seen, error, 1.0) if error.size else np.ones((1, 1, *error.shape[2:]))
-    return 1.4826 * np.nanmedian(np.abs(filled), axis=(0, 1)) + 1e-12
+def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "seq 1 horizon obs"]:
+    """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error to tell.
+
+    It is the geometric mean of a sequence's own and that of all: with that of all, a few loud recordings decide alone;
+    with its own, a recording in which hardly anything moves says as much as any.
+    """
+    if not error.size:
+        return np.ones((error.shape[0], 1, *error.shape[2:]))
+    size = np.ma.masked_invalid(np.abs(error))
+    whole, own = (np.ma.median(size, axis=over, keepdims=True) for over in ((0, 1), 1))
+    whole = np.ma.filled(whole, 1 / 1.4826)
+    own = np.where(np.ma.getmaskarray(own), whole, np.ma.filled(own, 1.0))
+    return 1.4826 * np.sqrt(whole * own) + 1e-12
 
 
 def huber(error, scale):
@@ -228,7 +236,7 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
 
 
 def weighed(found: Forks, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
-    """Robust weights: one over the variance of every horizon and channel, less for outliers, none for what is not."""
+    """Robust weights: one over the variance by sequence, horizon and channel, less for outliers, none for what is not."""
     error = np.where(used[:, None, None, None], found.error, np.nan)
     scale = robust_scale(error)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -236,7 +236,7 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
 
 
 def weighed(found: Forks, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
-    """Robust weights: one over the variance by sequence, horizon and channel, less for outliers, none for what is not."""
+    """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
     error = np.where(used[:, None, None, None], found.error, np.nan)
     scale = robust_scale(error)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -176,7 +176,7 @@ def _disputed(
             continue
         key, folds = key_of(one.candidate.start), np.asarray(one.share.folds if one.share else ())
         against = members[folds < 0].any(axis=0)
-        if 2 * against.sum() >= members.any(axis=0).sum():
+        if not 0 < 2 * against.sum() < members.any(axis=0).sum():
             continue  # no odd ones: it is no law
         told = Disputed(
             key, one.share.least if one.share else 0.0, tuple(map(int, np.flatnonzero(against))), -float(folds.min())

@@ -4,6 +4,7 @@ import dataclasses
 from types import SimpleNamespace
 
 import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -265,7 +266,8 @@ def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it():
     (told,) = _disputed((law, other), members, ShareRule())
     assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
     assert not _disputed((law, other), members, LikelihoodRule())
-    nobody = _screened(_of_input())._replace(share=Share(0.3, 0.2, (0.4, 0.3, 0.1)))  # refused, but harms none
+    law = eqx.tree_at(lambda law: law.weights, _of_input(), jnp.zeros(20))
+    nobody = _screened(law)._replace(share=Share(0.3, 0.2, (0.4, 0.3, 0.1)))  # refused, but harms none
     assert ShareRule().disputed(nobody) and not _disputed((nobody,), members, ShareRule())
 
 

@@ -3,8 +3,8 @@
 import dataclasses
 from types import SimpleNamespace
 
-import jax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest

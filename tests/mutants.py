@@ -837,6 +837,13 @@ MUTANTS = (
         "test_design.py::test_covariance_after_more_information_is_that_of_the_sum_of_precisions",
     ),
     Mutant(
+        "a friction band that counts at speed alone",
+        "design/questions.py",
+        "np.mean(np.log(mean + 1e-30), axis=-1)",
+        "np.log(mean + 1e-30)[..., 0]",
+        "test_design.py::test_friction_near_rest_counts_as_much_as_all_the_rest",
+    ),
+    Mutant(
         "a rival that adapts nothing",
         "design/questions.py",
         "np.sqrt(np.maximum(square - adapted, 0.0))",

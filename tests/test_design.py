@@ -20,7 +20,7 @@ from nnap_em.design.experiment import design_experiment
 from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
 from nnap_em.design.limits import DesignError, Limits, limits_of
 from nnap_em.design.play import motions
-from nnap_em.design.questions import Apart, Told, after, share
+from nnap_em.design.questions import Apart, Friction, Several, Told, after, share
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
@@ -92,6 +92,16 @@ def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_a
     told = Told(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
     direct = np.sqrt(r @ np.linalg.solve(np.eye(9) + jac @ cov @ jac.T, r))
     np.testing.assert_allclose(Apart((cov,)).distance(told), [direct], rtol=1e-10)
+
+
+def test_friction_near_rest_counts_as_much_as_all_the_rest():
+    """Torques of a joint at rest and at speed, in units of its friction: each bandwidth to the power of a half."""
+    std, weight = np.asarray([0.4, 0.1]), np.asarray([[[0.0, 1.0]], [[1.0, 0.0]]])
+    fit = Fit(None, None, np.asarray([[0.0, 9.0]]), np.diag(std**2), np.eye(2))  # type: ignore[arg-type]
+    cost = Friction(fit, np.asarray([2.0]), weight).cost
+    nothing, slow = (Told(np.diag([told, 0.0]) / std**2) for told in (0.0, 8.0))
+    np.testing.assert_allclose(np.exp(cost(nothing)), np.sqrt(0.2 * 0.05), rtol=1e-9)
+    np.testing.assert_allclose(cost(nothing) - cost(slow), 0.5 * np.log(3.0), rtol=1e-9)  # eightfold more information
 
 
 # --- on the bench of the paper's acrobot
@@ -189,6 +199,11 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     found = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(found.lowest) >= design.limits.lowest[None, None])
     assert np.all(np.asarray(found.highest) <= design.limits.highest[None, None])
+    assert isinstance(design.question, Several) and isinstance(design.question.questions[0], Friction)
+    whole, near = design.question.questions[0].weight
+    np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
+    speed = np.abs(np.asarray(design.fit.nodes))
+    assert speed[near > 0].max() <= design.slow[0] < speed[whole > 0].max()  # the slowest rows once more by themselves
     again = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
     np.testing.assert_array_equal(design.u, again.u)  # the same seed, the same numbers
     assert not np.array_equal(

@@ -92,7 +92,8 @@ def design_experiment(
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
     apart = Apart(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
-    friction = _friction(fit, visited)
+    slow = _slow(fit, visited)
+    friction = _friction(fit, visited, slow)
     asked = _question(question, fitted, fit, friction, apart)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
@@ -123,8 +124,8 @@ def design_experiment(
         asked,
         tuple(rivals),
         apart,
-        np.percentile(np.abs(visited), SLOW, axis=0),
-        friction.weight,
+        slow,
+        friction.weight[0],
     )
 
 
@@ -158,15 +159,22 @@ def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, 
     return rows[np.isfinite(rows).all(axis=-1), dof : 2 * dof]
 
 
-def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Friction:
-    """Over the visited velocities, near rest no more than its share."""
+def _slow(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, " dof"]:
+    """Speeds near rest; where the machine mostly stood still, as far as the map has its first nodes."""
+    return np.maximum(np.percentile(np.abs(visited), SLOW, axis=0), np.sort(np.abs(fit.nodes), axis=1)[:, 2])
+
+
+def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:
+    """Over the visited velocities, near rest no more than its share; and near rest alone."""
     nodes, dof = np.asarray(fit.nodes), fit.nodes.shape[0]
     low, high = np.percentile(visited, [0.5, 99.5], axis=0)
     place = np.arcsinh(nodes / (NEAR_REST * np.abs(nodes).max(axis=1, keepdims=True)))
-    weight = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
-    weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12) / dof
+    whole = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
+    near = np.gradient(nodes, axis=1) * (np.abs(nodes) <= slow[:, None])
+    weight = np.stack([whole, near])
+    weight = weight / np.maximum(weight.sum(axis=2, keepdims=True), 1e-12) / dof
     torque = np.stack([np.asarray(fit.model.unknown(jnp.asarray(v))) for v in nodes.T], axis=1)
-    scale = np.sqrt(np.sum(weight * torque**2, axis=1) * dof)
+    scale = np.sqrt(np.sum(weight[0] * torque**2, axis=1) * dof)
     return Friction(fit, np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight)
 
 

@@ -70,19 +70,21 @@ class AbstractQuestion(eqx.Module):
 
 
 class Friction(AbstractQuestion):
-    """How wide are the friction bands, the widest first."""
+    """How wide are the friction bands, the widest first: over all velocities, and once more near rest."""
 
     fit: Fit
     scale: Float[np.ndarray, " dof"]
     """Size of the map of each joint [N m]."""
-    weight: Float[np.ndarray, "dof node"]
-    """Which velocities count; their sum is 1."""
+    weight: Float[np.ndarray, "range dof node"]
+    """Which velocities count, in every range; their sum is 1."""
 
     def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
-        count = self.weight.size
-        variance = np.diagonal(after(np.asarray(self.fit.cov), told.information), axis1=-2, axis2=-1)[..., :count]
-        relative = variance.reshape(*variance.shape[:-1], *self.weight.shape) / self.scale[:, None] ** 2
-        return np.asarray(0.25 * np.log(np.sum(self.weight * relative**2, axis=(-2, -1)) + 1e-30))
+        shape = self.weight.shape[1:]
+        variance = np.diagonal(after(np.asarray(self.fit.cov), told.information), axis1=-2, axis2=-1)
+        variance = variance[..., : math.prod(shape)].reshape(*variance.shape[:-1], *shape)
+        relative = variance / self.scale[:, None] ** 2
+        mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
+        return np.asarray(0.25 * np.mean(np.log(mean + 1e-30), axis=-1))
 
 
 class Parameters(AbstractQuestion):

@@ -211,6 +211,17 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     )
 
 
+def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says_it(slide):
+    _, _, data, fitted = slide
+    pairs = rivals(fitted, data, [(None, Law("motor_gain", 1))])
+    plan = {"seconds": 4.0, "sequences": 2, "effort": SMALL}
+    design = design_experiment(fitted, data, key=jax.random.key(2), question="apart", rivals=pairs, **plan)
+    assert design.apart is not None
+    assert np.all(design.apart.distance(design.told) > 0)
+    std = lambda told: np.sqrt(after(np.asarray(design.fit.cov), told.information)[-1, -1])  # noqa: E731
+    assert std(design.told) < 0.99 * std(design.nothing)  # of the mass
+
+
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     _, rig, data, fitted = slide
     path, used, system = np.zeros((12, 151, 2)), np.ones(12, bool), fitted.model.system

@@ -114,7 +114,7 @@ class Apart(AbstractQuestion):
     """
 
     least: ClassVar[float] = 0.0
-    covs: tuple[Float[np.ndarray, "phi phi"], ...]
+    covs: tuple[Float[np.ndarray, "_ _"], ...]
     """Of every rival."""
 
     def distance(self, told: Told) -> Float[np.ndarray, "*proposal pair"]:

@@ -58,6 +58,8 @@ class Bench(NamedTuple):
     key: PRNGKeyArray
     share: float = 1.0
     """Of the expected information that is believed (`questions.share`)."""
+    informed: bool = True
+    """Whether information is taken, too: a search that tells laws apart asks for none."""
 
 
 class Plan(NamedTuple):
@@ -79,7 +81,8 @@ def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, "
 def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:
     """What sequences tell along the motions x, and from `start` on of the rivals."""
     pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
-    return Told(information(bench.fit, seq, x), pairs)
+    none = np.zeros((len(start), *bench.fit.cov.shape))
+    return Told(information(bench.fit, seq, x) if bench.informed else none, pairs)
 
 
 def search(

@@ -12,6 +12,7 @@ apart: two laws that 30 s of sines leave equivalent, then 30 s designed: which i
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import platform
@@ -28,6 +29,7 @@ import plant
 import nnap_em
 from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
+from nnap_em.data.limits import Bounds
 from nnap_em.design.experiment import Design, design_experiment
 from nnap_em.design.questions import after
 from nnap_em.design.rivals import Law, Rivals
@@ -98,8 +100,8 @@ def broken(design: Design, x: np.ndarray) -> list[bool]:
     return (~(tame & (x >= low).all((1, 2)) & (x <= high).all((1, 2)))).tolist()
 
 
-def friction(seed: int, out: Path, quick: bool = False) -> dict[str, Any]:
-    """One rig; there is no quick run."""
+def friction(seed: int, out: Path, quick: bool = False, rate: float | None = None) -> dict[str, Any]:
+    """One rig; there is no quick run, and torques change as in the logs."""
     case = plant.Case(sequences=2 * SEQUENCES, tests=1, torque="sine", seed=seed)
     rig, data = logs(case, out / f"rig_{seed}")
     first, key = some(data, slice(SEQUENCES)), jax.random.key(seed)
@@ -157,21 +159,27 @@ def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified], list[
     return tops[0] - tops[1], fits, [top - none for top in tops]
 
 
-def apart(seed: int, out: Path, quick: bool = False) -> dict[str, Any]:
-    """All pairs, either law as the true one; a quick run leaves out what 30 s more of the same inputs tell."""
+def apart(seed: int, out: Path, quick: bool = False, rate: float | None = None) -> dict[str, Any]:
+    """All pairs, either law as the true one; a quick run leaves out what 30 s more of the same inputs tell.
+
+    With `rate`, the owner of the drive allows torque to change that many times as fast as it did in the logs.
+    """
+    out = out if rate is None else out.with_name(f"{out.name}_{rate:g}")
     rows = []
     for name, both in PAIRS.items():
         for turn in (both, both[::-1]):
             file = out / f"{seed}_{name}_{turn[0].name}.json".replace(" ", "_")
             if not file.exists():
-                row = _told_apart(seed, name, turn, out, quick)
+                row = _told_apart(seed, name, turn, out, quick, rate)
                 print(row, flush=True)
                 replace_text(file, json.dumps(row) + "\n")
             rows.append(json.loads(file.read_text()))
     return {"seed": seed, "rows": rows}
 
 
-def _told_apart(seed: int, name: str, laws: tuple[Law, Law], out: Path, quick: bool) -> dict[str, Any]:
+def _told_apart(
+    seed: int, name: str, laws: tuple[Law, Law], out: Path, quick: bool, rate: float | None
+) -> dict[str, Any]:
     """A rig with the first law: what the first logs say, more of them, and a design."""
     key = jax.random.key(seed)
     spring = {"name": "torsional_spring", "joint": 1, "k": 0.06, "theta0": 0.0}
@@ -193,6 +201,10 @@ def _told_apart(seed: int, name: str, laws: tuple[Law, Law], out: Path, quick: b
     own, other = (0, 1) if lead > 0 else (1, 0)  # a diagnosis holds the likelier one
     pair = Rivals((str(laws[own]), str(laws[other])), fits[own], fits[other])
     began = time.perf_counter()
+    if rate is not None:
+        top = rate * float(np.abs(np.diff(first.u, axis=1)).max()) / rig.dt
+        bounds = Bounds(rate={column: (-top, top) for column in rig.input_columns})
+        fits = [fit._replace(rig=dataclasses.replace(fit.rig, limits=bounds)) for fit in fits]
     design = design_experiment(
         fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
     )
@@ -238,14 +250,15 @@ def table(out: Path) -> str:
         "| seed | pair | true | lead of the true law [nat]: 30 s, 30 s more, designed |",
         "| --- | --- | --- | --- |",
     ]
-    open_, right = 0, 0
-    for path in sorted((out / "apart").glob("*.json")):
-        row = json.loads(path.read_text())
-        open_ += not math.isnan(row["designed"])
-        right += row["designed"] >= EVEN
+    told: dict[str, list[bool]] = {}
+    for path in sorted(out.glob("apart*/*.json")):
+        row, kind = json.loads(path.read_text()), path.parent.name
+        if not math.isnan(row["designed"]):
+            told.setdefault(kind, []).append(row["designed"] >= EVEN)
         leads = ", ".join("-" if math.isnan(row[s]) else f"{row[s]:.1f}" for s in ("first", "more", "designed"))
-        lines.append(f"| {path.name.split('_')[0]} | {row['pair']} | {row['true']} | {leads} |")
-    return "\n".join([*lines, "", f"Told and named right: {right} of the {open_} that the first logs left open."])
+        lines.append(f"| {kind} {path.name.split('_')[0]} | {row['pair']} | {row['true']} | {leads} |")
+    right = (f"{kind}: told and named right {sum(each)} of the {len(each)} left open." for kind, each in told.items())
+    return "\n".join([*lines, "", *right])
 
 
 def main() -> None:
@@ -254,6 +267,7 @@ def main() -> None:
     arguments.add_argument("job", choices=[*JOBS, "table"])
     arguments.add_argument("--seeds", type=int, default=5)
     arguments.add_argument("--out", type=Path, required=True)
+    arguments.add_argument("--rate", type=float, help="apart where torque may change so many times as fast")
     arguments.add_argument("--quick", action="store_true", help="apart without what 30 s more of the same inputs tell")
     args = arguments.parse_args()
     if args.job == "table":
@@ -261,10 +275,11 @@ def main() -> None:
         return
     common.set_up()
     for seed in range(1, args.seeds + 1):
-        file = args.out / f"{args.job}_{seed}.json"
+        name = args.job if args.rate is None else f"{args.job}_{args.rate:g}"
+        file = args.out / f"{name}_{seed}.json"
         if not file.exists():
             began = time.perf_counter()
-            row = JOBS[args.job](seed, args.out / args.job, args.quick)
+            row = JOBS[args.job](seed, args.out / args.job, args.quick, args.rate)
             row |= {
                 "seconds": time.perf_counter() - began,
                 "date": str(date.today()),

@@ -26,7 +26,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "format": 1,
         "rig": fitted.rig.name,
         "system": fitted.rig.system,
-        "units": {name: system.unit(name) for name in system.coordinates + system.rates},
+        "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
         "untold": sentences(felt(fitted.rig, system)),

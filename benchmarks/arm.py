@@ -5,8 +5,8 @@
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
 of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
-where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` nobody reads the last joint; a gyroscope and
-an accelerometer at the hand do, as far as they feel it.
+where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last joint has no encoder, and the hand
+a gyroscope and an accelerometer.
 """
 
 import argparse
@@ -105,7 +105,7 @@ def plant(text: str) -> mujoco.MjModel:
 
 
 def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None) -> tuple[Dataset, np.ndarray]:
-    """Logs of the arm, of all joints or, where it has them, of the sensors of its hand in place of the last; all states."""
+    """Logs of the arm, of its hand in place of the last joint where there are sensors, and all its states."""
     lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
     model = plant(text)
     if lack.payload:

@@ -1,7 +1,7 @@
 """What rig.toml declares of a machine that stands in a file: its names, its inputs, and what of it is uncertain."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from .machine import SENSE_UNITS, Machine, Sense, packed, states
@@ -62,9 +62,8 @@ def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
     table = root.table("measurement")
     wanted = table.items.get("columns")
     for column in wanted if isinstance(wanted, list) else ():
-        sensor, _, axis = str(column).rpartition(".")
         for sense in machine.senses:
-            if sense.name.rpartition(".")[0] not in (column, sensor):
+            if sense.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
                 continue
             if sense.kind not in SENSE_UNITS:
                 mend = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"

@@ -1,7 +1,7 @@
 """The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k, u_k) + v_k."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..data.dataset import Dataset
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..numerics.gaussian import Gaussian
-from ..numerics.ode import integrate
+from ..numerics.ode import apart, integrate
 from ..systems.base import AbstractSystem
 from . import hooks
 from .base import AbstractModel
@@ -110,13 +110,16 @@ class StateSpaceModel(AbstractModel):
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " readable"]:
         """Coordinates, rates, and what the sensors beside these feel, at inputs u and an extra generalised force."""
-        dof = len(self.system.coordinates)
-        if not self.system.sensors:
+        dof, count = len(self.system.coordinates), len(self.system.sensors)
+        if not count:
             return x[: 2 * dof]
-        scene = self.scene(x, u)
         extra = jnp.zeros(dof, x.dtype) if force is None else force
-        a = hooks.acceleration(self.effects, scene, x[2 * dof :], extra)
-        return jnp.concatenate([x[: 2 * dof], jnp.stack(self.system.senses(scene.q, scene.v, a))])
+
+        def senses(x: Float[Array, " state"]) -> Sequence[Scalar]:
+            scene = self.scene(x, u)
+            return self.system.senses(scene.q, scene.v, hooks.acceleration(self.effects, scene, x[2 * dof :], extra))
+
+        return jnp.concatenate([x[: 2 * dof], jnp.stack(apart(senses, x, count))])
 
     def readable(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None

@@ -283,8 +283,9 @@ def test_a_machine_that_is_no_file_has_no_sensors(tmp_path):
 # --- what is stored, written and drafted
 
 SWING = """<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/>
-<inertial pos="0 0 -.2" mass="0.5" diaginertia=".004 .004 .001"/><site name="bob" pos="0.01 0 -.3" euler="0 0 90"/></body>
-</worldbody><actuator><motor name="push" joint="pivot"/></actuator>
+<inertial pos="0 0 -.2" mass="0.5" diaginertia=".004 .004 .001"/>
+<site name="bob" pos="0.01 0 -.3" euler="0 0 90"/></body></worldbody>
+<actuator><motor name="push" joint="pivot"/></actuator>
 <sensor><gyro name="imu" site="bob"/><accelerometer name="shake" site="bob"/><framepos name="at" objtype="site"
 objname="bob"/></sensor></mujoco>"""
 SEEN = ("imu.x", "shake.y", "shake.z", "at.x")

@@ -28,6 +28,7 @@ from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.identify import begin, phi_samples
 from nnap_em.em.local import local, readings_at
+from nnap_em.em.mstep import _shaken
 from nnap_em.em.predict import horizon_errors, predict
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
@@ -186,7 +187,7 @@ def _expanded(model, prior, data: Dataset):
     step = 1e-4
     ahead, behind = (jax.vmap(filtered)(sign * step * jnp.eye(2)) for sign in (1, -1))
     slope, jac = ((a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True))
-    return found, slope, jac
+    return found, slope, jac, _shaken(jax.tree.map(lambda a: a[None], here), model.log_q, model.log_r)
 
 
 def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information(tmp_path):
@@ -205,7 +206,9 @@ def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_infor
     data = simulate(model, start.mean[None], u, key=jax.random.key(0)).data
     data = data._replace(y=data.y.at[0, 7:9, 1].set(jnp.nan))
     prior = ParameterPrior(("cart.mass",), jnp.asarray([1.3]), jnp.asarray([0.1]))
-    found, slope, jac = _expanded(model, prior, data)
+    found, slope, jac, floor = _expanded(model, prior, data)
+    kick = model.log_q[1] - 2 * jnp.log(model.dt)  # a kick of the rate over one step is an acceleration
+    np.testing.assert_allclose(floor, [model.log_r[0], kick], rtol=1e-6)
     both = np.zeros((2, 6))
     both[0, :5], both[1, 5] = 1.0, 1.0  # the weights of the nodes sum to 1: a constant force is one at all of them
     np.testing.assert_allclose(both @ found.score, slope, rtol=1e-6)  # differences of step 1e-4

@@ -119,7 +119,8 @@ def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " ob
     felt = jnp.linalg.solve(kick, jnp.swapaxes(here.reading_by_force, -1, -2))  # dof obs: of a unit kick
     known = here.seq.active[..., None] & jnp.all(jnp.isfinite(felt), axis=-2)
     square = jnp.einsum("stdo,d->sto", felt**2, jnp.exp(log_q[dof : 2 * dof]))
-    mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(jnp.sum(known, axis=(0, 1)), 1)
+    count = jnp.sum(known, axis=(0, 1), dtype=square.dtype)
+    mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(count, 1.0)
     return jnp.maximum(log_r, jnp.log(mean))
 
 

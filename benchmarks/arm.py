@@ -1,11 +1,12 @@
 """Friction of every joint of an industrial arm of which all joints are read: declared by its file, logs from MuJoCo.
 
-    python benchmarks/arm.py [--joints 6] [--seeds 3]
+    python benchmarks/arm.py [--joints 6] [--seeds 3] [--imu]
     python benchmarks/arm.py --lacks payload --out OUT      # logs for `nnap-em diagnose OUT`, and no fit
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
 of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
-where the cache of compiled programs (XDG_CACHE_HOME) is empty.
+where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last joint has no encoder, and the hand
+a gyroscope and an accelerometer.
 """
 
 import argparse
@@ -37,6 +38,8 @@ from machine_files import DT, FINE, errors
 SEQUENCES, ROWS = 10, 501
 NOISE = 1e-3
 """Of the readings [rad]."""
+IMU = {"gyro": 0.005, "accelerometer": 0.05}
+"""Of the sensors at the hand [rad/s, m/s^2]."""
 BANDWIDTH = 12.0
 """Of the controller [rad/s]."""
 
@@ -76,6 +79,12 @@ class Lack(NamedTuple):
 LACKS = {"payload": Lack(payload=0.4), "late": Lack(late=2 * FINE), "spring": Lack(spring=0.8)}
 
 
+def machine(joints: int, *, imu: bool) -> str:
+    """The arm as MJCF, with or without sensors at its hand."""
+    sensors = "".join(f'<{kind} name="hand_{kind}" site="hand"/>' for kind in IMU if imu)
+    return arm(joints).replace("</mujoco>", f"<sensor>{sensors}</sensor></mujoco>")
+
+
 def friction(joints: tuple[Joint, ...]) -> Callable[[np.ndarray], np.ndarray]:
     """Torque at velocities [N m]."""
     coulomb, breakaway, stribeck, knee, viscous, _ = map(np.asarray, zip(*joints, strict=True))
@@ -96,7 +105,7 @@ def plant(text: str) -> mujoco.MjModel:
 
 
 def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None) -> tuple[Dataset, np.ndarray]:
-    """Logs of the arm, and all its states."""
+    """Logs of the arm, of its hand in place of the last joint where there are sensors, and all its states."""
     lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
     model = plant(text)
     if lack.payload:
@@ -107,6 +116,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
     inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
     t = DT * np.arange(ROWS)
     u, x = np.zeros((SEQUENCES, ROWS, dof)), np.zeros((SEQUENCES, ROWS, 2 * dof))
+    felt = np.zeros((SEQUENCES, ROWS, model.nsensordata))
     for s in range(SEQUENCES):
         tones, phases = rng.uniform(0.15, 1.2, (dof, 4)), rng.uniform(0, 2 * np.pi, (dof, 4))
         turn = 2 * np.pi * tones[None] * t[:, None, None] + phases[None]
@@ -121,6 +131,9 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
             mujoco.mj_forward(model, known)
             miss, slip = goal[k] - data.qpos, rate[k] - data.qvel
             u[s, k] = known.qfrc_bias + inertia * (BANDWIDTH**2 * miss + 1.4 * BANDWIDTH * slip)
+            data.ctrl[:], data.qfrc_applied[:] = u[s, k], law(data.qvel)
+            mujoco.mj_forward(model_true, data)
+            felt[s, k] = data.sensordata
             for _ in range(FINE):
                 sent = [*sent[1:], u[s, k]]
                 data.ctrl[:] = u[s, k]
@@ -130,7 +143,10 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
                 if lack.spring:
                     data.qfrc_applied[4] -= lack.spring * data.qpos[4]
                 mujoco.mj_step(model_true, data)
-    y = x[..., :dof] + NOISE * rng.normal(size=(SEQUENCES, ROWS, dof))
+    read = dof - bool(model.nsensor)
+    std = np.repeat([NOISE, *IMU.values()][: 1 + model.nsensor], [read, *model.sensor_dim])
+    y = np.concatenate([x[..., :read], felt], axis=-1)
+    y = y + std * rng.normal(size=y.shape)
     return Dataset(np.tile(t, (SEQUENCES, 1)), u, y, np.ones((SEQUENCES, ROWS), bool)), x
 
 
@@ -142,11 +158,13 @@ def _inertia(model: mujoco.MjModel) -> np.ndarray:
     return np.diag(mass)
 
 
-def declared(folder: Path, joints: int) -> Rig:
+def declared(folder: Path, joints: int, *, imu: bool = False) -> Rig:
     """The rig of the arm, written to a folder with its file."""
-    (folder / "arm.xml").write_text(arm(joints))
-    names = ", ".join(f'"joint{i + 1}"' for i in range(joints))
-    noise = "".join(f"joint{i + 1} = {NOISE}\n" for i in range(joints))
+    (folder / "arm.xml").write_text(machine(joints, imu=imu))
+    std = {f"joint{i + 1}": NOISE for i in range(joints - imu)}
+    std |= {f"hand_{kind}.{axis}": size for kind, size in IMU.items() for axis in "xyz" if imu}
+    names = ", ".join(f'"{name}"' for name in std)
+    noise = "".join(f"{name} = {size}\n" for name, size in std.items())
     (folder / "rig.toml").write_text(
         'format = 1\nname = "arm"\n[model]\ntype = "mjcf"\nfile = "arm.xml"\nfriction = "unknown"\n'
         f'[sampling]\ndt = {DT}\ninput_hold = "zero-order"\nclock = "sequence"\n'
@@ -167,6 +185,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--joints", type=int, default=6, choices=range(1, 7))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--imu", action="store_true", help="at the hand, in place of the last encoder")
     parser.add_argument("--lacks", choices=LACKS)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -182,9 +201,9 @@ def main() -> None:
     print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
     print("| --- " * (args.joints + 4) + "|")
     with TemporaryDirectory() as folder:
-        rig = declared(Path(folder), args.joints)
+        rig = declared(Path(folder), args.joints, imu=args.imu)
         for seed in range(args.seeds):
-            data, x = recorded(arm(args.joints), joints, seed)
+            data, x = recorded(machine(args.joints, imu=args.imu), joints, seed)
             began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))
             took, spent = time.perf_counter() - began, time.process_time() - spent

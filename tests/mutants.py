@@ -36,6 +36,7 @@ FISHER = "test_mstep.py::test_score_is_the_gradient_of_the_likelihood[slide]"
 DENSE_FISHER = "test_mstep.py::test_information_is_the_dense_fisher_information"
 RIDGE = "test_mstep.py::test_fit_of_parameters_alone_is_ridge_regression"
 MACHINES = "test_machines.py::test_"
+SENSORS = "test_sensors.py::test_"
 BRANCH = f"{MACHINES}mass_and_bias_are_those_of_mujoco[branch.xml]"
 LEFT_OUT = "test_mstep.py::test_sequences_that_are_not_used_have_no_weight"
 
@@ -962,6 +963,27 @@ MUTANTS = (
         "moved = scaled(mass / total, away)",
         "moved = scaled(0.0, away)",
         f"{MACHINES}payload_is_a_point_mass_at_the_site",
+    ),
+    Mutant(
+        "an accelerometer without what turning adds",
+        "systems/sensing.py",
+        "add(cross(turns, place), cross(spin, cross(spin, place)))",
+        "cross(turns, place)",
+        f"{SENSORS}readings_are_those_of_mujoco_under_torque_and_friction[branch]",
+    ),
+    Mutant(
+        "a sensor in the axes of its joint",
+        "systems/sensing.py",
+        "transposed(product(mount.turn, sense.turn))",
+        "transposed(mount.turn)",
+        f"{SENSORS}readings_are_those_of_mujoco_under_torque_and_friction[branch]",
+    ),
+    Mutant(
+        "friction that an accelerometer feels left out of the score",
+        "em/quadratic.py",
+        "score = score + jnp.concatenate([of_torque, of_readings])",
+        "score = score + jnp.concatenate([0 * of_torque, of_readings])",
+        f"{SENSORS}what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information",
     ),
     Mutant(
         "friction written back with the other sign",

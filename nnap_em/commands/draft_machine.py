@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.machine import Machine, machine_unit, packed, states
+from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
 from ..data.mjcf import read_machine
 from ..data.recordings.files import reader
 from ..data.recordings.recording import Address, Topic
@@ -30,8 +30,9 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         names = ", ".join(joint.name for joint in machine.joints)
         mend = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {mend}")
-    named = tuple(found)
-    machine = machine._replace(states=_called(machine, named))
+    found |= (sensed := _sensors(machine, topics))
+    named, senses = tuple(found), tuple(sense for sense in machine.senses if sense.name in sensed)
+    machine = machine._replace(states=_called(machine, named), senses=senses)
     spec, text = SystemSpec(machine.states, (), {}, len(machine.joints)), packed(machine)
     everything = found | {column: at for column, (at, _) in inputs.items()}
     table = _table(path, everything)
@@ -76,6 +77,22 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
                 out[sensor] = _first(fields, [sensor])
             elif at := at or kinds.get(f"{kind}{i + 1}"):
                 out[d + joint.name] = at
+    return out
+
+
+_IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
+"""What a ROS message of an inertial sensor calls its readings."""
+
+
+def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
+    """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
+    every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
+    for sense in machine.senses:
+        alone = sum(other.kind == sense.kind for other in machine.senses) == 3
+        usual = f"{_IMU[sense.kind]}.{'xyz'[sense.axis]}" if alone and sense.kind in _IMU else sense.name
+        at = [at for at in every if at.path == sense.name] or [at for at in every if at.path == usual]
+        if sense.kind in SENSE_UNITS and len(at) == 1:
+            out[sense.name] = at[0]
     return out
 
 

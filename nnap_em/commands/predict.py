@@ -16,5 +16,5 @@ def run(args: argparse.Namespace, say: Say) -> None:
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
     found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
-    write_states(args.out, logs, fitted.model.system.states, np.asarray(found.mean), np.asarray(found.std))
+    write_states(args.out, logs, fitted.model.system.readable, np.asarray(found.mean), np.asarray(found.std))
     say(f"wrote {len(logs.files)} files to {args.out}")

@@ -16,5 +16,5 @@ def run(args: argparse.Namespace, say: Say) -> None:
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
     state = smoothed_states(fitted, logs.data)
     std = np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
-    write_states(args.out, logs, fitted.model.system.states, np.asarray(state.mean), std)
+    write_states(args.out, logs, fitted.model.system.readable, np.asarray(state.mean), std)
     say(f"wrote {len(logs.files)} files to {args.out}")

@@ -1,12 +1,12 @@
 """What rig.toml declares of a machine that stands in a file: its names, its inputs, and what of it is uncertain."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
-from .machine import Machine, packed, states
+from .machine import SENSE_UNITS, Machine, Sense, packed, states
 from .mjcf import read_machine
-from .rig import Declared, RigWarning, SystemSpec, Told, nearest
+from .rig import Declared, RigWarning, SystemSpec, Told, flat, nearest
 
 OF_BODY = ("mass", "com.x", "com.y", "com.z", *(f"inertia.{axes}" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")))
 """In the frame of the body, the inertia about its centre of mass: kg, m, kg m^2."""
@@ -22,12 +22,16 @@ def declare(root: Any) -> Told:
     if not isinstance(model.items.get("file"), str) or not model.items["file"]:
         model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
     machine = read_machine(root.path.parent / str(model.items["file"]))
+    possible = tuple(sense.name for sense in machine.senses if sense.kind in SENSE_UNITS)
     machine = machine._replace(
-        file=str(model.items["file"]), states=_states(machine, root), rubs=model.items.get("friction") == "none"
+        file=str(model.items["file"]),
+        states=_states(machine, root),
+        rubs=model.items.get("friction") == "none",
+        senses=tuple(_senses(machine, root)),
     )
     _say_left_out(root, machine)
     columns, joints, gears, motored = _inputs(machine, root)
-    spec = SystemSpec(machine.states, (), {}, len(machine.joints))
+    spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model))
     return Told(spec, parameters, columns, joints, packed(machine._replace(gears=gears, motored=motored)))
 
@@ -51,6 +55,21 @@ def _states(machine: Machine, root: Any) -> tuple[str, ...]:
         twice = next(name for name in names if names.count(name) > 1)
         root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
     return tuple(names)
+
+
+def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
+    """The components of sensors that are measured."""
+    table = root.table("measurement")
+    wanted = table.items.get("columns")
+    for column in wanted if isinstance(wanted, list) else ():
+        for sense in machine.senses:
+            if sense.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
+                continue
+            if sense.kind not in SENSE_UNITS:
+                mend = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
+                table.refuse("columns", f"{column!r} is of a sensor of type {sense.kind}", mend)
+            if sense.name == column:
+                yield sense
 
 
 def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], tuple[float, ...], bool]:
@@ -102,7 +121,7 @@ def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
     given = {f"{body.name}.{what}": _of_body(body, what) for body in machine.bodies for what in OF_BODY}
     given |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
     owners = [one.name for one in (*machine.bodies, *machine.joints)]
-    for name, value in _flat(table.items):
+    for name, value in flat(table.items):
         owner, _, own = name.partition(".")
         if owner not in owners:
             table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
@@ -131,12 +150,3 @@ def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
     if (own in ("mass", *OF_JOINT) and numbers[0] < 0) or (own == "mass" and not numbers[0]):
         table.refuse(name, f"found mean = {numbers[0]}", "write a number above 0")
     return Declared(float(numbers[0]), float(numbers[1]))
-
-
-def _flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
-    """Dotted keys are tables inside tables."""
-    for key, value in items.items():
-        if isinstance(value, dict) and value and not set(value) & {"mean", "std"}:
-            yield from _flat(value, f"{before}{key}.")
-        else:
-            yield f"{before}{key}", value

@@ -81,6 +81,25 @@ class Spot(NamedTuple):
     """[m]"""
 
 
+class Sense(NamedTuple):
+    """A component of a sensor at a site; its column is called as the sensor with the component behind a dot."""
+
+    name: str
+    kind: str
+    """`gyro`, `accelerometer` or `framepos`; of what is not read here, MuJoCo's name for it."""
+    axis: int
+    body: int
+    """-1: the world."""
+    place: Vector
+    """Of the site in the frame of the body [m]."""
+    turn: Rotation
+    """Of the site in the frame of the body."""
+
+
+SENSE_UNITS = {"gyro": "rad/s", "accelerometer": "m/s^2", "framepos": "m"}
+"""Sensors that are read beside those of joints, and their units."""
+
+
 class Machine(NamedTuple):
     """A tree of bodies on a fixed base."""
 
@@ -100,6 +119,8 @@ class Machine(NamedTuple):
     """True where the inputs are motors of the file; False where rig.toml names joints."""
     rubs: bool = False
     """True where friction of the file acts, because none is learned."""
+    senses: tuple[Sense, ...] = ()
+    """Of a file all, of a rig those that are measured."""
 
 
 def packed(machine: Machine) -> str:
@@ -112,8 +133,8 @@ def unpacked(text: str) -> Machine:
     """The machine in a text of `packed`."""
     told = json.loads(text, parse_int=int)
     fields = [_tuples(part) for part in told]
-    kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "gauges": Gauge, "spots": Spot}
-    named = dict(zip(Machine._fields, fields, strict=True))
+    kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "gauges": Gauge, "spots": Spot, "senses": Sense}
+    named = dict(zip(Machine._fields, fields, strict=False))  # models that were saved before a field was there
     whole: dict[str, Any] = {
         name: tuple(kinds[name](*one) for one in value) if name in kinds else value for name, value in named.items()
     }
@@ -125,8 +146,11 @@ def _tuples(value):
 
 
 def machine_unit(text: str, name: str) -> str:
-    """The SI unit of a state or parameter of the machine in a text of `packed`."""
+    """The SI unit of a state, sensor or parameter of the machine in a text of `packed`."""
     machine = unpacked(text)
+    for sense in machine.senses:
+        if name == sense.name:
+            return SENSE_UNITS[sense.kind]
     dof, (owner, _, own) = len(machine.joints), name.partition(".")
     if name in machine.states:
         place = machine.states.index(name)

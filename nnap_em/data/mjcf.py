@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from .machine import Body, Gauge, Joint, Machine, Motor, Rotation, Spot, Vector
+from .machine import SENSE_UNITS, Body, Gauge, Joint, Machine, Motor, Rotation, Sense, Spot, Vector
 from .rig import RigError
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
@@ -40,6 +40,7 @@ def read_machine(path: Path) -> Machine:
             for i in range(model.nsite)
             if model.site_bodyid[i] > 0
         ),
+        senses=tuple(_senses(model)),
     )
     _refuse_names(path, machine)
     return machine
@@ -346,6 +347,24 @@ def _gauges(model: Any) -> Iterator[Gauge]:
         kind, rate = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTVEL)
         if kind in (int(kinds.mjSENS_JOINTPOS), rate):
             yield Gauge(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
+
+
+def _senses(model: Any) -> Iterator[Sense]:
+    """The components of every sensor that reads no joint."""
+    mujoco = _mujoco()
+    sites, joints = int(mujoco.mjtObj.mjOBJ_SITE), (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
+    for i in range(model.nsensor):
+        if int(model.sensor_type[i]) in map(int, joints):
+            continue
+        kind, at = mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_").lower(), -1
+        if int(model.sensor_objtype[i]) == sites and int(model.sensor_refid[i]) < 0:
+            at = int(model.sensor_objid[i])
+        elif kind in SENSE_UNITS:
+            kind = f"{kind} of no site, or in no frame of the world"
+        place, turn = (model.site_pos[at], model.site_quat[at]) if at >= 0 else (np.zeros(3), np.array([1.0, 0, 0, 0]))
+        body = int(model.site_bodyid[at]) - 1 if at >= 0 else -1
+        for axis, letter in enumerate("xyz"):
+            yield Sense(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:

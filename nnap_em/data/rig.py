@@ -1,15 +1,16 @@
 """What the owner declares about a rig: `rig.toml` in, `Rig` out, every mistake refused with its mend."""
 
+import dataclasses
 import difflib
 import json
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds
@@ -71,6 +72,8 @@ class SystemSpec:
     joints: int
     driven: int = 1
     """The joint that an input drives whose name does not tell it."""
+    sensors: tuple[str, ...] = ()
+    """Columns that are read beside states."""
     declare: "Callable[[_Table], Told] | None" = None
     """For a system whose names come from a file that rig.toml names: what the file and the whole table declare."""
 
@@ -195,6 +198,15 @@ def write_rig(rig: Rig, path: Path) -> None:
 def toml_text(text: str) -> str:
     """A text as TOML writes it."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL
+
+
+def flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
+    """Every key with its value; dotted keys are tables inside tables, but for a number with its uncertainty."""
+    for key, value in items.items():
+        if isinstance(value, dict) and value and not set(value) & {"mean", "std"}:
+            yield from flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value
 
 
 def nearest(word: str, known: Collection[str]) -> str:
@@ -343,9 +355,11 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
     if not columns:
         table.refuse("columns")
     for column in columns:
-        if column not in spec.states:
-            table.refuse("columns", f"{column!r} is no state of this system", nearest(column, spec.states))
+        if column not in spec.states + spec.sensors:
+            what = "no state or sensor" if spec.sensors else "no state"
+            table.refuse("columns", f"{column!r} is {what} of this system", nearest(column, spec.states + spec.sensors))
     noise = table.table("noise_std", absent={})
+    noise = dataclasses.replace(noise, items=dict(flat(noise.items)))
     noise.check((), columns)
     return columns, {column: noise.positive(column) for column in noise.items}
 

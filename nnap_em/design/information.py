@@ -13,7 +13,7 @@ from ..data.dataset import Dataset
 from ..em.identify import Identified
 from ..em.local import local
 from ..em.prior import ParameterPrior
-from ..em.quadratic import Local, friction_columns, whitened_sensitivities
+from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
 from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -85,12 +85,16 @@ POINTS = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
 """Three points of the same mean and variance as a normal distribution [standard deviations]."""
 
 
-def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time state phi"]:
-    """Sensitivity of the next state to phi; friction is felt at all speeds that the path may have."""
-    dof = fit.nodes.shape[0]
+def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
+    """All that the path may have."""
     v = path.mean[:, None, dof : 2 * dof]
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(path.cov, axis1=1, axis2=2), 0.0))[:, None, dof : 2 * dof]
-    speeds = v + std * jnp.asarray(POINTS, v.dtype)[None, :, None]
+    return v + std * jnp.asarray(POINTS, v.dtype)[None, :, None]
+
+
+def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time state phi"]:
+    """Sensitivity of the next state to phi; friction is felt at all speeds that the path may have."""
+    speeds = _speeds(path, fit.nodes.shape[0])
     torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, here.by_force)
     return jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter], axis=-1), 0.0)
 
@@ -98,8 +102,7 @@ def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time stat
 def _sensitivities(fit: Fit, here: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
     """Of the whitened readings to phi."""
     columns = columns_of(fit, here, path)
-    still = jnp.zeros((*here.seq.y.shape, fit.nodes.size), columns.dtype)
-    readings = jnp.concatenate([still, here.reading_by_parameter], axis=-1)
+    readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), here)
     jac = whitened_sensitivities(filtered, columns, readings, here.seq.observed)
     return jac.reshape(-1, jac.shape[-1])
 

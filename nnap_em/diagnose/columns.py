@@ -31,8 +31,10 @@ class Track(NamedTuple):
     """Generalised force of the inputs over every step [N m]."""
     friction: Float[Array, "*time dof"]
     """Torque of the learned map in the middle of every step [N m]."""
-    rate: Float[Array, "*time state"]
-    """Time derivative of (q, v) in every row."""
+    true: Float[Array, "*time readable"]
+    """What sensors without a fault would read in every row."""
+    rate: Float[Array, "*time readable"]
+    """Time derivative of that."""
     inputs: Inputs
     """What acts on the fitted model from outside."""
 
@@ -50,9 +52,11 @@ def _track(null: StateSpaceModel, one) -> Track:
     now = rate(mean, inputs)
     middle = mean + 0.5 * null.dt * now
     acceleration = rate(middle, inputs)[:, dof : 2 * dof]
-    past = now[:, : 2 * dof].at[0].set(0.0)  # the first row has none
+    along = lambda x, rate, u: jax.jvp(lambda x: null.true(x, u), (x,), (rate,))  # noqa: E731
+    true, past = jax.vmap(along)(mean, now, inputs)
+    past = past.at[0].set(0.0)  # the first row has none
     drive, friction = jax.vmap(null.system.drive)(inputs.u), jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
-    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, drive, friction, past, inputs)
+    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
 
 
 def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
@@ -74,11 +78,11 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
 
     force = jax.vmap(one)(driven, memory, track.acceleration) + drive - scenes.drive
 
-    def read(x, rate):
-        read = hooks.read(alone, system.coordinates + system.rates, x, lambda delay: x - delay * rate)
-        return jnp.stack([read[i] - x[i] for i in base.measured])
+    def read(true, rate):
+        read = hooks.read(alone, system.readable, true, lambda delay: true - delay * rate)
+        return jnp.stack([read[i] - true[i] for i in base.measured])
 
-    return Columns(force, jax.vmap(read)(x, track.rate))
+    return Columns(force, jax.vmap(read)(track.true, track.rate))
 
 
 def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:

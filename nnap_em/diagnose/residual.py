@@ -5,7 +5,7 @@ Innovations of a right model are white, normal, of variance 1, and have nothing 
 with Applications to Tracking and Navigation", section 5.4]
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import jax
@@ -42,11 +42,15 @@ class Names(NamedTuple):
     joints: tuple[int, ...]
     """Joint (counted from 1) that each input drives."""
     measured: tuple[str, ...]
+    sensors: Mapping[str, str] = {}
+    """Those that read no state, with their units."""
 
     def unit(self, name: str) -> str:
-        """SI unit of a state, an input or `time`."""
+        """SI unit of a state, a sensor, an input or `time`."""
         if name == "time":
             return "s"
+        if name in self.sensors:
+            return self.sensors[name]
         if name in self.inputs:
             return self.force_unit(self.joints[self.inputs.index(name)])
         place = (self.coordinates + self.rates).index(name)
@@ -118,8 +122,9 @@ def names_of(fitted: Identified) -> Names:
     """Names of the columns of `residual(fitted, ...)`."""
     system, rig = fitted.model.system, fitted.rig
     return Names(
-        system.coordinates, system.rates, tuple(system.angles), rig.input_columns, tuple(system.joints), rig.measured
-    )
+        system.coordinates, system.rates, tuple(system.angles), rig.input_columns, tuple(system.joints), rig.measured,
+        system.sensors,
+    )  # fmt: skip
 
 
 def _left(common, one) -> tuple[Float[Array, "time column"], ...]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..effects import Candidate
 from ..em.local import locals_along
+from ..em.multistep import read_columns
 from ..em.quadratic import friction_columns, whitened_sensitivities
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
@@ -43,13 +44,12 @@ class Sheet(NamedTuple):
 def _sheet(common, one) -> tuple[Float[Array, " column"], Float[Array, "column column"]]:
     """Score and information of one sequence."""
     (log_q, log_r, start, nodes), (here, middle, found) = common, one
-    dof, y = nodes.shape[0], here.seq.y
+    dof = nodes.shape[0]
     filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
     moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
-    of_torque = jnp.zeros((*y.shape, torque.shape[-1]), y.dtype)
     states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-    readings = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
+    readings = read_columns(nodes, here, middle, found)
     states = jnp.where(here.seq.active[:, None, None], states, 0.0)
     jac = whitened_sensitivities(filtered, states, readings, here.seq.observed).reshape(-1, states.shape[-1])
     return jac.T @ filtered.innovation.ravel(), jac.T @ jac

@@ -179,7 +179,7 @@ class AbstractEffect(eqx.Module):
 
     def units_on(self, system: AbstractSystem) -> dict[str, str]:
         """Units of the reported parameters on this machine and channel."""
-        if self.channel in system.coordinates + system.rates:
+        if self.channel in system.readable:
             return {name: unit.replace(CHANNEL, system.unit(self.channel)) for name, unit in self.units.items()}
         if self.joint is None:
             return self.units | self.units_free

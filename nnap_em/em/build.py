@@ -148,6 +148,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     noise = [
         d if d is not None else max(2 * reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i, d in enumerate(declared)
     ]
+    places = [system.readable.index(name) for name in rig.measured]
+    shaken = _shaken(system, scales)[places]
     unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
     if rig.friction:
         speed, scale = jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque)
@@ -158,8 +160,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         unknown=unknown,
         start=start,
         log_q=jnp.asarray(2 * np.log(np.concatenate([kick * rig.dt, kick]))),
-        log_r=jnp.asarray(2 * np.log(noise)),
-        measured=tuple(states.index(n) for n in rig.measured),
+        log_r=jnp.asarray(2 * np.log(np.hypot(noise, shaken))),
+        measured=tuple(places),
         dt=rig.dt,
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
@@ -168,8 +170,21 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         jnp.asarray([rig.parameters[n].mean for n in free]),
         jnp.asarray([rig.parameters[n].std for n in free]),
     )
-    mstep = ScoringMStep(prior, unknown.weights(), open_, tuple(d is None for d in declared), shape=model.log_q)
+    estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
+    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, shape=model.log_q)
     return Problem(model, mstep, start_bank(model, states, rig, system))
+
+
+def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
+    """How far accelerations as large as those in the logs move a reading: as little is known of forces at first."""
+    dof = len(system.coordinates)
+    still, out = jnp.zeros(dof), np.zeros(len(system.readable))
+    if system.sensors:
+        q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
+        felt = lambda a, q: jnp.stack(system.senses(q, still, tuple(a)))  # noqa: E731
+        slope = np.asarray(jax.jit(jax.vmap(jax.jacfwd(felt), (None, 0)))(still, q))
+        out[2 * dof :] = np.sqrt(np.mean(np.sum((slope * scales.acceleration) ** 2, axis=-1), axis=0))
+    return out
 
 
 def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:

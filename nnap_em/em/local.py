@@ -23,13 +23,19 @@ def local(
     prepared = prepare(model, seq)
     affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, prepared.inputs)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, prepared.inputs)
-    return Local(prepared, affine, reading, *_sensitivities(model, prior, path.mean, seq, prepared.inputs))
+    by_force, by_parameter, feels, of_reading = _sensitivities(model, prior, path.mean, seq, prepared.inputs)
+    return Local(prepared, affine, reading, by_force, by_parameter, of_reading, feels)
 
 
 def _sensitivities(
     model: StateSpaceModel, prior: ParameterPrior, path: Float[Array, "time state"], seq: Dataset, inputs: Inputs
-) -> tuple[Float[Array, "time state dof"], Float[Array, "time state param"], Float[Array, "time obs param"]]:
-    """Of the next state to a force held over the step, and of next state and reading to the parameters."""
+) -> tuple[
+    Float[Array, "time state dof"],
+    Float[Array, "time state param"],
+    Float[Array, "time obs dof"] | None,
+    Float[Array, "time obs param"],
+]:
+    """Of next state and reading to a force held over the step, and to the parameters."""
     value, held = prior.read(model), prior.held(model)
     free = np.flatnonzero(~held)
     dof = len(model.system.coordinates)
@@ -40,7 +46,7 @@ def _sensitivities(
     def row(x, u, by_z):
         def both(z, u):
             now = prior.write(model, value.at[free].set(z[dof:]))
-            return now.transition(x, u, z[:dof]), now.emission(x, u)
+            return now.transition(x, u, z[:dof]), now.emission(x, u, z[:dof])
 
         def along(dz, du):
             return jax.jvp(both, (z, u), (dz, du))[1]
@@ -52,13 +58,15 @@ def _sensitivities(
             return sum((e.force(scene, nothing) for e in now.effects if e.held), still)
 
         moved, read = jax.vmap(along, in_axes=(0, -1), out_axes=-1)(jnp.eye(z.shape[0], dtype=z.dtype), by_z)
-        by_force = moved[:, :dof]
+        by_force, feels = moved[:, :dof], read[:, :dof] if model.system.sensors else None
         by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, dof:])
+        of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, dof:])
         if held.any():
             middle = x + 0.5 * model.dt * model.rate(x, u, still)
-            by_parameter = by_parameter.at[:, held].set(by_force @ jax.jacfwd(pushed)(value[held]))
-        of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, dof:])
-        return by_force, by_parameter, of_reading
+            push = jax.jacfwd(pushed)(value[held])
+            by_parameter = by_parameter.at[:, held].set(by_force @ push)
+            of_reading = of_reading if feels is None else of_reading.at[:, held].set(feels @ push)
+        return by_force, by_parameter, feels, of_reading
 
     return jax.vmap(row)(path, inputs, by_z)
 

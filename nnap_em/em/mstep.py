@@ -111,6 +111,20 @@ def _widened(prior: ParameterPrior, w, here: Local, path: Gaussian, pad: int):
 
 
 @eqx.filter_jit
+def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
+    """`log_r` where it is no less than what the kicks of a step, felt as accelerations, do to a reading on average."""
+    assert here.reading_by_force is not None
+    dof = here.by_force.shape[-1]
+    kick = jnp.swapaxes(here.by_force[..., dof : 2 * dof, :], -1, -2)  # of a unit force on every joint
+    felt = jnp.linalg.solve(kick, jnp.swapaxes(here.reading_by_force, -1, -2))  # dof obs: of a unit kick
+    known = here.seq.active[..., None] & jnp.all(jnp.isfinite(felt), axis=-2)
+    square = jnp.einsum("stdo,d->sto", felt**2, jnp.exp(log_q[dof : 2 * dof]))
+    count = jnp.sum(known, axis=(0, 1), dtype=square.dtype)
+    mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(count, 1.0)
+    return jnp.maximum(log_r, jnp.log(mean))
+
+
+@eqx.filter_jit
 def _narrowed(core: Core, hessian, pad: int):
     """Without the last `pad` parameters."""
     size = core.w.shape[0] - pad
@@ -203,6 +217,8 @@ class ScoringMStep(AbstractMStep):
         terms = each(_quadratic, common, (here, posterior, read))
         asked = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
         core, hessian, used = _advance(*asked)
+        if here.reading_by_force is not None:
+            core = core._replace(log_r=_shaken(here, core.log_q, core.log_r))
         return *_narrowed(core, hessian, pad), used
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:

@@ -21,7 +21,7 @@ from ..smoother.kalman import CUBATURE, kalman_filter
 from .local import locals_along
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
-from .quadratic import Local, friction_columns
+from .quadratic import Local, friction_columns, reading_columns
 from .shape import friction_prior
 from .weights import Weights
 
@@ -80,9 +80,9 @@ def starts(model: StateSpaceModel, data: Dataset) -> Int[np.ndarray, " start"]:
 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
-    """Places in y of what is looked at: measured coordinates, or where there are none whatever is measured."""
-    dof = len(model.system.coordinates)
-    return tuple(i for i, s in enumerate(model.measured) if s < dof) or tuple(range(len(model.measured)))
+    """Places in y of what is looked at: measured coordinates and sensors, or where there are none all."""
+    rates = range(dof := len(model.system.coordinates), 2 * dof)
+    return tuple(i for i, s in enumerate(model.measured) if s not in rates) or tuple(range(len(model.measured)))
 
 
 def forks(
@@ -163,6 +163,17 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
     return jnp.stack([known[starts + age] - read[age - 1] for age in grid.ages], axis=1)
 
 
+def read_columns(
+    nodes: Float[Array, "dof count"], here: Local, middle: Float[Array, "time state"], found: Columns
+) -> Float[Array, "time obs column"]:
+    """How friction nodes, parameters and what was `found` move the readings of one sequence."""
+    dof = nodes.shape[0]
+    own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], here), jnp.moveaxis(found.reading, 0, -1)
+    if here.reading_by_force is not None:
+        read = read + jnp.einsum("tod,ctd->toc", here.reading_by_force, found.force)
+    return jnp.concatenate([own, read], axis=-1)
+
+
 def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     """How every column moves the predictions of one sequence."""
     (nodes, grid), (here, gain, middle, found) = common, one
@@ -170,9 +181,8 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     dof = nodes.shape[0]
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], here.by_force)
     moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    read = read_columns(nodes, here, middle, found)
     push = jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter, moved], axis=-1), 0.0)
-    of_torque = jnp.zeros((*found.reading.shape[1:], torque.shape[-1]), torque.dtype)
-    read = jnp.concatenate([of_torque, here.reading_by_parameter, jnp.moveaxis(found.reading, 0, -1)], axis=-1)
     matrix, rows, gain, push, read = single((here.affine.matrix, here.reading.rows, gain, push, read))
 
     def absorb(s, slices):

@@ -22,13 +22,13 @@ HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Prediction(NamedTuple):
-    """Mean and standard deviation of the noise-free state, for every row of the data.
+    """Mean and standard deviation of the noise-free state, and of sensors beside it, for every row of the data.
 
     What is measured is as its sensor would read it: with a biased sensor the bias is in.
     """
 
-    mean: Float[Array, "seq time state"]
-    std: Float[Array, "seq time state"]
+    mean: Float[Array, "seq time readable"]
+    std: Float[Array, "seq time readable"]
     ahead: Bool[Array, "seq time"]
     """Rows later than the given time; the others are smoothed."""
 
@@ -86,7 +86,7 @@ class Paths(NamedTuple):
         def one(x, u, table, parameters):
             force = jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table)
             now = self.prior.write(self.model, parameters)
-            return now.transition(x, u, force), now.shown(x, u)
+            return now.transition(x, u, force), now.shown(x, u, force)
 
         return jax.vmap(one)(x, u, self.tables, self.parameters)
 
@@ -100,7 +100,7 @@ def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
     return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
 
 
-def _roll(common: Paths, one) -> tuple[Float[Array, "time state"], Float[Array, "time state"]]:
+def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Array, "time readable"]]:
     """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
     model, tables = common.model, common.tables
     (mean, cov), seq, known, key = one

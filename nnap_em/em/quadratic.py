@@ -22,6 +22,8 @@ class Local(NamedTuple):
     """Sensitivity of the next state to a force held over the step."""
     by_parameter: Float[Array, "*time state param"]
     reading_by_parameter: Float[Array, "*time obs param"]
+    reading_by_force: Float[Array, "*time obs dof"] | None = None
+    """Of the reading to a force that acts at its moment; None where no sensor feels one."""
 
 
 class Quadratic(NamedTuple):
@@ -81,6 +83,16 @@ def friction_columns(
     return (by_force[:, :, None] * weights[None]).reshape(by_force.shape[0], -1)
 
 
+def reading_columns(
+    nodes: Float[Array, "dof count"], speed: Float[Array, "time node dof"], here: Local
+) -> Float[Array, "time obs phi"]:
+    """Sensitivity of the readings of a sequence to phi, the torques mean over some speeds in every row."""
+    torque = jnp.zeros((*here.seq.y.shape, nodes.size), speed.dtype)
+    if here.reading_by_force is not None:
+        torque = jax.vmap(lambda v, b: friction_columns(nodes, v, b))(speed, here.reading_by_force)
+    return jnp.concatenate([torque, here.reading_by_parameter], axis=-1)
+
+
 def quadratic(
     log_q: Float[Array, " state"],
     log_r: Float[Array, " obs"],
@@ -119,9 +131,13 @@ def quadratic(
     misfit = jnp.mean(miss**2, axis=1)
     score_r = 0.5 * jnp.sum(jnp.where(observed, misfit / r[None] - 1.0, 0.0), axis=0)
     weighed = jnp.where(observed, jnp.mean(miss, axis=1) / r[None], 0.0)
-    params = here.by_parameter.shape[-1]
+    rates = jnp.concatenate([posterior.prev, posterior.next[-1:]])[..., dof : 2 * dof]
+    of_torque = jnp.zeros(nodes.size, score.dtype)
+    if here.reading_by_force is not None:
+        each = jnp.where(observed[:, None], miss / r[None, None], 0.0) @ here.reading_by_force / miss.shape[1]
+        of_torque = jnp.sum(jax.vmap(lambda v, pull: spread(nodes, v, pull))(rates, each), axis=0).ravel()
     of_readings = jnp.einsum("to,top->p", weighed, here.reading_by_parameter)
-    score = score + jnp.concatenate([jnp.zeros(score.shape[0] - params, score.dtype), of_readings])
+    score = score + jnp.concatenate([of_torque, of_readings])
 
     def noise_filter(log_q, log_r):
         filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
@@ -133,8 +149,6 @@ def quadratic(
     noise_information = jac_e.T @ jac_e + 0.5 * jac_s.T @ jac_s
 
     padded = jnp.concatenate([jnp.where(inside[:, None, None], sensitivity, 0.0), jnp.zeros_like(sensitivity[:1])])
-    of_torque = jnp.zeros((*misfit.shape, sensitivity.shape[-1] - params), misfit.dtype)
-    readings = jnp.concatenate([of_torque, here.reading_by_parameter], axis=-1)
-    jac = whitened_sensitivities(filtered, padded, readings, observed)
+    jac = whitened_sensitivities(filtered, padded, reading_columns(nodes, rates, here), observed)
     jac = jac.reshape(-1, jac.shape[-1])
     return Quadratic(score, jac.T @ jac, jnp.concatenate([score_q, score_r]), noise_information)

@@ -21,7 +21,7 @@ class AbstractModel(eqx.Module):
     log_r: eqx.AbstractVar[Float[Array, " obs"]]
     """Log of the measurement variance."""
     measured: eqx.AbstractVar[tuple[int, ...]]
-    """Which states are read, in the order of y."""
+    """Places of what is read among all that may be, states first, in the order of y."""
     dt: eqx.AbstractVar[float]
     """Sample interval [s]."""
 

@@ -1,7 +1,7 @@
-"""The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k) + v_k."""
+"""The hidden Markov model: x_{k+1} = f(x_k, u_k) + w_k, y_k = g(x_k, u_k) + v_k."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..data.dataset import Dataset
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..numerics.gaussian import Gaussian
-from ..numerics.ode import integrate
+from ..numerics.ode import apart, integrate
 from ..systems.base import AbstractSystem
 from . import hooks
 from .base import AbstractModel
@@ -53,7 +53,7 @@ class StateSpaceModel(AbstractModel):
     log_r: Float[Array, " obs"]
     """Log of the measurement variance."""
     measured: tuple[int, ...] = eqx.field(static=True)
-    """Which states are read, in the order of y."""
+    """Places in `system.readable` of what is read, in the order of y."""
     dt: float = eqx.field(static=True)
     """Sample interval [s]."""
     substeps: int = eqx.field(static=True, default=2)
@@ -61,7 +61,7 @@ class StateSpaceModel(AbstractModel):
     """What the declared physics lacks."""
 
     def __str__(self) -> str:
-        names = self.system.coordinates + self.system.rates
+        names = self.system.readable
         noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)
         reads = ", ".join(f"{name} (noise {std:.2g} {self.system.unit(name)})" for name, std in noise)
         found = [self._described(effect) for effect in self.effects]
@@ -106,26 +106,47 @@ class StateSpaceModel(AbstractModel):
         """Integration steps of one sample, as many as the stiffest effect asks for."""
         return max([self.substeps, *(effect.substeps for effect in self.effects)])
 
-    def readable(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " readable"]:
-        """What sensors on all coordinates and rates would read without noise."""
-        names = self.system.coordinates + self.system.rates
+    def true(
+        self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
+    ) -> Float[Array, " readable"]:
+        """Coordinates, rates, and what the sensors beside these feel, at inputs u and an extra generalised force."""
+        dof, count = len(self.system.coordinates), len(self.system.sensors)
+        if not count:
+            return x[: 2 * dof]
+        extra = jnp.zeros(dof, x.dtype) if force is None else force
+
+        def senses(x: Float[Array, " state"]) -> Sequence[Scalar]:
+            scene = self.scene(x, u)
+            return self.system.senses(scene.q, scene.v, hooks.acceleration(self.effects, scene, x[2 * dof :], extra))
+
+        return jnp.concatenate([x[: 2 * dof], jnp.stack(apart(senses, x, count))])
+
+    def readable(
+        self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
+    ) -> Float[Array, " readable"]:
+        """What sensors on all coordinates and rates, and the others, would read without noise."""
+        names = self.system.readable
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
             """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
             before, reach = u._replace(u=u.before), jnp.minimum(delay, u.age)
             still = jnp.zeros(len(self.system.coordinates), x.dtype)
-            return integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3)[: len(names)]
+            return self.true(integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3), before, force)
 
-        return hooks.read(self.effects, names, x[: len(names)], past)
+        return hooks.read(self.effects, names, self.true(x, u, force), past)
 
-    def shown(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " readable"]:
-        """Coordinates and rates; those that are measured as their sensors read them."""
-        r = self.readable(x, u)
-        return jnp.stack([r[i] if i in self.measured else x[i] for i in range(r.shape[0])])
+    def shown(
+        self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
+    ) -> Float[Array, " readable"]:
+        """Coordinates, rates and sensors; those that are measured as their sensors read them."""
+        r, true = self.readable(x, u, force), self.true(x, u, force)
+        return jnp.stack([r[i] if i in self.measured else true[i] for i in range(r.shape[0])])
 
-    def emission(self, x: Float[Array, " state"], u: Inputs) -> Float[Array, " obs"]:
-        """Mean of the reading."""
-        r = self.readable(x, u)
+    def emission(
+        self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
+    ) -> Float[Array, " obs"]:
+        """Mean of the reading at the state x, and at the input that is held from then on."""
+        r = self.readable(x, u, force)
         return jnp.stack([r[i] for i in self.measured])
 
 

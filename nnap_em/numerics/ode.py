@@ -72,3 +72,19 @@ def integrate(
 
     entries, _ = jax.lax.scan(body, tuple(x), None, length=substeps)
     return jnp.stack(entries)
+
+
+def apart(
+    function: Callable[[Float[Array, " state"]], Sequence[Float[Array, ""]]], x: Float[Array, " state"], count: int
+) -> tuple[Float[Array, ""], ...]:
+    """The `count` results of `function(x)` in a compiled loop of their own, as the stages of an interval are.
+
+    Outside of one a recursion over joints is computed anew for every entry that is read of it: 357 us against 4 for the
+    slopes of six readings at six joints. Both passes give the same; a loop of one pass would be unrolled.
+    """
+
+    def again(carry, _):
+        return (carry[0], tuple(function(jnp.stack(carry[0])))), None
+
+    (_, found), _ = jax.lax.scan(again, (tuple(x), (jnp.zeros((), x.dtype),) * count), None, length=2)
+    return found

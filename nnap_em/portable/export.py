@@ -57,6 +57,7 @@ def parameters(fitted: Identified) -> dict[str, Any]:
             {"name": n, "joint": j, "unit": system.force_unit(j)}
             for n, j in zip(rig.input_columns, rig.input_joints, strict=True)
         ],
+        "sensors": [{"name": name, "unit": unit} for name, unit in system.sensors.items()],
         "measured": list(rig.measured),
         "dt": {"value": model.dt, "unit": "s"},
         "parameters": {
@@ -112,20 +113,21 @@ def predictor(fitted: Identified) -> str:
         read = prior.write(model, z).emission
         return read(x, _row(model, u)), jax.jacfwd(read)(x, _row(model, u))
 
-    def shown(x, u, z):
+    def shown(x, u, force, z):
         show = prior.write(model, z).shown
-        return show(x, _row(model, u)), jax.jacfwd(show)(x, _row(model, u))
+        return show(x, _row(model, u), force), jax.jacfwd(show)(x, _row(model, u), force)
 
     functions = [
         _unrolled("rate", rate, x=x, u=u, force=force, z=z),
         _unrolled("reading", reading, x=x, u=u, z=z),
-        _unrolled("shown", shown, x=x, u=u, z=z),
+        _unrolled("shown", shown, x=x, u=u, force=force, z=z),
     ]
     weights, bank = fitted.m_step.weights(model), fitted.bank.padded(len(_states(model)))
     numbers = {
         "states": _states(model),
         "measured": rig.measured,
         "inputs": rig.input_columns,
+        "sensors": tuple(model.system.sensors),
         "dt": model.dt,
         "substeps": model.steps,
         "dressed": bool(model.effects),
@@ -148,6 +150,8 @@ def predictor(fitted: Identified) -> str:
     states = ", ".join(f"{n} [{model.system.unit(n)}]" for n in _states(model)[: 2 * len(force)])
     drives = zip(rig.input_columns, map(model.system.force_unit, rig.input_joints), strict=True)
     inputs = ", ".join(f"{name} [{unit}]" for name, unit in drives) or "none"
+    sensors = ", ".join(f"{name} [{unit}]" for name, unit in model.system.sensors.items())
+    inputs += f".  Sensors: {sensors}" if sensors else ""
     units = f'States: {states}.  Inputs: {inputs}.\n"""\n'
     model_ = f"MODEL = Model(\n{fields}\n    rate=rate,\n    reading=reading,\n    shown=shown,\n)\n"
     tail = 'if __name__ == "__main__":\n    main(MODEL)\n'

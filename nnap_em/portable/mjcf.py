@@ -151,6 +151,12 @@ def _model(machine: Machine, system: Tree, curves: list[Friction]) -> ET.Element
     for gauge in machine.gauges:
         kind = "jointvel" if gauge.rate else "jointpos"
         ET.SubElement(sensors, kind, name=gauge.name, joint=machine.joints[gauge.joint].name)
+    for name, sense in {one.name.rpartition(".")[0]: one for one in machine.senses}.items():
+        axes = _text(*(row[0] for row in sense.turn), *(row[1] for row in sense.turn))
+        where = places[sense.body] if sense.body >= 0 else world
+        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sense.place), xyaxes=axes)
+        at = {"objtype": "site", "objname": f"{name}_site"} if sense.kind == "framepos" else {"site": f"{name}_site"}
+        ET.SubElement(sensors, sense.kind, {"name": name, **at})
     return root
 
 

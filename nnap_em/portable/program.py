@@ -17,6 +17,8 @@ class Model(NamedTuple):
     states: tuple[str, ...]
     measured: tuple[str, ...]
     inputs: tuple[str, ...]
+    sensors: tuple[str, ...]
+    """What is shown beside positions and rates."""
     dt: float
     substeps: int
     dressed: bool
@@ -109,16 +111,16 @@ def predict(
     tables, z = deviations[:, : dof * nodes].reshape(-1, dof, nodes), model.parameters + deviations[:, dof * nodes :]
     past, cov = smooth(model, time[: last + 1], u[: last + 1], y[: last + 1])
     inputs = rows_of(model, time, u)
-    mean, std = np.empty((len(time), 2 * dof)), np.empty((len(time), 2 * dof))
+    mean, std = np.empty((2, len(time), 2 * dof + len(model.sensors)))
     with np.errstate(all="ignore"):
-        mean[: last + 1], rows = _linear(model.shown, past, inputs[: last + 1], model.parameters)
+        mean[: last + 1], rows = _shown(model, past, inputs[: last + 1], np.zeros(dof), model.parameters)
         std[: last + 1] = np.sqrt(np.einsum("tij,tjk,tik->ti", rows, cov, rows))
         x = past[last] + start @ _cholesky(cov[last] + 1e-16 * np.eye(n)).T
         for k in range(last, len(time)):
-            if k > last:
-                shown = _linear(model.shown, x, inputs[k], z)[0]
-                mean[k], std[k] = shown.mean(0), shown.std(0)
             force = _between(model.nodes, tables, x[:, dof : 2 * dof])
+            if k > last:
+                shown = _shown(model, x, inputs[k], force, z)[0]
+                mean[k], std[k] = shown.mean(0), shown.std(0)
             x = transition(model, x, inputs[k], force, z) + noise[k] * np.exp(0.5 * model.log_q)
     return Prediction(mean, std, np.arange(len(time)) > last)
 
@@ -212,6 +214,11 @@ def _linear(function: Callable[..., Any], x: np.ndarray, u: np.ndarray, z: np.nd
     return _joined(value, shape), _joined(rows, shape).reshape(*shape, len(value), x.shape[-1])
 
 
+def _shown(model: Model, x: np.ndarray, u: np.ndarray, force: np.ndarray, z: np.ndarray):
+    """All that is shown, under an extra force, and its Jacobian."""
+    return _linear(lambda x, u, z: model.shown(x, u, _parts(force), z), x, u, z)
+
+
 def _between(nodes: np.ndarray, tables: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Tabulated torques at the velocities of each sample, constant beyond the ends."""
     out = np.empty_like(v)
@@ -261,7 +268,7 @@ def main(model: Model) -> None:
         np.array([column(name) for name in names]).T.reshape(len(time), -1) for names in (model.inputs, model.measured)
     )
     found = predict(model, time, u, y, args.given, seed=args.seed)
-    names = model.states[: found.mean.shape[1]]
+    names = model.states[: 2 * len(model.nodes)] + model.sensors
     with open(args.out, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["time", *names, *(f"{name}_std" for name in names)])

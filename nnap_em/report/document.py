@@ -26,7 +26,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "format": 1,
         "rig": fitted.rig.name,
         "system": fitted.rig.system,
-        "units": {name: system.unit(name) for name in system.coordinates + system.rates},
+        "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
         "untold": sentences(felt(fitted.rig, system)),
@@ -55,12 +55,12 @@ def parameters(fitted: Identified) -> dict[str, Any]:
 
 def noise(fitted: Identified) -> dict[str, Any]:
     """Standard deviations of readings, and of what pushes the states in every step."""
-    system, declared = fitted.model.system, fitted.rig.noise_std
+    system, estimated = fitted.model.system, fitted.m_step.learn_r
     reading, kick = (np.exp(0.5 * np.asarray(log)).tolist() for log in (fitted.model.log_r, fitted.model.log_q))
     return {
         "measurement": {
-            name: {"std": std, "estimated": name not in declared, "unit": system.unit(name)}
-            for name, std in zip(fitted.rig.measured, reading, strict=True)
+            name: {"std": std, "estimated": learned, "unit": system.unit(name)}
+            for name, std, learned in zip(fitted.rig.measured, reading, estimated, strict=True)
         },
         "process_per_step": {
             name: {"std": std, "unit": system.unit(name)}

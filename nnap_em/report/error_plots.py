@@ -66,8 +66,8 @@ def prediction_figure(
     *,
     title: str | None = None,
 ) -> Figure:
-    """Predicted distributions of every state; readings up to `given` [s] were used."""
-    states = (*names.coordinates, *names.rates)
+    """Predicted distributions of every state and sensor; readings up to `given` [s] were used."""
+    states = (*names.coordinates, *names.rates, *names.sensors)
     columns = 1 if len(states) <= ACROSS else 2
     deep = -(-len(states) // columns)
     figure = Figure(figsize=(7.6 if columns == 1 else 10.4, 1.75 * deep + 0.7), layout="constrained")

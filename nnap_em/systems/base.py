@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -28,6 +28,9 @@ class AbstractSystem(eqx.Module):
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {}
     """How a body may differ: (effect, joint) to (system, amount) -> system and system -> typical amount."""
 
+    sensors: ClassVar[dict[str, str]] = {}
+    """Columns of sensors that are read beside coordinates and rates, in the order of `senses`, and their SI units."""
+
     joints: eqx.AbstractVar[tuple[int, ...]]
     """The joint (counted from 1) that each input drives."""
 
@@ -42,6 +45,11 @@ class AbstractSystem(eqx.Module):
     def states(self) -> tuple[str, ...]:
         """Coordinates, then rates."""
         return self.coordinates + self.rates
+
+    @property
+    def readable(self) -> tuple[str, ...]:
+        """All that may be measured: coordinates, rates, then sensors."""
+        return self.states + tuple(self.sensors)
 
     def parameter(self, name: str) -> Any:
         """A parameter by the name that `rig.toml` gives it."""
@@ -66,8 +74,10 @@ class AbstractSystem(eqx.Module):
         return f"{type(self).__name__}: {quantities(values)}; driven joints: {driven}"
 
     def unit(self, name: str) -> str:
-        """SI unit of a coordinate or rate."""
-        place, dof = (self.coordinates + self.rates).index(name), len(self.coordinates)
+        """SI unit of a coordinate, rate or sensor."""
+        if name in self.sensors:
+            return self.sensors[name]
+        place, dof = self.states.index(name), len(self.coordinates)
         return state_unit(self.angles[place % dof], rate=place >= dof)
 
     def force_unit(self, joint: int) -> str:
@@ -94,6 +104,12 @@ class AbstractSystem(eqx.Module):
     ) -> tuple[Float[Array, ""], ...]:
         """Of every joint under a generalised force [N m, or N], one by one (`integrate` says why)."""
         return tuple(spd_solve(self.mass(q), force - self.bias(q, v)))
+
+    def senses(
+        self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Float[Array, ""]]
+    ) -> Sequence[Float[Array, ""]]:
+        """What the `sensors` read in a motion with the acceleration `a`, in SI units."""
+        return ()
 
     def vary(self, kind: str, joint: int, amount: Float[Array, ""]) -> "AbstractSystem":
         """The machine with one body changed by `amount` (an entry of `variations`)."""

@@ -48,6 +48,17 @@ class Pose(NamedTuple):
     back: Turn
 
 
+class Motion(NamedTuple):
+    """Of a joint's frame, in its own axes."""
+
+    spin: Three
+    """Angular velocity [rad/s]."""
+    turns: Three
+    """Angular acceleration [rad/s^2]."""
+    rise: Three
+    """Acceleration of its origin against free fall [m/s^2]."""
+
+
 NOTHING = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))
 
 
@@ -86,6 +97,24 @@ def posed(frames: Sequence[Frame], q: Sequence[Scalar]) -> list[Pose]:
     return poses
 
 
+def motions(
+    frames: Sequence[Frame], poses: Sequence[Pose], v: Sequence[Scalar], a: Sequence[Scalar], gravity: Three
+) -> list[Motion]:
+    """How the frame of every joint moves; that of the base stands last, so that -1 finds it."""
+    found: list[Motion] = [Motion(ZERO, ZERO, scaled(-1.0, gravity))]
+    for frame, pose, rate, more in zip(frames, poses, v, a, strict=True):
+        spin, turns, rise = found[frame.before]
+        rise = add(rise, add(cross(turns, pose.place), cross(spin, cross(spin, pose.place))))
+        spin, turns, rise = apply(pose.back, spin), apply(pose.back, turns), apply(pose.back, rise)
+        own, gain = (0.0, 0.0, rate), (0.0, 0.0, more)
+        if frame.slide:
+            rise = add(rise, add(scaled(2.0, cross(spin, own)), gain))
+        else:
+            turns, spin = add(turns, add(cross(spin, own), gain)), add(spin, own)
+        found.insert(-1, Motion(spin, turns, rise))
+    return found
+
+
 def newton_euler(
     frames: Sequence[Frame],
     poses: Sequence[Pose],
@@ -95,23 +124,9 @@ def newton_euler(
     gravity: Three,
 ) -> list[Scalar]:
     """Force at every joint that gives the acceleration `a`; with `a` zero that of Coriolis, rotation and gravity."""
-    spins: list[Three] = []
-    turning: list[Three] = []
-    rising: list[Three] = []
     forces: list[Three] = []
     moments: list[Three] = []
-    for frame, pose, body, rate, more in zip(frames, poses, bodies, v, a, strict=True):
-        i = frame.before
-        spin, turns, rise = (spins[i], turning[i], rising[i]) if i >= 0 else (ZERO, ZERO, scaled(-1.0, gravity))
-        rise = add(rise, add(cross(turns, pose.place), cross(spin, cross(spin, pose.place))))
-        spin, turns, rise = apply(pose.back, spin), apply(pose.back, turns), apply(pose.back, rise)
-        own, gain = (0.0, 0.0, rate), (0.0, 0.0, more)
-        if frame.slide:
-            rise = add(rise, add(scaled(2.0, cross(spin, own)), gain))
-        else:
-            turns, spin = add(turns, add(cross(spin, own), gain)), add(spin, own)
-        for known, new in ((spins, spin), (turning, turns), (rising, rise)):
-            known.append(new)
+    for body, (spin, turns, rise) in zip(bodies, motions(frames, poses, v, a, gravity), strict=False):
         force = add(scaled(body.mass, rise), add(cross(turns, body.moment), cross(spin, cross(spin, body.moment))))
         swing = add(apply(body.second, turns), cross(spin, apply(body.second, spin)))
         forces.append(force)

@@ -8,12 +8,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..data.machine import Machine, machine_unit, unpacked
+from ..data.machine import SENSE_UNITS, Machine, machine_unit, unpacked
 from ..data.units import quantities
 from .base import AbstractSystem
 from .bodies import carried_by, varied
 from .frames import laid
-from .recursion import composite, newton_euler, posed, solved
+from .recursion import composite, motions, newton_euler, posed, solved
+from .sensing import seen
 from .spatial import Scalar, minus, plus, times
 
 KNEE = 0.01
@@ -61,6 +62,11 @@ class Tree(AbstractSystem):
         return replace(self, values={**self.values, **values})
 
     @property
+    def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Of those of the file the measured ones."""
+        return {sense.name: SENSE_UNITS[sense.kind] for sense in self.machine.senses}
+
+    @property
     def gears(self):
         return self.machine.gears
 
@@ -88,6 +94,12 @@ class Tree(AbstractSystem):
 
     def acceleration(self, q, v, force):
         return _acceleration(self, q, v, force)
+
+    def senses(self, q, v, a):
+        layout, rates = laid(self.text), [v[i] for i in range(len(self.coordinates))]
+        poses = self._poses(q)
+        moving = motions(layout.frames, poses, rates, a, self.machine.gravity)
+        return [jnp.zeros_like(q[0]) + seen(sense, layout, poses, moving) for sense in self.machine.senses]
 
     def needed(self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Scalar]) -> list[Scalar]:
         """Generalised force that gives an acceleration [N m, or N]: inverse dynamics, M(q) a + c(q, v)."""

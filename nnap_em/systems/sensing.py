@@ -1,0 +1,34 @@
+"""What sensors at a site of a machine file read: exact, without noise, delay or range.
+
+[MuJoCo's documentation, "Sensors": gyro, accelerometer, framepos]
+"""
+
+from collections.abc import Sequence
+
+from ..data.machine import Sense
+from .frames import Layout, Mount
+from .recursion import Motion, Pose
+from .spatial import Scalar, Three, add, apply, cross, product, transposed
+
+_BASE = Mount(-1, (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+def seen(sense: Sense, layout: Layout, poses: Sequence[Pose], moving: Sequence[Motion]) -> Scalar:
+    """The reading of a component [rad/s, m/s^2 or m]; `moving` as `motions` gives them."""
+    mount = layout.mounts[sense.body] if sense.body >= 0 else _BASE
+    place = add(mount.place, apply(mount.turn, sense.place))
+    if sense.kind == "framepos":
+        return _outward(layout, poses, mount.joint, place)[sense.axis]
+    spin, turns, rise = moving[mount.joint]
+    value = spin
+    if sense.kind == "accelerometer":
+        value = add(rise, add(cross(turns, place), cross(spin, cross(spin, place))))
+    return apply(transposed(product(mount.turn, sense.turn)), value)[sense.axis]
+
+
+def _outward(layout: Layout, poses: Sequence[Pose], joint: int, place: Three) -> Three:
+    """A place in the frame of a joint as one in the world [m]."""
+    while joint >= 0:
+        place = add(poses[joint].place, apply(poses[joint].turn, place))
+        joint = layout.frames[joint].before
+    return place

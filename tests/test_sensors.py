@@ -1,0 +1,385 @@
+"""Sensors of a machine file that read no joint: their readings against MuJoCo's own, and what becomes of them."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from arm import JOINTS, declared, friction, machine, recorded
+from helpers import csv_text
+from machine_files import errors
+from machines import arm
+
+from nnap_em import identify
+from nnap_em.commands.draft_machine import _sensors, draft_machine
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.machine import packed, unpacked
+from nnap_em.data.mjcf import read_machine
+from nnap_em.data.recordings.recording import Topic
+from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.effects.sensor import SensorBias
+from nnap_em.em.build import build_system
+from nnap_em.em.identify import begin, phi_samples
+from nnap_em.em.local import local, readings_at
+from nnap_em.em.mstep import _shaken
+from nnap_em.em.predict import horizon_errors, predict
+from nnap_em.em.prior import ParameterPrior
+from nnap_em.em.quadratic import quadratic
+from nnap_em.em.store import load, save
+from nnap_em.model.base import prepare
+from nnap_em.model.friction import FixedFriction, NoFriction
+from nnap_em.model.law import StribeckLaw
+from nnap_em.model.simulate import simulate
+from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.portable.export import parameters, predictor
+from nnap_em.portable.mjcf import write_mjcf
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
+from nnap_em.smoother.start import StartBank
+from nnap_em.systems import specs
+
+ROOT = Path(__file__).resolve().parents[1]
+KINDS = ("gyro", "accelerometer", "framepos")
+SITES = {"trunk": "trunk", "left": "left", "plate": "plate", "right": "right", "hand": "hand"}
+
+
+def _wired(sites) -> str:
+    kinds = {"gyro": "site", "accelerometer": "site", "framepos": 'objtype="site" objname'}
+    return "".join(f'<{kind} name="{site}_{kind}" {at}="{site}"/>' for site in sites for kind, at in kinds.items())
+
+
+def _branch() -> str:
+    """The branching machine of the other tests with a turned site on every body, and one on the base."""
+    text = (ROOT / "tests" / "machines" / "branch.xml").read_text()
+    for i, body in enumerate(SITES):
+        site = f'<site name="{body}" pos="0.{i}1 -0.05 0.1" euler="{10 * i} 20 -{30 + i}"/>'
+        text = re.sub(rf'(<body name="{body}"[^>]*>)', rf"\1{site}", text)
+    text = text.replace("<worldbody>", '<worldbody><site name="base" pos="1 2 3" euler="30 40 50"/>')
+    return text.replace("<sensor>", f"<sensor>{_wired((*SITES, 'base'))}")
+
+
+def _arm(joints: int) -> str:
+    text = arm(joints).replace(
+        '<site name="hand" pos="0 0 0.05"/>', '<site name="hand" pos="0.02 -0.01 0.05" euler="0.3 0 1"/>'
+    )
+    return text.replace("</actuator>", f"</actuator><sensor>{_wired(['hand'])}</sensor>")
+
+
+MACHINES = {"branch": (_branch(), (*SITES, "base")), "arm3": (_arm(3), ("hand",)), "arm6": (_arm(6), ("hand",))}
+
+
+def _columns(sites) -> list[str]:
+    return [f"{site}_{kind}.{axis}" for site in sites for kind in KINDS for axis in "xyz"]
+
+
+def _rig(folder: Path, text: str, columns, rest: str = "", model: str = "") -> Path:
+    (folder / "machine.xml").write_text(text)
+    names = ", ".join(f'"{column}"' for column in columns)
+    (folder / "rig.toml").write_text(
+        f'format = 1\nname = "bench"\n[model]\ntype = "mjcf"\nfile = "machine.xml"\nfriction = "unknown"\n{model}\n'
+        f'[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n[measurement]\ncolumns = [{names}]\n'
+        f"{rest}"
+    )
+    return folder / "rig.toml"
+
+
+def _model(system, measured) -> StateSpaceModel:
+    """With a friction that acts in every joint."""
+    dof = len(system.coordinates)
+    law = StribeckLaw(*(jnp.linspace(0.5, 1.5, dof) * size for size in (0.3, 0.5, 0.4, 0.2, 0.1)))
+    return StateSpaceModel(
+        system=system,
+        unknown=FixedFriction(law, jnp.ones(dof)),
+        start=Gaussian(jnp.zeros(2 * dof), jnp.eye(2 * dof)),
+        log_q=jnp.zeros(2 * dof),
+        log_r=jnp.zeros(len(measured)),
+        measured=tuple(system.readable.index(name) for name in measured),
+        dt=0.01,
+    )
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_readings_are_those_of_mujoco_under_torque_and_friction(name, tmp_path):
+    text, sites = MACHINES[name]
+    columns = _columns(sites)
+    system = build_system(read_rig(_rig(tmp_path, text, columns), specs))
+    given = _model(system, columns)
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    address = {model.sensor(i).name: int(model.sensor_adr[i]) for i in range(model.nsensor)}
+    rng, read = np.random.default_rng(0), jax.jit(lambda x, u: given.emission(x, u))
+    for _ in range(6):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = rng.uniform(-3.0, 3.0, (2, model.nv))
+        data.ctrl[:] = u = rng.uniform(-2.0, 2.0, model.nu)
+        data.qfrc_applied[:] = np.asarray(given.unknown(jnp.asarray(data.qvel)))
+        mujoco.mj_forward(model, data)
+        x = jnp.asarray(np.concatenate([data.qpos, data.qvel]))
+        truth = [data.sensordata[address[c[:-2]] + "xyz".index(c[-1])] for c in columns]
+        np.testing.assert_allclose(read(x, Inputs.held(jnp.asarray(u))), truth, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["branch", "arm3"])
+def test_derivatives_of_readings_are_finite_differences(name, tmp_path):
+    text, sites = MACHINES[name]
+    columns = _columns(sites)
+    given = _model(build_system(read_rig(_rig(tmp_path, text, columns), specs)), columns)
+    dof, rng, step = len(given.system.coordinates), np.random.default_rng(1), 1e-6
+    x, u = (
+        jnp.asarray(rng.uniform(-1.0, 1.0, 2 * dof)),
+        Inputs.held(jnp.asarray(rng.uniform(-1, 1, len(given.system.joints)))),
+    )
+    both = jax.jit(lambda x, force: given.emission(x, u, force))
+    found = jnp.concatenate(jax.jacfwd(both, (0, 1))(x, jnp.zeros(dof)), axis=1)
+    for i in range(3 * dof):
+        dx, force = jnp.split(step * jnp.eye(3 * dof)[i], [2 * dof])
+        truth = (both(x + dx, force) - both(x - dx, -force)) / (2 * step)
+        np.testing.assert_allclose(found[:, i], truth, rtol=1e-6, atol=1e-6)
+
+
+# --- what a fit makes of them
+
+CART = """<mujoco><option gravity="0 0 -9.81"/><worldbody><body name="cart">
+<joint name="rail" type="slide" axis="1 0 0"/><inertial pos="0 0 0" mass="1.3" diaginertia="1 1 1"/>
+<site name="top" euler="0 90 0"/></body></worldbody><actuator><motor name="push" joint="rail"/></actuator>
+<sensor><accelerometer name="imu" site="top"/></sensor></mujoco>"""
+NODES = jnp.asarray([[-8.0, -2.0, 0.5, 3.0, 9.0]])  # beyond all speeds, so that the nodes interpolate v exactly
+
+
+class _Pushed(NamedTuple):
+    """A model under a small extra force."""
+
+    model: StateSpaceModel
+    force: jax.Array
+
+    def transition(self, x, u):
+        return self.model.transition(x, u, self.force)
+
+    def emission(self, x, u):
+        return self.model.emission(x, u, self.force)
+
+
+@eqx.filter_jit
+def _expanded(model, prior, data: Dataset):
+    """Score and information of one sequence; what the likelihood itself says of a constant force and of the mass."""
+    seq = jax.tree.map(lambda a: a[0], data)
+    given = prepare(model, seq)
+    posterior = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)(model, given)
+    here, read = local(model, prior, posterior.state, seq), readings_at(model, posterior, given)
+    found = quadratic(model.log_q, model.log_r, model.start, here, NODES, posterior, read)
+
+    def filtered(knobs):
+        pushed = _Pushed(prior.write(model, knobs[1:]), knobs[:1])
+        about = lambda x, u: Tangent()(pushed, Gaussian(x, jnp.eye(2)), u)  # noqa: E731
+        affine = jax.vmap(about)(posterior.state.mean, given.inputs)
+        reading = jax.vmap(lambda x, u: linear_reading(pushed, x, u))(posterior.state.mean, given.inputs)
+        out = kalman_filter(model.log_q, model.log_r, model.start, affine, reading, given)
+        return out.loglik, out.innovation.ravel()
+
+    step = 1e-4
+    ahead, behind = (jax.vmap(filtered)(sign * step * jnp.eye(2)) for sign in (1, -1))
+    slope, jac = ((a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True))
+    return found, slope, jac, _shaken(jax.tree.map(lambda a: a[None], here), model.log_q, model.log_r)
+
+
+def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information(tmp_path):
+    """A cart is linear: both are those of the likelihood itself, exactly."""
+    path = _rig(tmp_path, CART, ("rail", "imu.z"), model="[model.uncertain]\ncart.mass = { std = 0.1 }")
+    start = Gaussian(jnp.asarray([0.2, 0.0]), jnp.diag(jnp.asarray([0.1, 0.3]) ** 2))
+    model = dataclasses.replace(
+        _model(build_system(read_rig(path, specs)), ("rail", "imu.z")),
+        unknown=NoFriction(jnp.ones(1)),
+        start=start,
+        log_q=2 * jnp.log(jnp.asarray([0.01, 0.1])),
+        log_r=2 * jnp.log(jnp.asarray([0.02, 0.5])),
+        dt=0.05,
+    )
+    u = jnp.sin(0.25 * jnp.arange(40.0))[None, :, None]
+    data = simulate(model, start.mean[None], u, key=jax.random.key(0)).data
+    data = data._replace(y=data.y.at[0, 7:9, 1].set(jnp.nan))
+    prior = ParameterPrior(("cart.mass",), jnp.asarray([1.3]), jnp.asarray([0.1]))
+    found, slope, jac, floor = _expanded(model, prior, data)
+    kick = model.log_q[1] - 2 * jnp.log(model.dt)  # a kick of the rate over one step is an acceleration
+    np.testing.assert_allclose(floor, [model.log_r[0], kick], rtol=1e-6)
+    both = np.zeros((2, 6))
+    both[0, :5], both[1, 5] = 1.0, 1.0  # the weights of the nodes sum to 1: a constant force is one at all of them
+    np.testing.assert_allclose(both @ found.score, slope, rtol=1e-6)  # differences of step 1e-4
+    np.testing.assert_allclose(both @ found.information @ both.T, jac @ jac.T, rtol=1e-6)
+
+
+def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
+    text, _ = MACHINES["arm3"]
+    columns = ("joint1", "hand_gyro.z", "hand_accelerometer.x", "hand_framepos.y")
+    noise = '[measurement.noise_std]\nhand_gyro.z = 0.01\n"hand_accelerometer.x" = 0.1\n'
+    rig = read_rig(_rig(tmp_path, text, columns, noise), specs)
+    assert rig.measured == columns
+    assert rig.noise_std == {"hand_gyro.z": 0.01, "hand_accelerometer.x": 0.1}
+    system = build_system(rig)
+    assert system.sensors == {"hand_gyro.z": "rad/s", "hand_accelerometer.x": "m/s^2", "hand_framepos.y": "m"}
+    assert (
+        [rig.unit(name) for name in columns]
+        == [system.unit(name) for name in columns]
+        == ["rad", "rad/s", "m/s^2", "m"]
+    )
+    write_rig(rig, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == rig
+    assert unpacked(packed(read := unpacked(rig.machine))) == read
+
+
+def test_texts_of_machines_from_before_sensors_are_read():
+    before = json.dumps(json.loads(packed(read_machine(ROOT / "tests" / "machines" / "branch.xml")))[:-1])
+    assert unpacked(before).senses == ()
+
+
+BAD = {
+    "no component": (["hand_gyro"], "'hand_gyro' is no state or sensor of this system; did you mean 'hand_gyro."),
+    "no such component": (["hand_gyro.w"], "'hand_gyro.w' is no state or sensor of this system; did you mean"),
+    "another kind": (
+        ["hand_touch"],
+        "'hand_touch' is of a sensor of type touch; read are joints, and gyro, accelerometer, framepos of a site: take",
+    ),
+    "its component": (
+        ["hand_velocity.x"],
+        "'hand_velocity.x' is of a sensor of type velocimeter; read are joints, and",
+    ),
+    "a place of a body": (
+        ["link.x"],
+        "'link.x' is of a sensor of type framepos of no site, or in no frame of the world",
+    ),
+}
+
+
+@pytest.mark.parametrize(("columns", "said"), BAD.values(), ids=BAD)
+def test_sensors_that_are_not_read_are_refused_by_name(columns, said, tmp_path):
+    more = '<touch name="hand_touch" site="hand"/><velocimeter name="hand_velocity" site="hand"/>'
+    more += '<framepos name="link" objtype="body" objname="link1"/>'
+    path = _rig(tmp_path, MACHINES["arm3"][0].replace("<sensor>", f"<sensor>{more}"), ["joint1", *columns])
+    with pytest.raises(RigError, match=re.escape(said)):
+        read_rig(path, specs)
+
+
+def test_sensors_of_sites_that_are_missing_are_refused_by_the_compiler(tmp_path):
+    path = _rig(tmp_path, MACHINES["arm3"][0].replace('site="hand"', 'site="wrist"'), ["joint1"])
+    with pytest.raises(RigError, match="wrist"):
+        read_rig(path, specs)
+
+
+def test_a_machine_that_is_no_file_has_no_sensors(tmp_path):
+    with pytest.raises(RigError, match=re.escape("'hand_gyro.x' is no state of this system; possible here: x, dx")):
+        path = tmp_path / "rig.toml"
+        path.write_text(
+            'format = 1\nname = "bench"\n[model]\ntype = "slide"\nm = 1.0\nfriction = "unknown"\nactuated_joint = 1\n'
+            '[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n'
+            '[measurement]\ncolumns = ["x", "hand_gyro.x"]\n'
+        )
+        read_rig(path, specs)
+
+
+# --- what is stored, written and drafted
+
+SWING = """<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/>
+<inertial pos="0 0 -.2" mass="0.5" diaginertia=".004 .004 .001"/>
+<site name="bob" pos="0.01 0 -.3" euler="0 0 90"/></body></worldbody>
+<actuator><motor name="push" joint="pivot"/></actuator>
+<sensor><gyro name="imu" site="bob"/><accelerometer name="shake" site="bob"/><framepos name="at" objtype="site"
+objname="bob"/></sensor></mujoco>"""
+SEEN = ("imu.x", "shake.y", "shake.z", "at.x")
+
+
+@pytest.fixture(scope="module")
+def swung(tmp_path_factory):
+    """A pendulum that nobody reads at its joint, with a friction that no fit made, and a log with gaps."""
+    rig = read_rig(_rig(tmp_path_factory.mktemp("swing"), SWING, SEEN), specs)
+    t, rng = 0.01 * np.arange(90), np.random.default_rng(0)
+    u = 0.3 * np.sin(4 * t)[None, :, None]
+    blank = Dataset(t[None], u, rng.normal(size=(1, 90, 4)), np.ones((1, 90), bool))
+    fitted = begin(rig, blank, key=jax.random.key(0), effects=(SensorBias(jnp.asarray(0.3), channel="shake.z"),))
+    stir = lambda a: a + 0.1 * jnp.asarray(rng.normal(size=a.shape)) if eqx.is_inexact_array(a) else a  # noqa: E731
+    model = eqx.tree_at(lambda m: m.unknown.mlp, fitted.model, jax.tree.map(stir, fitted.model.unknown.mlp))
+    model = eqx.tree_at(lambda m: m.log_r, model, 2 * jnp.log(jnp.asarray([0.01, 0.1, 0.1, 0.001])))
+    model = eqx.tree_at(lambda m: m.log_q, model, 2 * jnp.log(jnp.asarray([1e-5, 1e-2])))
+    data = simulate(model, jnp.asarray([[0.7, -0.4]]), jnp.asarray(u), key=jax.random.key(1)).data
+    data = data._replace(y=data.y.at[0, 20:30, 1].set(jnp.nan))
+    hessian = 1e3 * jnp.eye(fitted.state.hessian.shape[0])
+    return fitted._replace(state=fitted.state._replace(model=model, best=model, hessian=hessian)), data
+
+
+def test_a_joint_that_only_its_sensors_tell_is_followed_and_predicted(swung):
+    fitted, data = swung
+    found = predict(fitted, data, 0.5, key=jax.random.key(0), samples=20)
+    assert found.mean.shape == (1, 90, 6)  # angle, rate, and four components
+    errors = horizon_errors(found, fitted, data, 0.5, horizons=(0.1,))
+    assert list(errors) == list(SEEN)
+    assert [errors[name][0] < bound for name, bound in zip(SEEN, (0.1, 0.3, 0.5, 0.01), strict=True)] == [True] * 4
+
+
+def test_the_exported_predictor_agrees_with_predict(swung):
+    fitted, data = swung
+    key = jax.random.key(3)
+    wanted = predict(fitted, data, 0.5, key=key, samples=20)
+    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
+    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
+    draws = phi_samples(fitted, 20, key=key_draw), jax.random.normal(key_start, (20, 2))
+    space: dict = {"__name__": "predictor"}
+    exec(predictor(fitted), space)
+    one = (np.asarray(part[0]) for part in data[:3])
+    noise = np.asarray(jax.random.normal(key_noise, (90, 20, 2)))
+    found = space["predict"](space["MODEL"], *one, 0.5, draws=(*map(np.asarray, draws), noise))
+    np.testing.assert_allclose(found.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.std, wanted.std[0], rtol=1e-6, atol=1e-6)
+    assert space["MODEL"].sensors == SEEN
+    assert parameters(fitted)["sensors"][1] == {"name": "shake.y", "unit": "m/s^2"}
+
+
+def test_a_saved_model_reads_the_same(swung, tmp_path):
+    fitted, _ = swung
+    save(tmp_path / "model.npz", fitted)
+    again = load(tmp_path / "model.npz")
+    x, u = jnp.asarray([0.3, 1.0]), Inputs.held(jnp.ones(1))
+    np.testing.assert_array_equal(again.model.emission(x, u), fitted.model.emission(x, u))
+
+
+def test_sensors_are_written_back(swung, tmp_path):
+    fitted, _ = swung
+    write_mjcf(
+        fitted._replace(state=fitted.state._replace(best=with_effects(fitted.model, ()))), tmp_path / "again.xml"
+    )
+    again = read_machine(tmp_path / "again.xml").senses
+    for sense in unpacked(fitted.rig.machine).senses:
+        own = next(one for one in again if one.name == sense.name)
+        assert own[:4] == sense[:4]
+        np.testing.assert_allclose(own.turn, sense.turn, atol=1e-11)
+        np.testing.assert_allclose(own.place, sense.place, atol=1e-11)
+
+
+def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp_path):
+    (tmp_path / "swing.xml").write_text(SWING)
+    t = 0.01 * np.arange(200)
+    header = {"time": t, "pivot": np.sin(t), "imu.x": np.cos(t), "shake.z": np.sin(3 * t), "push": np.cos(2 * t)}
+    (tmp_path / "log.csv").write_text(csv_text(header))
+    made = draft_machine(tmp_path / "log.csv", tmp_path / "swing.xml", tmp_path)
+    (tmp_path / "rig.toml").write_text(made.text)
+    assert read_rig(tmp_path / "rig.toml", specs).measured == ("pivot", "imu.x", "shake.z")
+    assert re.search(r"imu\.x = .*# rad/s$", made.text, re.M) and re.search(r"shake\.z = .*# m/s\^2$", made.text, re.M)
+    fields = tuple(f"{kind}.{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz")
+    found = _sensors(read_machine(tmp_path / "swing.xml"), [Topic("/imu", "sensor_msgs/msg/Imu", 10, fields)])
+    assert {name: str(at) for name, at in found.items() if name[-1] == "y"} == {
+        "imu.y": "/imu:angular_velocity.y", "shake.y": "/imu:linear_acceleration.y",
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+def test_friction_of_a_joint_without_encoder_is_told_by_an_inertial_sensor_at_the_hand(tmp_path):
+    """Logs from MuJoCo, 8 s in all."""
+    data, x = recorded(machine(2, imu=True), JOINTS[:2], 0)
+    data = Dataset(*(part[:4, :200] for part in data))
+    fitted = identify(declared(tmp_path, 2, imu=True), data, key=jax.random.key(0))
+    assert max(errors(fitted.model.unknown, friction(JOINTS[:2]), x[:4, :200])) < 0.08

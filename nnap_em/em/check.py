@@ -154,16 +154,17 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[Finding]
         seen, spread = reading_noise(signal), float(np.nanstd(signal))
         declared = rig.noise_std.get(name)
         loud = max(seen, declared or 0.0) > 0.3 * spread
+        alone = name not in model.system.sensors  # of three axes one may feel nothing
         drowned = "; the motion hardly rises above it: move more, or look at the units" if loud else ""
         if declared is None:
             text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
-            yield Finding(_mark(False, loud), "noise", text)
+            yield Finding(_mark(loud, loud and alone), "noise", text)
             continue
         ratio = seen / declared
         how = f"{name}: declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
         tame = "; the log was filtered, or less is true" if ratio < 0.1 else ""
         wild = "; declare more, or leave it out to have it estimated" if ratio > 3 else ""
-        mark = _mark(tame or wild, loud or ratio > 30)
+        mark = _mark(tame or wild or loud, (loud and alone) or ratio > 30)
         yield Finding(mark, "noise", how + tame + wild + drowned)
 
 

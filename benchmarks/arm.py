@@ -1,17 +1,20 @@
 """Friction of every joint of an industrial arm of which all joints are read: declared by its file, logs from MuJoCo.
 
-    python benchmarks/arm.py [--joints 6] [--seeds 3] [--imu]
-    python benchmarks/arm.py --lacks payload --out OUT      # logs for `nnap-em diagnose OUT`, and no fit
+    python benchmarks/arm.py [--joints 6] [--seeds 3] [--first 0] [--imu]
+    python benchmarks/arm.py --lacks payload --out OUT      # `nnap-em diagnose` on logs of an arm with a payload
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
 of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
 where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last joint has no encoder, and the hand
-a gyroscope and an accelerometer.
+a gyroscope and an accelerometer. With `--lacks` the machine has what its file does not say; OUT keeps logs and
+findings, and a seed that is found there is not run again.
 """
 
 import argparse
+import json
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -180,29 +183,53 @@ def written(rig: Rig, data: Dataset, folder: Path) -> None:
         write_csv(folder / "train" / f"{i:03d}.csv", {"time": np.asarray(t)} | columns)
 
 
+def diagnosed(kind: str, seed: int, out: Path, count: int) -> str:
+    """What `nnap-em diagnose` names in a machine that lacks something, and how long it took; a row of the table."""
+    folder, found = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
+    if not (found / "report.json").exists():
+        (folder / "train").mkdir(parents=True, exist_ok=True)
+        written(declared(folder, count), recorded(arm(count), JOINTS[:count], seed, LACKS[kind])[0], folder)
+        command = ["diagnose", str(folder), "--out", str(found), "--seed", str(seed), "--quiet"]
+        began, before = time.perf_counter(), os.times().children_user
+        subprocess.run([sys.executable, "-m", "nnap_em.commands.cli", *command], check=True)
+        took, spent = time.perf_counter() - began, os.times().children_user - before
+        (found / "seconds.json").write_text(json.dumps([took, spent]))
+    report = json.loads((found / "report.json").read_text())
+    took, spent = json.loads((found / "seconds.json").read_text())
+    named = "; ".join(f"{e['name']} {e['joint']}: {_numbers(e)}" for e in report["effects"])
+    return f"| {kind} | {seed} | {named or 'nothing'} | {took:.0f} | {spent:.0f} |"
+
+
+def _numbers(effect: dict) -> str:
+    """Parameters of an effect with their standard deviations."""
+    return ", ".join(f"{name} {p['value']:.3g} +- {p['std']:.1g}" for name, p in effect["parameters"].items())
+
+
 def main() -> None:
-    """Print the table, or write logs."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--joints", type=int, default=6, choices=range(1, 7))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="seed")
     parser.add_argument("--imu", action="store_true", help="at the hand, in place of the last encoder")
     parser.add_argument("--lacks", choices=LACKS)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     set_up()
     joints = JOINTS[: args.joints]
-    if args.lacks:
-        (args.out / "train").mkdir(parents=True, exist_ok=True)
-        rig = declared(args.out, args.joints)
-        written(rig, recorded(arm(args.joints), joints, 0, LACKS[args.lacks])[0], args.out)
-        return
     print(f"{date.today()}, {platform.machine()}, {jax.device_count()} devices, JAX {jax.__version__}, ", end="")
     print(f"load {os.getloadavg()[0]:.1f} before: {' '.join(['python', *sys.argv])}\n")
+    seeds = range(args.first, args.first + args.seeds)
+    if args.lacks:
+        print("| lacks | seed | named | s | processor s |\n| --- | --- | --- | --- | --- |")
+        for seed in seeds:
+            print(diagnosed(args.lacks, seed, args.out, args.joints), flush=True)
+        return
     print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
     print("| --- " * (args.joints + 4) + "|")
     with TemporaryDirectory() as folder:
         rig = declared(Path(folder), args.joints, imu=args.imu)
-        for seed in range(args.seeds):
+        for seed in seeds:
             data, x = recorded(machine(args.joints, imu=args.imu), joints, seed)
             began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))

@@ -2,6 +2,7 @@
 
     python benchmarks/design.py friction --seeds 5 --out OUT     # some three minutes a seed, half a core
     python benchmarks/design.py apart --seeds 5 --out OUT        # half an hour a seed; --quick is shorter
+    python benchmarks/design.py friction --rate 4 --out OUT      # torque may change 4 times as fast as in the logs
     python benchmarks/design.py table --out OUT                  # the tables of docs/design.md
 
 friction: an acrobot whose joint 1 is measured alone, 30 s of sines.  Then 30 s more, designed or of the same sines: how
@@ -100,12 +101,22 @@ def broken(design: Design, x: np.ndarray) -> list[bool]:
     return (~(tame & (x >= low).all((1, 2)) & (x <= high).all((1, 2)))).tolist()
 
 
+def allowed(fits: list[Identified], first: Dataset, rate: float | None) -> list[Identified]:
+    """The fits, whose owner lets torque change `rate` times as fast as it did in the logs; None: as fast."""
+    if rate is None:
+        return fits
+    rig = fits[0].rig
+    top = rate * float(np.abs(np.diff(first.u, axis=1)).max()) / rig.dt
+    rig = dataclasses.replace(rig, limits=Bounds(rate={column: (-top, top) for column in rig.input_columns}))
+    return [fit._replace(rig=rig) for fit in fits]
+
+
 def friction(seed: int, out: Path, quick: bool = False, rate: float | None = None) -> dict[str, Any]:
-    """One rig; there is no quick run, and torques change as in the logs."""
+    """One rig; there is no quick run."""
     case = plant.Case(sequences=2 * SEQUENCES, tests=1, torque="sine", seed=seed)
     rig, data = logs(case, out / f"rig_{seed}")
     first, key = some(data, slice(SEQUENCES)), jax.random.key(seed)
-    base = identify(rig, first, key=key)
+    (base,) = allowed([identify(rig, first, key=key)], first, rate)
     began = time.perf_counter()
     design = design_experiment(base, first, key=key, question="friction", seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
     seconds = time.perf_counter() - began
@@ -160,10 +171,7 @@ def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified], list[
 
 
 def apart(seed: int, out: Path, quick: bool = False, rate: float | None = None) -> dict[str, Any]:
-    """All pairs, either law as the true one; a quick run leaves out what 30 s more of the same inputs tell.
-
-    With `rate`, the owner of the drive allows torque to change that many times as fast as it did in the logs.
-    """
+    """All pairs, either law as the true one; a quick run leaves out what 30 s more of the same inputs tell."""
     out = out if rate is None else out.with_name(f"{out.name}_{rate:g}")
     rows = []
     for name, both in PAIRS.items():
@@ -201,10 +209,7 @@ def _told_apart(
     own, other = (0, 1) if lead > 0 else (1, 0)  # a diagnosis holds the likelier one
     pair = Rivals((str(laws[own]), str(laws[other])), fits[own], fits[other])
     began = time.perf_counter()
-    if rate is not None:
-        top = rate * float(np.abs(np.diff(first.u, axis=1)).max()) / rig.dt
-        bounds = Bounds(rate={column: (-top, top) for column in rig.input_columns})
-        fits = [fit._replace(rig=dataclasses.replace(fit.rig, limits=bounds)) for fit in fits]
+    fits = allowed(fits, first, rate)
     design = design_experiment(
         fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
     )
@@ -219,10 +224,11 @@ def _told_apart(
 JOBS = {"friction": friction, "apart": apart}
 
 
-def table(out: Path) -> str:
-    """What the files in `out` say, as Markdown."""
-    rows = [json.loads(path.read_text()) for path in sorted(out.glob("friction_*.json"))]
+def _near_rest_table(kind: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Bands and errors near rest, of designs with one allowance for the rate of torque."""
     lines = [
+        f"{kind}:",
+        "",
         "| seed | joint | stated: 30 s, 30 s more, designed [mN m] | ratio | promised "
         "| true: the same [mN m] | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- |",
@@ -242,10 +248,17 @@ def table(out: Path) -> str:
                 f"| {row['seed']} | {j + 1} | {text['stated']} | {ratios['stated']:.2f} | {promised:.2g} "
                 f"| {text['true']} | {ratios['true']:.2f} |"
             )
-    if rows:
-        broken, plays = (sum(row[name] for row in rows) for name in ("broken", "plays"))
-        means = f"Mean ratio: stated {np.mean(stated):.2f}, true {np.mean(true):.2f}."
-        lines += ["", f"{means} Limits broken: {broken} of {plays} sequences played.", ""]
+    broken, plays = (sum(row[name] for row in rows) for name in ("broken", "plays"))
+    means = f"Mean ratio: stated {np.mean(stated):.2f}, true {np.mean(true):.2f}."
+    return [*lines, "", f"{means} Limits broken: {broken} of {plays} sequences played.", ""]
+
+
+def table(out: Path) -> str:
+    """What the files in `out` say, as Markdown."""
+    lines = []
+    kinds = {path.stem.rsplit("_", 1)[0] for path in out.glob("friction_*.json")}
+    for kind in sorted(kinds):
+        lines += _near_rest_table(kind, [json.loads(path.read_text()) for path in sorted(out.glob(f"{kind}_?.json"))])
     lines += [
         "| seed | pair | true | lead of the true law [nat]: 30 s, 30 s more, designed |",
         "| --- | --- | --- | --- |",
@@ -267,7 +280,7 @@ def main() -> None:
     arguments.add_argument("job", choices=[*JOBS, "table"])
     arguments.add_argument("--seeds", type=int, default=5)
     arguments.add_argument("--out", type=Path, required=True)
-    arguments.add_argument("--rate", type=float, help="apart where torque may change so many times as fast")
+    arguments.add_argument("--rate", type=float, help="torque may change so many times as fast as in the logs")
     arguments.add_argument("--quick", action="store_true", help="apart without what 30 s more of the same inputs tell")
     args = arguments.parse_args()
     if args.job == "table":

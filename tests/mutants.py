@@ -958,6 +958,13 @@ MUTANTS = (
         f"{MACHINES}unphysical_bodies_have_no_numbers",
     ),
     Mutant(
+        "a step out of the physical ones",
+        "systems/bodies.py",
+        "jnp.where(fine, after[name], one)",
+        "jnp.where(fine, after[name], after[name])",
+        f"{MACHINES}a_step_of_a_whole_body_ends_at_one_that_can_be",
+    ),
+    Mutant(
         "a load in the middle",
         "systems/bodies.py",
         "moved = scaled(mass / total, away)",

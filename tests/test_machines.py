@@ -23,6 +23,7 @@ from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
 from nnap_em.systems import specs
 from nnap_em.systems.bodies import physical
+from nnap_em.systems.pseudo_inertia import Numbers, of_pseudo, pseudo, stepped
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = sorted((ROOT / "tests" / "machines").iterdir())
@@ -229,6 +230,12 @@ def test_payload_is_a_point_mass_at_the_site(tmp_path):
         np.testing.assert_allclose(loaded.bias(q, v), data.qfrc_bias, atol=1e-9)
 
 
+def test_declared_bodies_that_cannot_be_are_refused(tmp_path):
+    uncertain = "[model.uncertain]\nlink2.inertia.xx = { mean = 0.1, std = 0.01 }"
+    with pytest.raises(RigError, match=r"link2\.inertia.*principal inertias .*sum of the others"):
+        read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
+
+
 def test_unphysical_bodies_have_no_numbers(tmp_path):
     rig = read_rig(_rig(tmp_path, arm(2), model="[model.uncertain]\nlink2.mass = {std = 0.1}"), specs)
     system = build_system(rig)
@@ -245,6 +252,46 @@ def test_physical_says_the_same_as_the_pseudo_inertia(seed):
     half = 0.5 * np.trace(own) * np.eye(3) - own
     told = bool(physical(jnp.asarray(1.0), tuple(map(tuple, own))))
     assert told == bool(np.linalg.eigvalsh(half).min() > 0)
+
+
+WHOLE = [f"link2.{what}" for what in ("mass", "com.x", "com.y", "com.z")]
+WHOLE += [f"link2.inertia.{pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_step_of_a_whole_body_ends_at_one_that_can_be(tmp_path, seed):
+    uncertain = "[model.uncertain]\n" + "\n".join(f"{name} = {{std = 0.1}}" for name in WHOLE)
+    before = build_system(read_rig(_rig(tmp_path, arm(2), model=uncertain), specs))
+    rng = np.random.default_rng(seed)
+    size = {name: max(abs(float(before.values[name])), 1e-3) for name in WHOLE}
+    way = {name: size[name] * rng.normal() for name in WHOLE}
+
+    def at(share: float):
+        return before.with_parameters({name: before.values[name] + share * way[name] for name in WHOLE})
+
+    far = at(20.0)
+    assert bool(jnp.isnan(far.mass(jnp.zeros(2))[1, 1]))
+    kept = far.reached_from(before)
+    assert np.linalg.eigvalsh(np.asarray(kept.mass(jnp.zeros(2)))).min() > 0
+    near = at(1e-3)
+    assert all(near.reached_from(before).values[name] == near.values[name] for name in WHOLE)
+
+
+def test_a_step_of_a_pseudo_inertia_is_itself_to_first_order():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    before = of_pseudo(jnp.asarray(root @ root.T))
+    np.testing.assert_allclose(pseudo(before), root @ root.T, rtol=1e-12)
+    way = Numbers(*(jnp.asarray(rng.normal(size=np.shape(a))) for a in before))
+    way = way._replace(inertia=way.inertia + way.inertia.T)
+
+    def missed(share: float) -> float:
+        after = jax.tree.map(lambda a, b: a + share * b, before, way)
+        found = stepped(before, after)
+        return max(float(jnp.abs(a - b).max()) for a, b in zip(found, after, strict=True))
+
+    assert missed(1e-4) < 0.3 * missed(2e-4)  # it falls with the square
+    assert np.linalg.eigvalsh(np.asarray(pseudo(stepped(before, jax.tree.map(lambda a: -3.0 * a, before))))).min() > 0
 
 
 def test_what_no_motion_feels_is_told(tmp_path):

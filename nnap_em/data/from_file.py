@@ -4,12 +4,12 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
-from .machine import SENSE_UNITS, Machine, Sense, packed, states
+import numpy as np
+
+from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Sense, of_body, packed, states
 from .mjcf import read_machine
 from .rig import Declared, RigWarning, SystemSpec, Told, flat, nearest
 
-OF_BODY = ("mass", "com.x", "com.y", "com.z", *(f"inertia.{axes}" for axes in ("xx", "yy", "zz", "xy", "xz", "yz")))
-"""In the frame of the body, the inertia about its centre of mass: kg, m, kg m^2."""
 OF_JOINT = ("armature", "stiffness")
 _FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
 _UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
@@ -118,7 +118,8 @@ def _place(machine: Machine, table: Any, joint: Any) -> int:
 def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
     """Every number of [model.uncertain], its mean that of the file where none is written."""
     table = model.table("uncertain", absent={})
-    given = {f"{body.name}.{what}": _of_body(body, what) for body in machine.bodies for what in OF_BODY}
+    bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
+    given = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
     given |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
     owners = [one.name for one in (*machine.bodies, *machine.joints)]
     for name, value in flat(table.items):
@@ -128,15 +129,24 @@ def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
         if name not in given:
             known = [key.partition(".")[2] for key in given if key.partition(".")[0] == owner]
             table.refuse(name, f"{owner!r} has no {own!r}" if own else "names no number", nearest(own, known))
-        yield name, _declared(table, name, value, given[name])
+        declared = _declared(table, name, value, given[name])
+        if owner in bodies:
+            bodies[owner][own] = declared.mean
+        yield name, declared
+    for body, values in bodies.items():
+        if any(name.startswith(f"{body}.") for name, _ in flat(table.items)):
+            _check_inertia(table, body, values)
 
 
-def _of_body(body: Any, what: str) -> float:
-    if what == "mass":
-        return body.mass
-    kind, _, axes = what.partition(".")
-    places = ["xyz".index(axis) for axis in axes]
-    return body.centre[places[0]] if kind == "com" else body.inertia[places[0]][places[1]]
+def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
+    """That some distribution of mass has the declared inertia."""
+    inertia = np.empty((3, 3))
+    for (i, j), what in zip(PAIRS, OF_BODY[4:], strict=True):
+        inertia[i, j] = inertia[j, i] = values[what]
+    low, middle, high = np.linalg.eigvalsh(inertia)
+    if low + middle < (1 - 1e-9) * high:
+        found = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
+        table.refuse(f"{body}.inertia", found, "write means of which the largest is at most the sum of the others")
 
 
 def _declared(table: Any, name: str, value: object, mean: float) -> Declared:

@@ -28,6 +28,18 @@ class Body(NamedTuple):
     """About the centre of mass, along the axes of the frame [kg m^2]."""
 
 
+AXES = "xyz"
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Entries of an inertia."""
+OF_BODY = ("mass", *(f"com.{axis}" for axis in AXES), *(f"inertia.{AXES[i]}{AXES[j]}" for i, j in PAIRS))
+"""The numbers of a body by name, in its frame, the inertia about its centre of mass: kg, m, kg m^2."""
+
+
+def of_body(body: Body) -> tuple[float, ...]:
+    """In the order of `OF_BODY`."""
+    return body.mass, *body.centre, *(body.inertia[i][j] for i, j in PAIRS)
+
+
 class Joint(NamedTuple):
     """A hinge or a slide, and what stands about it in the file."""
 

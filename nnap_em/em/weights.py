@@ -27,10 +27,11 @@ class Weights(eqx.Module):
         return jnp.concatenate([model.unknown.weights(), self.prior.read(model)])
 
     def write(self, model, w: Float[Array, " weight"]):
-        """A model with other weights."""
+        """A model after a step to other weights, its machine among those that can be."""
         cut = w.shape[0] - self.prior.size
         unknown = model.unknown.with_weights(w[:cut])
-        return self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
+        there = self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
+        return eqx.tree_at(lambda m: m.system, there, there.system.reached_from(model.system))
 
     @eqx.filter_jit
     def phi(self, unknown, w: Float[Array, " weight"]) -> Float[Array, " phi"]:

@@ -6,14 +6,19 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ..data.machine import Body, Machine
+from ..data.machine import AXES, OF_BODY, PAIRS, Body, Machine
 from .frames import Layout, Mount
+from .pseudo_inertia import Numbers, stepped
 from .recursion import NOTHING, Inertia, inertia, united
 from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed
 
-AXES = "xyz"
 MARGIN = 1e-9
 """Share by which an inertia may leave the physical ones: rounding, and rods that have none about their axis."""
+
+
+def names(body: Body) -> list[str]:
+    """All that may be estimated of a body."""
+    return [f"{body.name}.{what}" for what in OF_BODY]
 
 
 def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Turn]:
@@ -62,6 +67,29 @@ def physical(mass: Scalar, own: Turn) -> Any:
     return (mass > 0) & (half > 0) & (a > 0) & (second > 0) & (third > 0)
 
 
+def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping[str, Scalar]) -> dict[str, Any]:
+    """`after`, but a body that is estimated in all its numbers and cannot be so is one on the way from `before`."""
+    out = dict(after)
+    for body in machine.bodies:
+        own = names(body)
+        if not set(own) <= set(after):
+            continue
+        goal = numbers(body, after)
+        there = _told(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        fine = physical(goal[0], goal[2])
+        out |= {name: jnp.where(fine, after[name], one) for name, one in zip(own, there, strict=True)}
+    return out
+
+
+def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
+    return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in own]))
+
+
+def _told(body: Numbers) -> list[Scalar]:
+    """In the order of `names`."""
+    return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
+
+
 def with_load(tree: Any, place: int, at: Three, mass: Scalar) -> Any:
     """A point mass at a place of a body, as other mass, centre and inertia of that body."""
     body = tree.machine.bodies[place]
@@ -71,10 +99,8 @@ def with_load(tree: Any, place: int, at: Three, mass: Scalar) -> Any:
     moved = scaled(mass / total, away)
     own = summed(own, about(scaled(0.5 * old * mass / total, away), away))
     centre = add(centre, moved)
-    values = {f"{body.name}.mass": total}
-    values |= {f"{body.name}.com.{axis}": jnp.asarray(centre[i]) for i, axis in enumerate(AXES)}
-    pairs = ((i, j) for i in range(3) for j in range(i, 3))
-    values |= {f"{body.name}.inertia.{AXES[i]}{AXES[j]}": jnp.asarray(own[i][j]) for i, j in pairs}
+    told = [total, *centre, *(own[i][j] for i, j in PAIRS)]
+    values = dict(zip(names(body), map(jnp.asarray, told), strict=True))
     return replace(tree, values={**tree.values, **values})
 
 

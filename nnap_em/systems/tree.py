@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, unpacked
 from ..data.units import quantities
 from .base import AbstractSystem
-from .bodies import carried_by, varied
+from .bodies import carried_by, kept_physical, varied
 from .frames import laid
 from .recursion import composite, motions, newton_euler, posed, solved
 from .sensing import seen
@@ -60,6 +60,9 @@ class Tree(AbstractSystem):
 
     def with_parameters(self, values: Mapping[str, Array]):
         return replace(self, values={**self.values, **values})
+
+    def reached_from(self, before: "Tree"):
+        return replace(self, values=kept_physical(self.machine, before.values, self.values))
 
     @property
     def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -274,10 +274,11 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
     def loss(w):
         """Minus the log-likelihood, ridge and symmetry prior, up to constants; written for the target, not phi0."""
         phi = jnp.concatenate([jax.vmap(lambda v: unknown.with_weights(w[:-1])(v))(nodes.T)[:, 0], w[-1:]])
-        even = 0.5 * (phi[:21] + phi[:21][::-1]) / jnp.sqrt(21.0)
+        even = 0.5 * (phi[:21] + phi[:21][::-1])
         d = phi - target
         ridge = jnp.sum((w[:-1] - middle) ** 2) + w[-1] ** 2
-        return 0.5 * d @ information @ d + 0.5 * ridge + 0.5 * jnp.sum(even**2) / 0.3**2
+        asymmetry = jnp.sum(even**2) - jnp.sum(even) ** 2 / 22.0
+        return 0.5 * d @ information @ d + 0.5 * ridge + 0.5 * asymmetry / 0.3**2
 
     better = minimize(loss, w, jac=jax.grad(loss), method="BFGS", options={"maxiter": 2000})
     assert float(loss(w0)) - float(loss(w)) > 1e3
@@ -286,6 +287,16 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
     gradient = jax.grad(loss)(w)
     hessian, _ = weights.hessian(model.unknown, w, information + weights.symmetry())
     assert 0.5 * float(gradient @ jnp.linalg.solve(hessian, gradient)) < 0.01  # Newton decrement [nats]
+
+
+def test_the_symmetry_prior_is_that_of_an_offset_and_a_number_at_every_node():
+    nodes, rng = jnp.linspace(-2.0, 2.0, 11)[None], np.random.default_rng(0)
+    precision = Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3])).symmetry()[:11, :11]
+    odd, half = rng.normal(size=11), rng.normal(size=11)
+    np.testing.assert_allclose(precision @ (odd - odd[::-1]), 0.0, atol=1e-12)
+    even = half + half[::-1]
+    covariance = 0.3**2 * (1.0 + np.eye(11))
+    assert even @ precision @ even == pytest.approx(even @ np.linalg.solve(covariance, even), rel=1e-12)
 
 
 def test_fit_of_parameters_alone_is_ridge_regression():

@@ -1,7 +1,5 @@
 """Network weights and parameters as one vector, fitted to a log-likelihood that is quadratic in torques at nodes."""
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,10 @@ class Weights(eqx.Module):
     centre: Float[Array, " weight"]
     """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
     asymmetry: Float[Array, " dof"]
-    """Prior standard deviation [N m] of the even part of a friction map, its mean over the nodes."""
+    """Prior standard deviation [N m] of the even part of a friction map: of an offset, and again at every node.
+
+    The latter keeps a peak between stops, which no data see beside it, from being learned and never left again.
+    """
 
     def read(self, model) -> Float[Array, " weight"]:
         """Those of a model, as one vector."""
@@ -52,8 +53,9 @@ class Weights(eqx.Module):
     def symmetry(self) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
         dof, count = self.nodes.shape
-        even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1]) / math.sqrt(count)
-        blocks = [even.T @ even / self.asymmetry[j] ** 2 for j in range(dof)]
+        even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1])
+        of_even = even.T @ (jnp.eye(count) - 1 / (count + 1)) @ even  # the inverse of one offset and one number a node
+        blocks = [of_even / self.asymmetry[j] ** 2 for j in range(dof)]
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
     @eqx.filter_jit

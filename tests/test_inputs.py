@@ -65,8 +65,8 @@ def plain():
 
 def _screened(asked, candidates):
     model, rule, data, path, _ = asked
-    table = sheet(model, model, rule.weights(model), candidates, path, jax.tree.map(jnp.asarray, data))
-    return judge(project(table, np.ones(COUNT)), candidates)
+    data = jax.tree.map(jnp.asarray, data)
+    return judge(project(sheet(model, model, rule.weights(model), candidates, path, data, np.ones(COUNT))), candidates)
 
 
 def _functions(around):

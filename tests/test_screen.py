@@ -38,7 +38,6 @@ def test_columns_are_difference_quotients(bench, name):
     """A column is minus the change of the whitened innovations; its force is held over a step, so to some per cent."""
     rig, model, rule, data, path = bench
     candidate = catalogue[name].candidates(surroundings(rig, model, data, path, data.t.shape[1]))[-1]
-    table = sheet(model, model, rule.weights(model), [candidate], path, data)
     small = 1.0 if name == "input_delay" else 1e-2  # its probe is of finite size
     weak = jax.tree.map(lambda start, p: start + small * (p - start), candidate.start, candidate.probes[-1])
     full = with_effects(model, (weak,))
@@ -48,8 +47,9 @@ def test_columns_are_difference_quotients(bench, name):
         before = run(model, at, seq)
         column = -(run(full, at, seq) - before) / small
         size = float(jnp.linalg.norm(column) * jnp.linalg.norm(before))
-        assert table.score[i, -1] == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
-        assert table.information[i, -1, -1] == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
+        table = sheet(model, model, rule.weights(model), [candidate], path, data, np.eye(4)[i])
+        assert table.score[-1] == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
+        assert table.information[-1, -1] == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
 
 
 def test_projection_is_least_squares():
@@ -58,9 +58,9 @@ def test_projection_is_least_squares():
     x, e = rng.normal(size=(200, 5)), rng.normal(size=200)
     x[:, 4] += 0.8 * x[:, 0]
     e += 0.4 * x[:, 4]
-    table = Sheet((x.T @ e)[None], (x.T @ x)[None], 3, 1e-9 * np.eye(3))
+    table = Sheet(x.T @ e, x.T @ x, 3, 1e-9 * np.eye(3))
     one = catalogue["motor_gain"](jnp.zeros(()), joint=2)
-    verdict = judge(project(table, np.ones(1)), [Candidate(one, (one, one), one)])[0]
+    verdict = judge(project(table), [Candidate(one, (one, one), one)])[0]
     full = np.linalg.lstsq(x, e, rcond=None)[0]
     rest = np.sum((e - x[:, :3] @ np.linalg.lstsq(x[:, :3], e, rcond=None)[0]) ** 2)
     gain = 0.5 * (rest - np.sum((e - x @ full) ** 2))
@@ -76,10 +76,9 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
     maps = ("torque_offset", "motor_back_emf", "air_drag")
     held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
     free = catalogue["torsional_spring"].candidates(around)
-    table = sheet(model, model, rule.weights(model), [*held, *free], path, data)
     much = np.full(4, 1e4)  # as many copies of the data, beside which the prior of the map counts for nothing
-    left = np.diag(project(table, much).information)
-    share = left / np.diag(np.einsum("s,scd->cd", much, table.information))[table.nuisance :]
+    table = sheet(model, model, rule.weights(model), [*held, *free], path, data, much)
+    share = np.diag(project(table).information) / np.diag(table.information)[table.nuisance :]
     # what the map has no nodes for, and what a spring keeps: 4e-4 at most and .025 at least with this key
     assert np.all(share[: len(held)] < 0.003)
     slope, moment = share[len(held) :: 2], share[len(held) + 1 :: 2]
@@ -110,8 +109,8 @@ def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
     around = surroundings(rig, model, data, path, data.t.shape[1])
     names = ("base_tilt", "sensor_bias", "torsional_spring")
     candidates = [catalogue[name].candidates(around)[0] for name in names]
-    table = sheet(model, model, rule.weights(model), candidates, path, data)
-    tilt, bias, spring = unlike(project(table, np.ones(4)), candidates, candidates[0])
+    table = sheet(model, model, rule.weights(model), candidates, path, data, np.ones(4))
+    tilt, bias, spring = unlike(project(table), candidates, candidates[0])
     # itself; the same but for the prior of the first row (3e-4 with this key); another force (.7)
     assert tilt < 1e-6
     assert bias < 0.02

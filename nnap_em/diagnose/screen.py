@@ -31,10 +31,10 @@ from .evidence import Projected, Question, Screen, Screened
 
 
 class Sheet(NamedTuple):
-    """Score and information of nuisance and candidate columns, of every sequence."""
+    """Score and information of nuisance and candidate columns."""
 
-    score: Float[np.ndarray, "seq column"]
-    information: Float[np.ndarray, "seq column column"]
+    score: Float[np.ndarray, " column"]
+    information: Float[np.ndarray, "column column"]
     nuisance: int
     """Leading columns that are projected out."""
     prior: Float[np.ndarray, "nuisance nuisance"]
@@ -62,17 +62,29 @@ def sheet(
     candidates: Sequence[Candidate],
     path: Gaussian,
     data: Dataset,
+    used: Float[np.ndarray, " seq"],
     rows: int = 0,
 ) -> Sheet:
-    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects."""
+    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects: the
+    sum over sequences with weights `used`.  What a lost one says does not count, not even as NaN.
+    """
     here = locals_along(null, weights.prior, path, data, CUBATURE)
     track = tracks(null, path, here.seq.inputs)
     base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
     every = candidate_columns(base, candidates, track, rows)
     common = (null.log_q, null.log_r, null.start, weights.nodes)
-    outcome = each(_sheet, common, (here, track.middle, every), together=1)  # a sequence fills the cache
-    score, information = (np.asarray(a) for a in outcome)
     nuisance = weights.nodes.size + weights.prior.size
+    size = nuisance + every.force.shape[1]
+    score, information = np.zeros(size), np.zeros((size, size))
+    together = jax.device_count()  # a sequence fills the cache, and the information of all of them the memory
+    for first in range(0, len(used), together):
+        some = np.minimum(np.arange(first, first + together), len(used) - 1)
+        part = jax.tree.map(lambda a, some=some: a[some], (here, track.middle, every))
+        found = map(np.asarray, each(_sheet, common, part, together=1))
+        for weight, own, its in zip(used[first:], *found, strict=False):
+            if weight > 0 and np.isfinite(own).all() and np.isfinite(its).all():
+                score += weight * own
+                information += weight * its
     prior = np.asarray(weights.symmetry()) + _smooth_prior(weights)
     return Sheet(score, information, nuisance, prior)
 
@@ -89,14 +101,9 @@ def _smooth_prior(weights: Weights) -> np.ndarray:
     return out
 
 
-def project(sheet: Sheet, used: Float[np.ndarray, " seq"]) -> Projected:
-    """Sum over sequences with weight `used`, and project; what a lost sequence says does not count, not even as NaN."""
-    known = np.asarray(used) > 0
-    known = known & np.isfinite(sheet.score).all(axis=1) & np.isfinite(sheet.information).all(axis=(1, 2))
-    score = np.einsum("s,sc->c", used[known], sheet.score[known])
-    information = np.zeros(sheet.information.shape[1:])
-    for s in np.flatnonzero(known):  # one by one: the whole is large
-        information += used[s] * sheet.information[s]
+def project(sheet: Sheet) -> Projected:
+    """What the nuisance cannot say."""
+    score, information = sheet.score, sheet.information
     n = sheet.nuisance
     factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
     half = np.linalg.solve(factor, information[:n, n:])
@@ -116,7 +123,7 @@ def screen(
     rows: int,
 ) -> Projected:
     """The sheet of all candidates, projected: what the sequences `used` say of them."""
-    return project(sheet(base, null, weights, candidates, path, data, rows), np.asarray(used, float))
+    return project(sheet(base, null, weights, candidates, path, data, np.asarray(used, float), rows))
 
 
 def score_test(question: Question, candidates: Sequence[Candidate]) -> Screen:

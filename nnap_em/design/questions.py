@@ -104,7 +104,7 @@ class Parameters(AbstractQuestion):
 SURE = 9.0
 """Distance of two models [standard deviations of their log-likelihood ratio] from which on more tells nothing new.
 
-At 6 one in 700 is told wrong, but what logs then add is about half of what was promised of the ratio (docs/design.md)."""
+At 6 one in 700 is told wrong, but logs then add about half of what was promised of the ratio (docs/design.md)."""
 
 
 class Apart(AbstractQuestion):

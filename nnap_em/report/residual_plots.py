@@ -69,7 +69,7 @@ def _causes(found: Residual, names: Names) -> Iterator[_Cause]:
     for j, name in enumerate(names.coordinates):
         yield _Cause(f"{symbol(name)} [{names.unit(name)}]", found.state[..., j], names.rotary[j])
     if len(rotary) > 1:
-        label = " + ".join(symbol(names.coordinates[j]) for j in rotary)
+        label = " + ".join(symbol(names.coordinates[j]) for j in rotary) if len(rotary) < 4 else "sum of all angles"
         yield _Cause(f"{label} [rad]", found.state[..., rotary].sum(-1), True)
     for j, name in enumerate(names.rates):
         yield _Cause(f"{symbol(name)} [{names.unit(name)}]", found.state[..., dof + j])

@@ -153,6 +153,13 @@ def test_page_says_what_was_found_in_order():
     assert places == sorted(places)
 
 
+def test_of_many_tests_all_that_fail_are_listed_and_of_the_others_a_part():
+    bad, good = TEST | {"meaning": "It fails."}, TEST | {"p_value": 0.9, "meaning": "It holds."}
+    text = "".join(_parsed(page(WHOLE | {"tests": {"before": 50 * [good, bad], "after": 60 * [good]}})).text)
+    assert (text.count("It fails."), text.count("It holds.")) == (50, 40)
+    assert "50 more pass" in text and "20 more pass" in text
+
+
 def test_all_text_is_escaped():
     evil = '<script>alert("1")</script>&'
 

@@ -183,12 +183,13 @@ def written(rig: Rig, data: Dataset, folder: Path) -> None:
         write_csv(folder / "train" / f"{i:03d}.csv", {"time": np.asarray(t)} | columns)
 
 
-def diagnosed(kind: str, seed: int, out: Path, count: int) -> str:
+def diagnosed(kind: str, seed: int, out: Path, count: int, *, imu: bool) -> str:
     """What `nnap-em diagnose` names in a machine that lacks something, and how long it took; a row of the table."""
     folder, found = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
     if not (found / "report.json").exists():
         (folder / "train").mkdir(parents=True, exist_ok=True)
-        written(declared(folder, count), recorded(arm(count), JOINTS[:count], seed, LACKS[kind])[0], folder)
+        data, _ = recorded(machine(count, imu=imu), JOINTS[:count], seed, LACKS[kind])
+        written(declared(folder, count, imu=imu), data, folder)
         command = ["diagnose", str(folder), "--out", str(found), "--seed", str(seed), "--quiet"]
         began, before = time.perf_counter(), os.times().children_user
         subprocess.run([sys.executable, "-m", "nnap_em.commands.cli", *command], check=True)
@@ -223,7 +224,7 @@ def main() -> None:
     if args.lacks:
         print("| lacks | seed | named | s | processor s |\n| --- | --- | --- | --- | --- |")
         for seed in seeds:
-            print(diagnosed(args.lacks, seed, args.out, args.joints), flush=True)
+            print(diagnosed(args.lacks, seed, args.out, args.joints, imu=args.imu), flush=True)
         return
     print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
     print("| --- " * (args.joints + 4) + "|")

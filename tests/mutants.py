@@ -958,6 +958,20 @@ MUTANTS = (
         f"{MACHINES}unphysical_bodies_have_no_numbers",
     ),
     Mutant(
+        "smoothed states that a model does not widen",
+        "em/predict.py",
+        "path._replace(cov=path.cov + more)",
+        "path._replace(cov=path.cov + 0.0 * more)",
+        "test_predict.py::test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read",
+    ),
+    Mutant(
+        "forces unsaid that move no state",
+        "em/stated.py",
+        "pushed = jnp.concatenate([torque, here.by_parameter, other], axis=-1)",
+        "pushed = jnp.concatenate([torque, here.by_parameter, 0.0 * other], axis=-1)",
+        "test_stated.py::test_forces_unsaid_move_states_as_the_same_input_does",
+    ),
+    Mutant(
         "a step out of the physical ones",
         "systems/bodies.py",
         "jnp.where(fine, after[name], one)",

@@ -208,7 +208,8 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     monkeypatch.setattr(stated, "forks", lambda *_: told)
     monkeypatch.setattr(stated, "size", lambda *_: force)
     hessian = jnp.full((1, 1), 1.0 + likelihood)
-    found = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
+    found, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
+    assert size == force
     weight = multistep.weighed(told, every)
     scores = slope * np.sum(weight * errors, axis=(1, 2, 3))
     disagree = np.sum((scores - scores.mean()) ** 2) * 4 / 3
@@ -273,7 +274,7 @@ def _finished(monkeypatch, error):
 
     fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
     fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
-    fakes["widened"] = lambda *args, key: 2 * args[-1]
+    fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
     for name, value in fakes.items():
         monkeypatch.setattr(identify, name, value)
     smoother = SimpleNamespace(tolerant=lambda: None)
@@ -285,7 +286,7 @@ def _finished(monkeypatch, error):
 def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch):
     fitted, after, masks = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2)
     assert after.model is fitted.model
-    assert float(after.state.hessian[0, 0]) == 2.0
+    assert float(after.state.hessian[0, 0]) == 2.0 and after.unsaid == 0.7
     np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
 
 

@@ -11,7 +11,7 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.identify import Identified, begin, friction_table, phi_samples
-from nnap_em.em.predict import Prediction, given_samples, horizon_errors, predict, smooth
+from nnap_em.em.predict import Prediction, given_samples, horizon_errors, predict, smooth, smoothed_states
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics import parallel
@@ -149,6 +149,16 @@ def test_uncertain_friction_widens_the_prediction():
     sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
     std = [predict(c.fitted, c.data, GIVEN, key=jax.random.key(1), samples=50).std[:, -1, 0] for c in (sure, unsure)]
     assert np.all(np.asarray(std[1]) > 1.5 * np.asarray(std[0]))
+
+
+def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():
+    sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
+    blind = sure.data._replace(y=sure.data.y.at[:, 20:].set(jnp.nan))
+    own = smooth(sure.fitted, blind).state.cov
+    known, wide = (smoothed_states(case.fitted, blind).cov for case in (sure, unsure))
+    np.testing.assert_allclose(known, own, rtol=1e-6)
+    last, first = (np.asarray(wide / own)[:, row, 0, 0] for row in (-1, 5))
+    assert np.all(last > 100 * first)
 
 
 def test_posterior_samples_have_the_moments_of_the_table():

@@ -40,6 +40,8 @@ class Identified(NamedTuple):
     """Hypotheses of the start."""
     smoother: AbstractSmoother
     """Of the fit, and of all that uses it: to smooth, predict, tell what is left over, and search for what it lacks."""
+    unsaid: float = 0.0
+    """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -146,8 +148,8 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
     now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    hessian = widened(*now, key=jax.random.key(0))
-    return fitted._replace(state=fitted.state._replace(hessian=hessian))
+    told = widened(*now, key=jax.random.key(0))
+    return fitted._replace(state=fitted.state._replace(hessian=told.hessian), unsaid=told.unsaid)
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

@@ -15,6 +15,7 @@ from ..smoother.posterior import AbstractSmoother, Posterior
 from .identify import Identified, phi_samples
 from .loop import e_step
 from .prior import ParameterPrior
+from .stated import of_states
 
 GIVEN = 1.0  # s of readings before a reported error
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
@@ -125,9 +126,21 @@ def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Arra
     return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
 
 
+DRAWN = 32
+"""Models by which a smoothed state is told how far it hangs on the model."""
+
+
 def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
-    """What `smooth` gives, in the coordinates of `Prediction`."""
-    return each(_shown, fitted.model, (smooth(fitted, data).state, data))
+    """What `smooth` gives, in the coordinates of `Prediction`; as wide as what is uncertain of the model makes it, too.
+
+    A hidden joint hangs on the model alone: on two real double pendulums the smoother's own standard deviation held the
+    angle within two in 55 and 65 % of the rows, this one in 83 and 85 %.
+    """
+    data = Dataset(*map(jnp.asarray, data))
+    path, key = smooth(fitted, data).state, jax.random.key(1)
+    phi = phi_samples(fitted, DRAWN, key=key)
+    more = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.unsaid, key=key)
+    return each(_shown, fitted.model, (path._replace(cov=path.cov + more), data))
 
 
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:

@@ -15,14 +15,27 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import kalman_filter, rts
+from .local import locals_along
 from .mstep import ScoringMStep
-from .multistep import Columns, Forks, forks, weighed
+from .multistep import Columns, Forks, forks, read_columns, weighed
+from .quadratic import friction_columns
 from .weights import Weights
 
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""
 SMALLEST, LARGEST, SIZES = 1e-3, 1e5, 49
 """Sizes of such forces that are tried: variance of what they add over that of the rest, where they are told best."""
+
+
+class Stated(NamedTuple):
+    """How sure a fit is."""
+
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of the M-step's weights."""
+    unsaid: float
+    """Size of the forces that no part of the model describes, in those of `unsaid`."""
 
 
 class Errors(NamedTuple):
@@ -48,7 +61,7 @@ def widened(
     hessian: Float[Array, "weight weight"],
     *,
     key: PRNGKeyArray,
-) -> Float[Array, "weight weight"]:
+) -> Stated:
     """Posterior precision that owns up to how much recordings disagree and to what the model leaves unsaid.
 
         H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s' + tau^2 sum_k b_k b_k') A^-1
@@ -68,17 +81,56 @@ def widened(
     information = prior + own.T @ (here.weight[:, None] * own)
     scores = (scores[used] - scores[used].mean(axis=0)) @ jac
     count = len(scores)
-    sources = np.concatenate(
-        [
-            math.sqrt(count / max(count - 1, 1)) * scores.T,
-            size(here._replace(own=own), information) * own.T @ (here.weight[:, None] * here.other),
-        ],
-        axis=1,
-    )
+    force = size(here._replace(own=own), information)
+    shared = force * own.T @ (here.weight[:, None] * here.other)
+    sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
     told, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(told, 0.0))  # L = half half'
     across = half.T @ np.linalg.solve(information, sources)
-    return jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
+    hessian = jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
+    return Stated(hessian, force)
+
+
+def of_states(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    phi: Float[Array, "draw phi"],
+    force: float,
+    *,
+    key: PRNGKeyArray,
+) -> Float[Array, "seq time state state"]:
+    """Covariance that smoothed states have beyond the smoother's own: by friction and parameters, of which `phi` are
+    deviations drawn from the posterior, and by forces unsaid of size `force`.
+
+    The smoother is linear about its path: the mean square of what each draw moves there.
+    """
+    weights = m_step.weights(model)
+    other = unsaid(model, weights, path, data, np.ones(len(data.t), bool), key=key)
+    kicks = force * jax.random.normal(jax.random.fold_in(key, 1), (phi.shape[0], other.force.shape[1]), phi.dtype)
+    here = locals_along(model, m_step.prior, path, data, m_step.linearise)
+    common = model.log_q, model.log_r, model.start, weights.nodes, jnp.concatenate([phi, kicks], axis=1)
+    return each(_moved, common, (here, path.mean, other))
+
+
+def _moved(common, one) -> Float[Array, "time state state"]:
+    """Of one sequence."""
+    (log_q, log_r, start, nodes, draws), (here, mean, found) = common, one
+    dof = nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], here.by_force)
+    other = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    pushed = jnp.concatenate([torque, here.by_parameter, other], axis=-1)
+    read = read_columns(nodes, here, mean, found)
+    still = start._replace(mean=jnp.zeros_like(start.mean))
+    seq = here.seq._replace(y=jnp.zeros_like(here.seq.y))
+
+    def response(draw):
+        affine, reading = (a._replace(offset=b @ draw) for a, b in ((here.affine, pushed), (here.reading, read)))
+        return rts(kalman_filter(log_q, log_r, still, affine, reading, seq)).state.mean
+
+    moved = jax.lax.map(response, draws)
+    return jnp.einsum("kti,ktj->tij", moved, moved) / draws.shape[0]
 
 
 def unsaid(

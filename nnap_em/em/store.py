@@ -186,6 +186,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     del tree["smoother"]
     if "smoother" in header:
         tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
+    if "/unsaid" not in leaves:  # of files from before it was kept
+        del tree["unsaid"]
     tree = _rebuild(tree, "", leaf, setting)
     tree.setdefault("smoother", CubatureSmoother(tree["bank"]))  # of files from before smoothers were kept
     for place in (*leaves, *settings):

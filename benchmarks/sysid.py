@@ -1,7 +1,7 @@
 """Identification beside `mujoco.sysid`, the toolbox of the mujoco package: the table of docs/measured.md.
 
     pip install -e .[bench]
-    python benchmarks/sysid.py [--data ../shared/data/measured] [rig ...]
+    python benchmarks/sysid.py [--data ../shared/data/measured] [--alone] [rig ...]     # alone: without the peer's rows
 
 Both get the same training recordings and the same declared unknowns.  The peer fits them with joint damping and dry
 friction (`damping`, `frictionloss`) by least squares of the angles over chunks of .5 s, each from the measured state; a
@@ -237,22 +237,21 @@ def cells(path: np.ndarray, data: Dataset, start: Start, dt: float) -> list[str]
     return ["; ".join(f"{a:.3f} / {b:.3f}" for a, b in table) for table in numbers]
 
 
-def study(folder: Path) -> list[list[str]]:
-    """Rows of the table: the peer, the library, and the library from the start of the peer."""
+def study(folder: Path, *, alone: bool) -> list[list[str]]:
+    """Rows of the table: the peer unless the library is `alone`, the library, and it from the start of the peer."""
     rig = read_rig(folder / "rig.toml", specs)
     train, test = (jax.tree.map(jnp.asarray, read_logs(folder / part, rig).data) for part in ("train", "test"))
     check(rig)
     start = starts(test, rig.dt, EVERY, max(HORIZONS), EVERY)
+    told, began = {}, time.process_time()
+    if not alone:
+        peer = fit_peer(rig, train)
+        told["mujoco.sysid"] = peer_paths(peer, test, start, rig.dt), f"{time.process_time() - began:.0f}"
     began = time.process_time()
-    peer = fit_peer(rig, train)
-    middle = time.process_time()
     fitted = identify(rig, train, key=jax.random.key(0))
-    seconds = middle - began, time.process_time() - middle
-    told = {
-        "mujoco.sysid": (peer_paths(peer, test, start, rig.dt), f"{seconds[0]:.0f}"),
-        "nnap-em": (predicted_paths(fitted, test, start, rig.dt), f"{seconds[1]:.0f}"),
-        "nnap-em, same start": (same_start_paths(fitted, test, start, rig.dt), "-"),
-    }
+    spent = time.process_time() - began
+    told["nnap-em"] = predicted_paths(fitted, test, start, rig.dt), f"{spent:.0f}"
+    told["nnap-em, same start"] = same_start_paths(fitted, test, start, rig.dt), "-"
     return [
         [folder.name, str(len(start.row)), who, *cells(path, test, start, rig.dt), spent]
         for who, (path, spent) in told.items()
@@ -265,6 +264,7 @@ def main() -> None:
     root = Path(__file__).resolve().parent.parent
     arguments.add_argument("rigs", nargs="*", default=RIGS)
     arguments.add_argument("--data", type=Path, default=root.parent / "shared" / "data" / "measured")
+    arguments.add_argument("--alone", action="store_true", help="without the peer's rows")
     args = arguments.parse_args()
     if not args.data.is_dir():
         sys.exit(f"error: {args.data} is not there: the recordings are no part of the repository")
@@ -276,7 +276,7 @@ def main() -> None:
     heads = ["rig", "starts", "fitted by", "theta1 / theta2 at .25; .5; 1 s, root mean square [rad]", "median", "s"]
     print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
     for name in args.rigs:
-        for row in study(args.data / name):
+        for row in study(args.data / name, alone=args.alone):
             print(f"| {' | '.join(row)} |", flush=True)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -17,10 +18,16 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
 from nnap_em.data.mjcf import read_machine
 from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig, write_rig
+from nnap_em.design.experiment import Design
+from nnap_em.design.information import Fit
+from nnap_em.design.questions import Told
+from nnap_em.effects import catalogue
 from nnap_em.em.build import build, build_system
 from nnap_em.em.felt import felt, sentences
+from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
+from nnap_em.report.design import parameters_told
 from nnap_em.systems import specs
 from nnap_em.systems.bodies import physical
 from nnap_em.systems.pseudo_inertia import Numbers, of_pseudo, pseudo, stepped
@@ -228,6 +235,23 @@ def test_payload_is_a_point_mass_at_the_site(tmp_path):
         q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
         np.testing.assert_allclose(loaded.mass(q), _full(model, data), atol=1e-10)
         np.testing.assert_allclose(loaded.bias(q, v), data.qfrc_bias, atol=1e-9)
+
+
+def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_path):
+    rig = read_rig(_rig(tmp_path, arm(2), model="[model.uncertain]\nlink2.mass = {std = 0.1}"), specs)
+    late = catalogue["input_delay"].of(0.004, joint=2)
+    prior = ParameterPrior(("link2.mass", "0.delay"), jnp.asarray([2.0, 0.0]), jnp.asarray([0.1, 0.01]))
+    model = SimpleNamespace(system=build_system(rig), effects=(late,))
+    told = Told(np.zeros((4, 4)))
+    fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
+    design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
+    design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), told=told, old=told)
+    found = parameters_told(design)
+    assert {name: entry["unit"] for name, entry in found.items()} == {
+        "link2.mass": "kg",
+        "input delay at joint 2, delay": "s",
+    }
+    assert found["input delay at joint 2, delay"]["value"] == pytest.approx(0.004)
 
 
 def test_declared_bodies_that_cannot_be_are_refused(tmp_path):

@@ -135,10 +135,9 @@ def _question(name: str, fitted: Identified, fit: Fit, friction: Friction, apart
     prior, there = fitted.m_step.prior, {}
     if fitted.rig.friction:
         there["friction"] = friction
-    declared = [i for i, n in enumerate(prior.names) if "." not in n]
     if prior.size:
         there["parameters"] = Parameters(fit, tuple(range(prior.size)))
-    singles = {prior.names[i]: Parameters(fit, (i,)) for i in declared}
+    singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
     if apart is not None:
         there["apart"] = apart
     if name == "all" and there:

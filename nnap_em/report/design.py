@@ -9,7 +9,6 @@ import numpy as np
 from scipy import stats
 
 from ..data.formats import write_csv
-from ..data.units import parameter_unit
 from ..design.experiment import Design
 from ..design.questions import Told, after
 from ..diagnose.keys import key_of, listed, words
@@ -139,13 +138,17 @@ def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
     stds = {
         side: std * np.sqrt(np.diagonal(after(cov, told.information))[cut:]) for side, told in _sides(design).items()
     }
-    labels = []
+    labels, units = [], []
     for name, place in zip(prior.names, prior.places(model), strict=True):
-        at, _, own = name.rpartition(".")
-        whose = f"{words(key_of(model.effects[int(at)]))}, {own}" if at else own
+        whose, unit = name, design.fitted.rig.unit(name)
+        if name not in prior.declared:
+            at, _, own = name.partition(".")
+            effect = model.effects[int(at)]
+            whose, unit = f"{words(key_of(effect))}, {own}", effect.units_on(model.system).get(own, "SI")
         labels += [whose] if np.size(place) == 1 else [f"{whose} {i + 1}" for i in range(np.size(place))]
+        units += [unit] * np.size(place)
     return {
-        label: {"value": float(value[i]), "unit": parameter_unit(label)} | {s: float(v[i]) for s, v in stds.items()}
+        label: {"value": float(value[i]), "unit": units[i]} | {s: float(v[i]) for s, v in stds.items()}
         for i, label in enumerate(labels)
     }
 

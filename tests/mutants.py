@@ -972,6 +972,13 @@ MUTANTS = (
         "test_stated.py::test_forces_unsaid_move_states_as_the_same_input_does",
     ),
     Mutant(
+        "friction that may peak at rest while the horizon grows",
+        "em/mstep.py",
+        "(jnp.asarray(1e4), jnp.asarray(1.0))",
+        "(jnp.asarray(1e4), self.rough)",
+        "test_mstep.py::test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows",
+    ),
+    Mutant(
         "a step out of the physical ones",
         "systems/bodies.py",
         "jnp.where(fine, after[name], one)",

@@ -291,12 +291,21 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
 
 def test_the_symmetry_prior_is_that_of_an_offset_and_a_number_at_every_node():
     nodes, rng = jnp.linspace(-2.0, 2.0, 11)[None], np.random.default_rng(0)
-    precision = Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3])).symmetry()[:11, :11]
+    precision = Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3]), jnp.asarray(2.0)).symmetry()[:11, :11]
     odd, half = rng.normal(size=11), rng.normal(size=11)
     np.testing.assert_allclose(precision @ (odd - odd[::-1]), 0.0, atol=1e-12)
     even = half + half[::-1]
-    covariance = 0.3**2 * (1.0 + np.eye(11))
+    covariance = 0.3**2 * (1.0 + 2.0**2 * np.eye(11))
     assert even @ precision @ even == pytest.approx(even @ np.linalg.solve(covariance, even), rel=1e-12)
+
+
+def test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows():
+    model = _slide(FrictionNetwork(jnp.asarray([6.0]), jnp.asarray([1.0]), key=jax.random.key(3)))
+    rule = ScoringMStep(MASS, model.unknown.weights(), (True, True), (True, True), shape=model.log_q)
+    peak = jnp.zeros(42).at[20].set(1.0)  # at rest; the last of all is the mass
+    early, late = (float(peak @ r.weights(model).symmetry() @ peak) for r in (rule.early(), rule))
+    assert early == pytest.approx((1 - 1 / 42) / 0.1**2)
+    assert late == pytest.approx(early / 41, rel=0.05)
 
 
 def test_fit_of_parameters_alone_is_ridge_regression():

@@ -164,16 +164,22 @@ class ScoringMStep(AbstractMStep):
     A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.
     """
     linearise: Tangent | Cubature = Cubature()
+    rough: Float[Array, ""] = eqx.field(default=6.4, converter=jnp.asarray)
+    """`Weights.rough`: loose, but while the horizon grows.
+
+    A peak at rest, beside which there are few readings, would be learned from the first half second and not left again.
+    """
     shape: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
 
     def weights(self, model) -> Weights:
         """What is estimated: weights of the network and parameters."""
-        return Weights(self.prior, model.unknown.nodes(self.nodes), self.ridge, self.centre, 0.1 * model.unknown.scale)
+        nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
+        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough)
 
     def early(self) -> "ScoringMStep":
-        """With the ratio of the joints' noise nearly fixed."""
-        return eqx.tree_at(lambda m: m.tie, self, jnp.asarray(1e4))
+        """With the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the whole."""
+        return eqx.tree_at(lambda m: (m.tie, m.rough), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
 
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
         """Of the network's weights and the parameters."""

@@ -39,6 +39,10 @@ KIND = Kind(
 )
 
 
+LATER = ("/unsaid", "/m_step/rough")
+"""Numbers that files from before they were kept do not have: as a new fit begins with."""
+
+
 class Stored(NamedTuple):
     """What a file holds."""
 
@@ -162,7 +166,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            differs(place, "missing in the file")
+            return value if place in LATER else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":
@@ -186,8 +190,6 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     del tree["smoother"]
     if "smoother" in header:
         tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
-    if "/unsaid" not in leaves:  # of files from before it was kept
-        del tree["unsaid"]
     tree = _rebuild(tree, "", leaf, setting)
     tree.setdefault("smoother", CubatureSmoother(tree["bank"]))  # of files from before smoothers were kept
     for place in (*leaves, *settings):

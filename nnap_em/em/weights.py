@@ -18,10 +18,9 @@ class Weights(eqx.Module):
     centre: Float[Array, " weight"]
     """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
     asymmetry: Float[Array, " dof"]
-    """Prior standard deviation [N m] of the even part of a friction map: of an offset, and again at every node.
-
-    The latter keeps a peak between stops, which no data see beside it, from being learned and never left again.
-    """
+    """Prior standard deviation [N m] of an offset, the even part of a friction map that all nodes share."""
+    rough: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
+    """That of the even part at every node alone, in those of the offset."""
 
     def read(self, model) -> Float[Array, " weight"]:
         """Those of a model, as one vector."""
@@ -54,8 +53,8 @@ class Weights(eqx.Module):
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
         dof, count = self.nodes.shape
         even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1])
-        of_even = even.T @ (jnp.eye(count) - 1 / (count + 1)) @ even  # the inverse of one offset and one number a node
-        blocks = [of_even / self.asymmetry[j] ** 2 for j in range(dof)]
+        inverse = (jnp.eye(count) - 1 / (count + self.rough**2)) / self.rough**2  # of 1 + rough^2 I
+        blocks = [even.T @ inverse @ even / self.asymmetry[j] ** 2 for j in range(dof)]
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
     @eqx.filter_jit

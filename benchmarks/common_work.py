@@ -33,8 +33,8 @@ from nnap_em.smoother.start import StartBank
 START, START_STD = (math.pi / 2, 0.0, 0.0, 0.0), (0.05, 0.05, 0.05, 0.05)
 """Prior of the first row: the arm held out level, at rest [rad, rad/s]."""
 WIDTH = 16
-one_start = StartBank((1, 1, 1, 1), jnp.float32)
-wide_bank = StartBank((1, 13, 1, 1), jnp.float32)
+one_start = StartBank((1, 1, 1, 1))
+wide_bank = StartBank((1, 13, 1, 1))
 """The bank that `nnap-em identify` builds for the paper's acrobot."""
 
 

@@ -81,7 +81,10 @@ def transition(
 
 
 def smooth(model: Model, time: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of the state in every row, given all readings; NaN in y is no reading."""
+    """Mean and covariance of the state in every row, given all readings and this model; NaN in y is no reading.
+
+    The model counts as sure: where a joint is not read, the state is less certain than this.
+    """
     with np.errstate(all="ignore"):
         return _smooth(model, rows_of(model, time, u), y)
 

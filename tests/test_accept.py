@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
+from nnap_em.diagnose.accept import LikelihoodRule, ShareRule, SoonRule
 from nnap_em.diagnose.evidence import Evidence, Screened, Share, price
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis
@@ -34,6 +34,8 @@ class Numbers(Evidence):
     error: float = 0.6
     unseen: float = 0.7
     foretold: float = 0.95
+    soon: float = 1.0
+    soon_unseen: float = 1.0
 
 
 def _screened(
@@ -165,3 +167,30 @@ def test_what_stays():
     for gain, error, stays in ((13.0, 2.0, (True, False)), (11.0, 0.5, (False, True)), (-5.0, 0.95, (False, False))):
         numbers = Numbers(_screened(), gain=gain, error=error)
         assert (LikelihoodRule().keeps(numbers).believed, ShareRule().keeps(numbers).believed) == stays
+    assert ShareRule().keeps(Numbers(_screened(), error=1.3, soon=0.4)).believed  # a fast machine forgets
+
+
+def test_only_named_laws_that_shout_are_looked_at_beyond_the_shares():
+    rule = SoonRule()
+    assert isinstance(ShareRule().beyond(), SoonRule) and LikelihoodRule().beyond() is rule.beyond() is None
+    shout = _screened(gain=0.06 * READINGS)
+    assert rule.promise(shout, READINGS) == pytest.approx(0.06 - NET / READINGS)
+    assert rule.worth_a_refit(0.051, READINGS) and not rule.worth_a_refit(0.049, READINGS)
+    assert rule.promise(shout._replace(candidate=FREE), READINGS) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "sound", "believed"),
+    [
+        ({"error": 1.4, "soon": 0.49, "soon_unseen": 0.69}, True, True),
+        ({"error": 0.1, "soon": 0.51, "soon_unseen": 0.69}, False, True),
+        ({"soon": 0.1, "soon_unseen": 0.71}, True, False),  # not on motions left out
+        ({"soon": 0.1, "soon_unseen": 0.1, "certainty": 4.9}, False, True),
+    ],
+)
+def test_where_a_machine_forgets_half_of_the_error_must_go_at_once(numbers, sound, believed):
+    evidence = Numbers(_screened(), **numbers)
+    assert SoonRule().keeps(evidence).believed == (numbers["soon"] <= 0.5)
+    assert SoonRule().sound(evidence).believed == sound
+    assert SoonRule().believes(evidence).believed == believed
+    assert SoonRule().worth(evidence) == pytest.approx(1 - numbers["soon"])

@@ -113,10 +113,10 @@ def test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other(monkeypatch):
         fitted.append((now, tuple(np.flatnonzero(question.used))))
         return Trial(now.model, RULE, fitted[-1], np.zeros(6), None)
 
-    def error(null, full, data, out):
+    def error(null, full, data, out, horizons):
         assert (null.path[0], full.path[0]) == (BARE, now)
         assert null.path[1] == full.path[1] == tuple(np.flatnonzero(used & ~out))
-        return float(np.flatnonzero(out)[0] + 1)
+        return 10 * len(horizons) + float(np.flatnonzero(out)[0] + 1)
 
     monkeypatch.setattr("nnap_em.diagnose.case.open_loop_error", error)
     now = _with("motor_gain")
@@ -125,7 +125,7 @@ def test_an_effect_is_seen_on_either_half_after_a_fit_to_the_other(monkeypatch):
     null = Trial(MODEL, RULE, None, np.zeros(6), None)
     path = Gaussian(jnp.zeros((6, 9, 2)), jnp.zeros((6, 9, 2, 2)))
     found = Case(_screened(_law("motor_gain", 1.0)), now, path, null, question, fit, halves)
-    assert found.unseen == 2.0
+    assert (found.unseen, found.soon_unseen) == (32.0, 22.0)
     assert len(fitted) == 5  # once on all, twice on either half
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Candidate, fields, flat
-from ..em.multistep import JUDGED, errors, finish, forks, ratio, weighed
+from ..em.multistep import JUDGED, SOON, errors, finish, forks, ratio, weighed
 from ..numerics.gaussian import Gaussian
 from .evidence import Evidence, Question, Screened, lazy
 from .hypothesis import Hypothesis, blocks
@@ -28,9 +28,9 @@ def refitted(now: Hypothesis, path: Gaussian, question: Question, *, passes: int
     return trial._replace(model=finished(trial.model, trial.m_step, trial.path))
 
 
-def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used) -> float:
+def open_loop_error(null: Trial | Question, full: Trial | Question, data: Dataset, used, horizons=JUDGED) -> float:
     """Squared open-loop error of one model over that of another, each along its own smoothed paths."""
-    before, after = (errors(one.model, one.m_step.prior, one.path, data, JUDGED) for one in (null, full))
+    before, after = (errors(one.model, one.m_step.prior, one.path, data, horizons) for one in (null, full))
     return ratio(before, after, used)
 
 
@@ -73,7 +73,7 @@ class Case(Evidence):
         halves: Sequence[Bool[np.ndarray, " seq"]] = (),
     ):
         self.screened, self.null, self.question = screened, null, question
-        self._refits = lambda question: (fit(question.now, question.path, question), fit(begun, path, question))
+        self._refit = lambda question: (fit(question.now, question.path, question), fit(begun, path, question))
         self._halves = halves
         self.trial = fit(begun, path, question)
         self.after = begun.refitted(self.trial.model)
@@ -104,10 +104,28 @@ class Case(Evidence):
         return open_loop_error(self.null, self.trial, self.question.data, self.question.used)
 
     @lazy
+    def soon(self) -> float:
+        """The same over the first tenth of a second."""
+        return open_loop_error(self.null, self.trial, self.question.data, self.question.used, SOON)
+
+    @lazy
     def unseen(self) -> float:
-        """The same on either half of the motions after fits to the other, their mean."""
-        fits = [(out, self._refits(self.question._replace(used=rest))) for out, rest in self._parts()]
-        return float(np.mean([open_loop_error(*both, self.question.data, out) for out, both in fits] or [self.error]))
+        """The error on either half of the motions after fits to the other, their mean."""
+        return self._on_refits(JUDGED) if self._parts() else self.error
+
+    @lazy
+    def soon_unseen(self) -> float:
+        """The same over the first tenth of a second."""
+        return self._on_refits(SOON) if self._parts() else self.soon
+
+    @lazy
+    def _refits(self) -> list[tuple[Bool[np.ndarray, " seq"], tuple[Trial, Trial]]]:
+        """Without and with the effect, fitted to the other half."""
+        return [(out, self._refit(self.question._replace(used=rest))) for out, rest in self._parts()]
+
+    def _on_refits(self, horizons: tuple[float, ...]) -> float:
+        data = self.question.data
+        return float(np.mean([open_loop_error(*both, data, out, horizons) for out, both in self._refits]))
 
     @lazy
     def foretold(self) -> float:

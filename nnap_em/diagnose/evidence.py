@@ -15,11 +15,11 @@ from ..numerics.gaussian import Gaussian
 from .hypothesis import Hypothesis
 
 
-def lazy(measure: Callable[[Any], float]) -> Any:
+def lazy(measure: Callable[[Any], Any]) -> Any:
     """A property that is measured when it is asked for, and once."""
     name = f"_{measure.__name__}"
 
-    def value(self) -> float:
+    def value(self) -> Any:
         if name not in self.__dict__:
             self.__dict__[name] = measure(self)
         return self.__dict__[name]
@@ -130,6 +130,8 @@ class Worth:
     """Log-likelihood [nat]."""
     error: float
     """Squared open-loop error of the one over that of the other."""
+    soon: float
+    """The same over the first tenth of a second."""
 
 
 class Evidence(Worth):
@@ -147,6 +149,8 @@ class Evidence(Worth):
     there are no others."""
     foretold: float
     """The same on motions that had no part in the fit of its own numbers alone."""
+    soon_unseen: float
+    """`unseen` over the first tenth of a second."""
 
 
 def readings(data: Dataset) -> int:

@@ -140,7 +140,7 @@ def look(question: Question, rig, rule: AbstractRule, effort: Effort, say: Say) 
             tried, sound = tried + cases, [case for case in cases if _is_sound(case, rule, say)]
     by_worth = functools.partial(sorted, key=lambda case: -rule.worth(case))
     step = step._replace(refitted=tuple((key_of(c.effect), rule.worth(c)) for c in by_worth(tried)))
-    return Look(step, screen, _named_first(by_worth(sound), rule), by_worth(tried))
+    return Look(step, screen, _named_first(_likelier_first(by_worth(sound), rule), rule), by_worth(tried))
 
 
 def _refits(question: Question, group: Sequence[Screened], null: Trial, rule, fit: Fit, halves, say: Say) -> list[Case]:
@@ -184,6 +184,12 @@ def _disputed(
         if key not in best or best[key].share < told.share:
             best[key] = told
     return tuple(sorted(best.values(), key=lambda told: -told.share))
+
+
+def _likelier_first(sound: list[Case], rule: AbstractRule) -> list[Case]:
+    """The likeliest of those that the rule cannot tell from the best in front."""
+    even = [case for case in sound if rule.even(sound[0], case)]
+    return sorted(even, key=lambda case: -case.gain) + [case for case in sound if not any(case is e for e in even)]
 
 
 def _named_first(sound: list[Case], rule: AbstractRule) -> list[Case]:

@@ -43,17 +43,21 @@ SAME = 0.01
 
 def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tuple[Hypothesis, EMState | None]:
     """Look at one horizon until nothing more is found; a fit to a longer one, where a playoff made it."""
-    rule, say, been = loop.rule, loop.say, {_names(now)}
+    say, been = loop.say, {_names(now)}
     while len(now.found) < loop.effort.most:
         let_go()
         question, whole = asked(loop, now, length)
         say(f"horizon {length * loop.before.rig.dt:.2f} s: {whole.sum()} of {whole.size} sequences followed")
         if not question.used.any():
             break
-        if rule.multistep and now.found:
+        if loop.rule.multistep and now.found:
             question = question._replace(left=Difference(loop, loop.bare, now, math.nan).error)
             say(f"  {question.left:.0%} of the open-loop error of the declared model is left")
-        seen = look(question, loop.before.rig, rule, loop.effort, say)
+        rule, seen = loop.rule, look(question, loop.before.rig, loop.rule, loop.effort, say)
+        beyond = None if seen.sound else rule.beyond()
+        if beyond is not None:
+            again = look(question, loop.before.rig, beyond, loop.effort, say)
+            rule, seen = (beyond, again) if again.sound else (rule, seen)
         steps.append(seen.step)
         if not seen.sound:
             break
@@ -62,7 +66,7 @@ def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tupl
             steps[-1] = seen.step._replace(rivals=tuple(key_of(case.effect) for case in rivals))
             say(f"  cannot tell: {', '.join(map(words, steps[-1].rivals))} explain the same; none is added")
             break
-        best, further, behind = settle(loop, now, length, seen.sound)
+        best, further, behind = settle(loop._replace(rule=rule), now, length, seen.sound)
         winner = _believed(best, seen.sound, rule, say)
         if winner is None:
             break

@@ -150,10 +150,7 @@ def removed(
     track = tracks(model, path, each(_inputs, model, data))
     extra = candidate_columns(eqx.tree_at(lambda m: m.unknown, base, model.unknown), candidates, track)
     found = forks(model, weights, path, data, extra)
-    state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
-    motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
-    clock = np.asarray(data.t)[:, starts(model, data)]
-    part = fold_of(used, motion, times(clock, data, recording, 4))
+    part, clock = parts(model, path, data, used, recording), _clock(model, data)
     rows = project(found, model, weights, used, part, times(clock, data, recording, BLOCKS))
     timed = ["time" in c.start.signals(model.system) for c in candidates]
     told = [
@@ -165,8 +162,30 @@ def removed(
     projected = Projected(columns.T @ (rows.error / np.sqrt(rows.overlap)), columns.T @ columns)
     return Removed(
         np.asarray(inside), np.asarray(left_out), np.stack(folds), np.asarray(directions), np.concatenate(coefficients),
-        np.array([(part == f).any(axis=1) & used for f in np.unique(rows.fold)]).reshape(-1, used.size), projected,
+        members(part, used), projected,
     )  # fmt: skip
+
+
+def parts(
+    model: StateSpaceModel,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    recording: Int[np.ndarray, " seq"],
+) -> Int[np.ndarray, "seq start"]:
+    """The part that is left out with every fork, in turn."""
+    state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
+    motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
+    return fold_of(used, motion, times(_clock(model, data), data, recording, 4))
+
+
+def members(part: Int[np.ndarray, "seq start"], used: Bool[np.ndarray, " seq"]) -> Bool[np.ndarray, "fold seq"]:
+    """Sequences that each part holds, or pieces of."""
+    return np.array([(part == f).any(axis=1) & used for f in np.unique(part[used])]).reshape(-1, used.size)
+
+
+def _clock(model: StateSpaceModel, data: Dataset) -> Float[np.ndarray, "seq start"]:
+    return np.asarray(data.t)[:, starts(model, data)]
 
 
 def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:

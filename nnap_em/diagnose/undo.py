@@ -7,6 +7,7 @@ import numpy as np
 
 from ..em.identify import finished
 from ..em.loop import EMState
+from ..em.multistep import JUDGED, SOON
 from ..model.state_space import StateSpaceModel
 from .case import open_loop_error, significance, trimmed
 from .evidence import Worth, lazy, readings
@@ -30,8 +31,16 @@ class Difference(Worth):
     @lazy
     def error(self) -> float:
         """Squared open-loop error of the one over that of the other."""
+        return self._over(JUDGED)
+
+    @lazy
+    def soon(self) -> float:
+        """The same over the first tenth of a second."""
+        return self._over(SOON)
+
+    def _over(self, horizons: tuple[float, ...]) -> float:
         (a, one), (b, other) = (asked(self.loop, each, self.loop.longest) for each in (self.less, self.full))
-        return open_loop_error(a, b, self.loop.data, one & other)
+        return open_loop_error(a, b, self.loop.data, one & other, horizons)
 
 
 def needed(loop: Loop, now: Hypothesis, state: EMState | None) -> tuple[Hypothesis, EMState | None]:

@@ -29,6 +29,8 @@ HORIZONS = (0.25, 0.5)
 """Horizons [s] at which errors are looked at."""
 JUDGED = (*HORIZONS, 1.0)
 """Horizons [s] at which a model is judged: what only bends the first half second fails later."""
+SOON = (0.05, 0.1)
+"""Horizons [s] that a machine does not forget over, however fast it is."""
 SPACING = 0.05
 """Time [s] between starts."""
 WIDE = 0.1

@@ -92,7 +92,8 @@ def test_columns_are_difference_quotients(question, known, name):
     candidates = _candidates(question, name)
     inputs = jax.vmap(known.model.inputs)(known.data)
     extra = candidate_columns(known.model, candidates, tracks(known.model, known.path, inputs))
-    before = forks(known.model, known.m_step.weights(known.model), known.path, known.data, extra)
+    some = lambda index: jax.tree.map(lambda a: a[index], extra)  # noqa: E731
+    before = forks(known.model, known.m_step.weights(known.model), known.path, known.data, some)
     start, probe = candidates[0].start, candidates[0].probes[0]
     weak = jax.tree.map(lambda start, p: start + 1e-2 * (p - start), start, probe)
     after = errors(with_effects(known.model, (weak,)), known.m_step.prior, known.path, known.data)

@@ -125,7 +125,8 @@ class Case(Evidence):
 
     def _on_refits(self, horizons: tuple[float, ...]) -> float:
         data = self.question.data
-        return float(np.mean([open_loop_error(*both, data, out, horizons) for out, both in self._refits]))
+        told = [open_loop_error(null, full, data, out, horizons) for out, (null, full) in self._refits]
+        return float(np.mean(told))
 
     @lazy
     def foretold(self) -> float:

@@ -23,7 +23,7 @@ from ..em.quadratic import friction_columns, whitened_sensitivities
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each
+from ..numerics.parallel import each, turns
 from ..smoother.kalman import CUBATURE, kalman_filter
 from ..storage.journal import HERE, step
 from .columns import candidate_columns, tracks
@@ -76,12 +76,9 @@ def sheet(
     nuisance = weights.nodes.size + weights.prior.size
     size = nuisance + every.force.shape[1]
     score, information = np.zeros(size), np.zeros((size, size))
-    together = jax.device_count()  # a sequence fills the cache, and the information of all of them the memory
-    for first in range(0, len(used), together):
-        some = np.minimum(np.arange(first, first + together), len(used) - 1)
-        part = jax.tree.map(lambda a, some=some: a[some], (here, track.middle, every))
+    for some, part in turns(len(used), here, track.middle, every):  # the information of all fills the memory
         found = map(np.asarray, each(_sheet, common, part, together=1))
-        for weight, own, its in zip(used[first:], *found, strict=False):
+        for weight, own, its in zip(used[some[0] :], *found, strict=False):
             if weight > 0 and np.isfinite(own).all() and np.isfinite(its).all():
                 score += weight * own
                 information += weight * its

@@ -5,6 +5,7 @@ filter up to the start and of the open loop from there on, so that the errors ar
 """
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each
+from ..numerics.parallel import each, turns
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .local import locals_along
 from .mstep import ScoringMStep
@@ -88,21 +89,28 @@ def channels(model: StateSpaceModel) -> tuple[int, ...]:
 
 
 def forks(
-    model: StateSpaceModel, weights: Weights, path: Gaussian, data: Dataset, extra: Columns | None = None
+    model: StateSpaceModel,
+    weights: Weights,
+    path: Gaussian,
+    data: Dataset,
+    extra: Callable[[Int[np.ndarray, " some"]], Columns] | None = None,
 ) -> Forks:
-    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` are more columns."""
+    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` says more columns of some."""
     grid = _grid(model, data)
     here, exact = _wide(model, weights.prior, path, data)
     state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
     error = np.array(each(_errors, (model, grid), (state, here.seq)))
-    if extra is None:
-        sequences, rows, dof = *path.mean.shape[:2], len(model.system.coordinates)
-        extra = Columns(jnp.zeros((sequences, 0, rows, dof)), jnp.zeros((sequences, 0, rows, data.y.shape[-1])))
-    middle = 0.5 * (path.mean + exact)
-    sens = each(_sensitivities, (weights.nodes, grid), (here, gain, middle, extra), together=1)
-    see = channels(model)
+    rows, dof = path.mean.shape[1], len(model.system.coordinates)
+
+    def none(some) -> Columns:
+        return Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, data.y.shape[-1])))
+
+    middle, columns, see = 0.5 * (path.mean + exact), [], channels(model)
+    for some, part in turns(len(error), here, gain, middle):  # columns of all would be gigabytes at six joints
+        sens = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(some)), together=1)
+        columns.append(np.asarray(sens)[..., see, :])
     overlap = np.asarray(grid.ages) / grid.stride
-    return Forks(error[..., see], np.asarray(sens)[..., see, :], overlap)
+    return Forks(error[..., see], np.concatenate(columns)[: len(error)], overlap)
 
 
 def errors(

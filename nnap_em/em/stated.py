@@ -74,7 +74,8 @@ def widened(
     left unsaid; Rahimi & Recht 2007, NIPS, for the functions]
     """
     weights = m_step.weights(model)
-    now = forks(model, weights, path, data, unsaid(model, weights, path, data, used, key=key))
+    other = unsaid(model, weights, path, data, used, key=key)
+    now = forks(model, weights, path, data, lambda some: jax.tree.map(lambda a: a[some], other))
     prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
     here, scores = _rows(now, weighed(now, used), len(jac))
     own = here.own @ jac

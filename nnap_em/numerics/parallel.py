@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
+from jaxtyping import Int
 
 AXIS = "seq"
 _mesh: contextvars.ContextVar[Mesh | None] = contextvars.ContextVar("nnap_em_mesh", default=None)
@@ -85,6 +86,17 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
         out = _gather(_program(function)(mesh, group, common, batch))
     return jax.tree.map(lambda a: a[:count], out) if whole > count else out
+
+
+def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " some"], tuple[Any, ...]]]:
+    """As many entries at a time as there are devices: which, and theirs of `trees`; the last again where they run out.
+
+    For work whose results, of all entries together, would not fit the memory.
+    """
+    every = jax.tree.map(np.asarray, trees)  # NumPy cuts by views, JAX by a program for every shape
+    for first in range(0, count, jax.device_count()):
+        some = np.minimum(np.arange(first, first + jax.device_count()), count - 1)
+        yield some, jax.tree.map(lambda a, some=some: a[some], every)
 
 
 @functools.cache

@@ -21,7 +21,16 @@ from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Sha
 from nnap_em.diagnose.grow import Loop
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import covered, key_of, rest_of
-from nnap_em.diagnose.look import EFFORT, Look, _best_of_kind, _disputed, _named_first, _shortlist, look
+from nnap_em.diagnose.look import (
+    EFFORT,
+    Look,
+    _best_of_kind,
+    _disputed,
+    _likelier_first,
+    _named_first,
+    _shortlist,
+    look,
+)
 from nnap_em.diagnose.outcome import Closed, Step
 from nnap_em.diagnose.propose import seeded
 from nnap_em.diagnose.refit import Trial
@@ -246,6 +255,16 @@ def test_a_law_with_a_name_is_preferred_where_it_is_nearly_as_good(gain, first):
     assert _named_first(sound, LikelihoodRule())[0].effect.name == first
 
 
+def test_the_likeliest_of_those_that_shares_cannot_tell_is_first():
+    laws = (_law("motor_gain"), _law("dead_zone"), _spring())
+    cases = [_case(law, gain) for law, gain in zip(laws, (100.0, 160.0, 900.0), strict=True)]
+    for case, error in zip(cases, (0.40, 0.42, 0.6), strict=True):
+        case.__dict__["_error"] = error
+    first = [case.effect.name for case in _likelier_first(cases, ShareRule())]
+    assert first == ["dead_zone", "motor_gain", "torsional_spring"]  # the last removes far less, likely as it is
+    assert _likelier_first([], ShareRule()) == []
+
+
 def test_laws_of_other_causes_that_explain_the_same_are_rivals():
     """A gain and a spring, where multi-step errors decide; two laws of the input are not."""
     gain, zone, spring = (_case(law, 100.0) for law in (_law("motor_gain"), _law("dead_zone"), _spring()))
@@ -317,6 +336,24 @@ WORTH = {"motor_gain": 50.0, "dead_zone": 1.0}
 
 def _top(model) -> float:
     return sum(WORTH[name] for name in _names(model))
+
+
+@pytest.mark.parametrize(
+    ("error", "rule", "kept"), [(0.9, ShareRule(), 7.0), (1.1, ShareRule(), 0.0), (1.1, None, 7.0)]
+)
+def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypatch, error, rule, kept):
+    """By multi-step errors; where one-step likelihood decides, it is what the fit is for."""
+    tops = []
+
+    def fit(state, data, smoother, m_step, *, epochs, schedule):
+        tops.append(0.0 if epochs == 2 else 7.0)  # one epoch, which only judges the model as it is
+        return _emstate(state.model, tops[-1])
+
+    monkeypatch.setattr(grow, "fit", fit)
+    monkeypatch.setattr(grow, "asked", lambda *_: (None, np.ones(6, bool)))
+    monkeypatch.setattr(grow, "open_loop_error", lambda *_: error)
+    asked = _loop([])._replace(rule=rule)
+    assert grow.grow(asked, _with("motor_gain"), 9, 9).top[0] == kept
 
 
 @pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])

@@ -146,13 +146,33 @@ class LikelihoodRule(AbstractRule):
         return Verdict(worth.gain > self.bar(worth.readings), f"gains {worth.gain:.0f} nat")
 
 
-class ShareRule(AbstractRule):
+class ErrorRule(AbstractRule):
+    """Errors of the model run alone, whatever its likelihood."""
+
+    multistep: ClassVar[bool] = True
+    level: float = eqx.field(static=True, default=0.9)
+    """Share of the winner's worth from which on a rival explains the same as well: folds differ by more."""
+
+    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
+        """The whole: over a second a fifth of the error goes by chance."""
+        return [longest]
+
+    def even(self, winner: Evidence, rival: Evidence) -> bool:
+        """Nearly the same share."""
+        return self.worth(rival) > self.level * self.worth(winner)
+
+    def falls(self, error: float, bar: float, where: str) -> Verdict:
+        """Whether an error has fallen by a share."""
+        gone = 1.0 - error
+        return Verdict(gone >= bar, f"removes {gone:.0%} of the {where}")
+
+
+class ShareRule(ErrorRule):
     """Multi-step prediction, on all recordings and on those left out: right where innovations are not what the model
     says, because what a machine lacks adds up over many steps and what spoils its readings does not.
     """
 
     promises: ClassVar[str] = "share of the squared multi-step error"
-    multistep: ClassVar[bool] = True
     least: float = eqx.field(static=True, default=0.15)
     """Share of the squared error that must go, inside and on what is left out: chance removes up to a tenth."""
     agree: float = eqx.field(static=True, default=0.75)
@@ -161,12 +181,6 @@ class ShareRule(AbstractRule):
     """Share by which it may rise on any."""
     matters: float = eqx.field(static=True, default=0.1)
     """Share of the declared model's error that a later law must remove as well: what chance can of the whole."""
-    level: float = eqx.field(static=True, default=0.9)
-    """Share of the winner's worth from which on a rival explains the same as well: folds differ by more."""
-
-    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
-        """The whole: over a second a fifth of the error goes by chance."""
-        return [longest]
 
     def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
         """By shares of the multi-step error."""
@@ -234,14 +248,11 @@ class ShareRule(AbstractRule):
         gone = 1.0 - evidence.foretold
         return Verdict(gone >= self.least, f"{verdict.reason}, {gone:.0%} where its own numbers alone are left out")
 
-    def even(self, winner: Evidence, rival: Evidence) -> bool:
-        """Nearly the same share."""
-        return self.worth(rival) > self.level * self.worth(winner)
-
     def keeps(self, worth: Worth) -> Verdict:
         """Whether the error falls, or most of that at once."""
         verdict = self._falls(worth.error)
-        return verdict if verdict.believed or not self.beyond().keeps(worth).believed else self.beyond().keeps(worth)
+        at_once = verdict if verdict.believed else self.beyond().keeps(worth)
+        return at_once if at_once.believed else verdict
 
     def beyond(self) -> AbstractRule:
         """Errors at once."""
@@ -249,11 +260,10 @@ class ShareRule(AbstractRule):
 
     def _falls(self, error: float, where: str = "") -> Verdict:
         """Of the refitted model, which is not linear and has to say it all, most of the share."""
-        gone = 1.0 - error
-        return Verdict(gone >= self.near * self.least, f"removes {gone:.0%} of the open-loop error{where}")
+        return self.falls(error, self.near * self.least, f"open-loop error{where}")
 
 
-class SoonRule(AbstractRule):
+class SoonRule(ErrorRule):
     """Errors at once, of named laws that one-step likelihood shouts for: right where a machine forgets.
 
     A law that makes a fast machine unstable, as detents do, cannot be seen in errors half a second ahead: small
@@ -261,17 +271,10 @@ class SoonRule(AbstractRule):
     """
 
     promises: ClassVar[str] = "expected gain in log-likelihood a reading [nat]"
-    multistep: ClassVar[bool] = True
     loud: float = eqx.field(static=True, default=0.05)
     """Expected gain a reading [nat]: errors that are halved in one reading of four give .09."""
     least: float = eqx.field(static=True, default=0.5)
     """Share of the squared errors a tenth of a second ahead that must go: what is false removed a quarter at most."""
-    level: float = eqx.field(static=True, default=0.9)
-    """Share of the winner's worth from which on a rival explains the same as well."""
-
-    def horizons(self, fitted: Sequence[int], longest: int) -> list[int]:
-        """The whole."""
-        return [longest]
 
     def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
         """By the score test; what is left out is as by shares."""
@@ -296,20 +299,15 @@ class SoonRule(AbstractRule):
         """Whether it is far from none and most of the error goes at once."""
         if evidence.certainty <= self.certain:
             return Verdict(False, f"is {evidence.certainty:.1f} standard deviations from none only")
-        return self._falls(evidence.soon)
+        return self._falls(evidence.soon, self.least)
 
     def believes(self, evidence: Evidence) -> Verdict:
         """Whether it goes on what was left out of the refit, too: most of the share, as halves fit less well."""
-        return self._falls(evidence.soon_unseen, self.near, " of motions left out")
-
-    def even(self, winner: Evidence, rival: Evidence) -> bool:
-        """Nearly the same share."""
-        return self.worth(rival) > self.level * self.worth(winner)
+        return self._falls(evidence.soon_unseen, self.near * self.least, " of motions left out")
 
     def keeps(self, worth: Worth) -> Verdict:
         """Whether most of the error goes at once."""
-        return self._falls(worth.soon)
+        return self._falls(worth.soon, self.least)
 
-    def _falls(self, error: float, part: float = 1.0, where: str = "") -> Verdict:
-        gone = 1.0 - error
-        return Verdict(gone >= part * self.least, f"removes {gone:.0%} of the error at once{where}")
+    def _falls(self, error: float, bar: float, where: str = "") -> Verdict:
+        return self.falls(error, bar, f"error at once{where}")

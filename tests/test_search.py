@@ -339,7 +339,7 @@ def _top(model) -> float:
 
 
 @pytest.mark.parametrize(
-    ("error", "rule", "kept"), [(0.9, ShareRule(), 7.0), (1.1, ShareRule(), 0.0), (1.1, None, 7.0)]
+    ("error", "rule", "kept"), [(0.9, ShareRule(), 7.0), (1.1, ShareRule(), 0.0), (1.1, LikelihoodRule(), 7.0)]
 )
 def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypatch, error, rule, kept):
     """By multi-step errors; where one-step likelihood decides, it is what the fit is for."""

@@ -91,7 +91,7 @@ def test_columns_are_difference_quotients(question, known, name):
     """A column is minus the change of the error where a hundredth of the effect is in the model."""
     candidates = _candidates(question, name)
     inputs = jax.vmap(known.model.inputs)(known.data)
-    extra = candidate_columns(known.model, candidates, tracks(known.model, known.path, inputs))
+    extra = candidate_columns(known.model, candidates)(tracks(known.model, known.path, inputs))
     some = lambda index: jax.tree.map(lambda a: a[index], extra)  # noqa: E731
     before = forks(known.model, known.m_step.weights(known.model), known.path, known.data, some)
     start, probe = candidates[0].start, candidates[0].probes[0]
@@ -109,13 +109,13 @@ def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):
     candidates = proposals(surroundings(rig, q.model, q.data, q.path, ROWS))
     inputs = jax.vmap(q.model.inputs)(q.data)
     track = tracks(q.model, q.path, inputs)
-    force, reading = map(np.asarray, candidate_columns(q.model, candidates, track))
+    force, reading = map(np.asarray, candidate_columns(q.model, candidates)(track))
     probes = [probe for candidate in candidates for probe in candidate.probes]
     assert force.shape[1] == reading.shape[1] == len(probes)
     for kind in ("UnknownFunction", "Cogging", "SensorBias"):
         places = [i for i, probe in enumerate(probes) if type(probe).__name__ == kind]
         place = places[len(places) // 2]
-        alone = candidate_columns(q.model, [Candidate(probes[place], 2 * (probes[place],), probes[place])], track)
+        alone = candidate_columns(q.model, [Candidate(probes[place], 2 * (probes[place],), probes[place])])(track)
         for i in range(2):  # forces are up to some 100: rounding
             np.testing.assert_allclose(force[:, place], alone.force[:, i], atol=1e-12)
             np.testing.assert_allclose(reading[:, place], alone.reading[:, i], atol=1e-12)

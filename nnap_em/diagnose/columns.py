@@ -1,7 +1,7 @@
 """What candidates would add along the smoothed motion: force and reading of each of their probes."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -137,21 +137,29 @@ def _stack_columns(common, track: Track) -> list[Columns]:
     return [jax.vmap(one, in_axes=(axes,))(stack) for stack, axes in stacks]
 
 
-def candidate_columns(base: StateSpaceModel, candidates: Sequence[Candidate], track: Track, rows: int = 0) -> Columns:
-    """What every probe of every candidate adds to `base` along the tracks of all sequences: seq column time ...
+def candidate_columns(
+    base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0
+) -> Callable[[Track], Columns]:
+    """What every probe of every candidate adds to `base` along the tracks of some sequences: seq column time ...
 
     Tracks are padded to `rows`, so that horizons share the largest program.
     """
-    groups, length = _stacks([probe for candidate in candidates for probe in candidate.probes]), track.x.shape[1]
-    more = [(0, 0), (0, max(0, rows - length))]
-    longer = lambda a: jnp.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
-    track, size = jax.tree.map(longer, track), sum(len(stack.places) for stack in groups)
-    last = track.acceleration.shape[-1], len(base.measured)
-    force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
-    for _, group in itertools.groupby(groups, key=lambda stack: type(stack.probes)):  # a program for every class
-        stacks = list(group)
-        every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in stacks]), track)
-        for stack, found in zip(stacks, every, strict=True):
-            for whole, own in ((force, found.force), (reading, found.reading)):
-                whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
-    return Columns(jnp.asarray(force), jnp.asarray(reading))
+    stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
+    groups = [list(group) for _, group in itertools.groupby(stacks, key=lambda stack: type(stack.probes))]
+    size = sum(len(stack.places) for stack in stacks)
+
+    def along(track: Track) -> Columns:
+        length = track.x.shape[1]
+        more = [(0, 0), (0, max(0, rows - length))]
+        longer = lambda a: np.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
+        track = jax.tree.map(longer, track)
+        last = track.acceleration.shape[-1], len(base.measured)
+        force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
+        for group in groups:  # a program for every class
+            every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
+            for stack, found in zip(group, every, strict=True):
+                for whole, own in ((force, found.force), (reading, found.reading)):
+                    whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
+        return Columns(jnp.asarray(force), jnp.asarray(reading))
+
+    return along

@@ -71,17 +71,17 @@ def sheet(
     here = locals_along(null, weights.prior, path, data, CUBATURE)
     track = tracks(null, path, here.seq.inputs)
     base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
-    every = candidate_columns(base, candidates, track, rows)
+    along = candidate_columns(base, candidates, rows)
     common = (null.log_q, null.log_r, null.start, weights.nodes)
     nuisance = weights.nodes.size + weights.prior.size
-    size = nuisance + every.force.shape[1]
+    size = nuisance + sum(len(candidate.probes) for candidate in candidates)
     score, information = np.zeros(size), np.zeros((size, size))
-    for some, part in turns(len(used), here, track.middle, every):  # the information of all fills the memory
-        found = map(np.asarray, each(_sheet, common, part, together=1))
-        for weight, own, its in zip(used[some[0] :], *found, strict=False):
-            if weight > 0 and np.isfinite(own).all() and np.isfinite(its).all():
-                score += weight * own
-                information += weight * its
+    for some, (local, own) in turns(len(used), here, track):  # columns of all fill the memory
+        found = map(np.asarray, each(_sheet, common, (local, own.middle, along(own)), together=1))
+        for weight, its, told in zip(used[some[0] :], *found, strict=False):
+            if weight > 0 and np.isfinite(its).all() and np.isfinite(told).all():
+                score += weight * its
+                information += weight * told
     prior = np.asarray(weights.symmetry()) + _smooth_prior(weights)
     return Sheet(score, information, nuisance, prior)
 

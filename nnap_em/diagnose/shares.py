@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..data.dataset import Dataset
 from ..effects import Candidate, flat
-from ..em.multistep import Columns, Forks, forks, starts, weighed
+from ..em.multistep import Forks, forks, starts, weighed
 from ..em.shape import friction_prior
 from ..em.weights import Weights
 from ..model.state_space import Inputs, StateSpaceModel
@@ -149,12 +149,9 @@ def removed(
 ) -> Removed:
     """What every candidate removes of the multi-step errors of `model`, which is `base` and its effects."""
     track = tracks(model, path, each(_inputs, model, data))
-    base = eqx.tree_at(lambda m: m.unknown, base, model.unknown)
-
-    def extra(some: Int[np.ndarray, " some"]) -> Columns:
-        return candidate_columns(base, candidates, jax.tree.map(lambda a: np.asarray(a)[some], track))
-
-    found = forks(model, weights, path, data, extra)
+    along = candidate_columns(eqx.tree_at(lambda m: m.unknown, base, model.unknown), candidates)
+    track = jax.tree.map(np.asarray, track)
+    found = forks(model, weights, path, data, lambda some: along(jax.tree.map(lambda a: a[some], track)))
     part, clock = parts(model, path, data, used, recording), _clock(model, data)
     rows = project(found, model, weights, used, part, times(clock, data, recording, BLOCKS))
     timed = ["time" in c.start.signals(model.system) for c in candidates]

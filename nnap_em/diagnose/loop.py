@@ -5,7 +5,7 @@ The search measures and proposes; whether something is believed is asked of a ru
 
 import functools
 import math
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -53,21 +53,8 @@ def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tupl
         if loop.rule.multistep and now.found:
             question = question._replace(left=Difference(loop, loop.bare, now, math.nan).error)
             say(f"  {question.left:.0%} of the open-loop error of the declared model is left")
-        rule, seen = loop.rule, look(question, loop.before.rig, loop.rule, loop.effort, say)
-        beyond = None if seen.sound else rule.beyond()
-        if beyond is not None:
-            again = look(question, loop.before.rig, beyond, loop.effort, say)
-            rule, seen = (beyond, again) if again.sound else (rule, seen)
+        rule, seen, winner, further, behind = _choice(loop, now, question, length)
         steps.append(seen.step)
-        if not seen.sound:
-            break
-        rivals = _rivals(seen.sound, rule, now.model.system)
-        if rivals:
-            steps[-1] = seen.step._replace(rivals=tuple(key_of(case.effect) for case in rivals))
-            say(f"  cannot tell: {', '.join(map(words, steps[-1].rivals))} explain the same; none is added")
-            break
-        best, further, behind = settle(loop._replace(rule=rule), now, length, seen.sound)
-        winner = _believed(best, seen.sound, rule, say)
         if winner is None:
             break
         key = key_of(winner.effect)
@@ -88,6 +75,38 @@ def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tupl
         if further is not None:
             return now, further
     return now, None
+
+
+class Choice(NamedTuple):
+    """What came of a look."""
+
+    rule: AbstractRule
+    seen: Look
+    winner: Case | None
+    further: EMState | None
+    """A fit to a longer horizon, where a playoff made it."""
+    behind: dict[Key, float]
+    """How many nats each rival fell behind in it."""
+
+
+def _choice(loop: Loop, now: Hypothesis, question: Question, length: int) -> Choice:
+    """Who is believed, by the rule or, where that believes nobody, by the one beyond it."""
+    rule, none = loop.rule, None
+    while rule is not None:
+        seen = look(question, loop.before.rig, rule, loop.effort, loop.say)
+        none = none or Choice(rule, seen, None, None, {})
+        if seen.sound:
+            rivals = tuple(key_of(case.effect) for case in _rivals(seen.sound, rule, now.model.system))
+            if rivals:
+                loop.say(f"  cannot tell: {', '.join(map(words, rivals))} explain the same; none is added")
+                return Choice(rule, seen._replace(step=seen.step._replace(rivals=rivals)), None, None, {})
+            best, further, behind = settle(loop._replace(rule=rule), now, length, seen.sound)
+            winner = _believed(best, seen.sound, rule, loop.say)
+            if winner is not None:
+                return Choice(rule, seen, winner, further, behind)
+        rule = rule.beyond()
+    assert none is not None
+    return none
 
 
 def _rivals(sound: list[Case], rule: AbstractRule, system: AbstractSystem) -> list[Case]:

@@ -74,13 +74,6 @@ MUTANTS = (
         "test_effects.py::test_brakes_never_add_energy[motor_back_emf]",
     ),
     Mutant(
-        "rows of a block left out",
-        "numerics/rows.py",
-        "reshape(count * size, *a.shape[2:])[:length]",
-        "reshape(count * size, *a.shape[2:])[-length:]",
-        "test_rows.py::test_rows_in_blocks_are_the_rows_all_at_once",
-    ),
-    Mutant(
         "weights of the Runge-Kutta stages",
         "numerics/ode.py",
         "[1.0, 2.0, 2.0, 1.0]",

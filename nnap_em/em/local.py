@@ -10,7 +10,6 @@ from ..model.base import AbstractModel, Prepared, prepare
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..numerics.rows import rows
 from ..smoother.kalman import TANGENT, Cubature, Tangent, linear_reading
 from ..smoother.posterior import Posterior
 from .prior import ParameterPrior
@@ -22,7 +21,7 @@ def local(
 ) -> Local:
     """The model of one sequence, linearised about the Gaussians of `path`, and its sensitivities at their means."""
     prepared = prepare(model, seq)
-    affine = rows(lambda state, u: linearise(model, state, u), path, prepared.inputs)
+    affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, prepared.inputs)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, prepared.inputs)
     by_force, by_parameter, feels, of_reading = _sensitivities(model, prior, path.mean, seq, prepared.inputs)
     return Local(prepared, affine, reading, by_force, by_parameter, of_reading, feels)
@@ -69,7 +68,7 @@ def _sensitivities(
             of_reading = of_reading if feels is None else of_reading.at[:, held].set(feels @ push)
         return by_force, by_parameter, feels, of_reading
 
-    return rows(row, path, inputs, by_z)
+    return jax.vmap(row)(path, inputs, by_z)
 
 
 def locals_along(

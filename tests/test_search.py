@@ -15,7 +15,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnose import case as case_of
 from nnap_em.diagnose import grow, loop, undo
 from nnap_em.diagnose import look as search
-from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
+from nnap_em.diagnose.accept import LikelihoodRule, ShareRule, SoonRule
 from nnap_em.diagnose.case import Case, left_out_error, significance, trimmed
 from nnap_em.diagnose.evidence import Projected, Question, Screen, Screened, Share
 from nnap_em.diagnose.grow import Loop
@@ -406,7 +406,8 @@ def test_only_what_the_rule_believes_is_added(monkeypatch, held_out, added):
     empty = Screen((), Projected(np.zeros(0), np.eye(0)))
     looks = [Look(Step(9, (), (), None, 1), empty, [case], [case]), Look(Step(9, (), (), None, 1), empty, [], [])]
     monkeypatch.setattr(loop, "let_go", lambda: None)
-    monkeypatch.setattr(loop, "asked", lambda *_: (SimpleNamespace(used=np.ones(6, bool)), np.ones(6, bool)))
+    question = Question(BARE, BARE, None, DATA, np.ones(6, bool), 9)
+    monkeypatch.setattr(loop, "asked", lambda *_: (question, np.ones(6, bool)))
     monkeypatch.setattr(loop, "look", lambda *_: looks.pop(0))
     monkeypatch.setattr(loop, "_found", lambda *_: _found("motor_gain"))
     monkeypatch.setattr(loop, "_plain", lambda *_: None)
@@ -442,3 +443,20 @@ def test_likelihood_is_believed_where_noise_is_what_the_model_says(monkeypatch, 
     rules.clear()
     loop.close_the_loop(RIG, DATA, key=jax.random.key(0), rule=ShareRule())
     assert rules == [ShareRule]
+
+
+@pytest.mark.parametrize(("unseen", "believed"), [(0.5, "motor_gain"), (1.5, "torsional_spring")])
+def test_what_lies_beyond_is_asked_where_the_rule_believes_nobody(monkeypatch, unseen, believed):
+    empty = Screen((), Projected(np.zeros(0), np.eye(0)))
+    cases = {rule: [_case(law, 100.0)] for rule, law in ((ShareRule, _law("motor_gain")), (SoonRule, _spring()))}
+    cases[ShareRule][0].__dict__ |= {"_unseen": unseen, "_foretold": 2.0, "_error": 0.5}
+    cases[SoonRule][0].__dict__ |= {"_soon": 0.3, "_soon_unseen": 0.4}
+    seen = lambda question, rig, rule, *_: Look(Step(9, (), (), None, 1), empty, cases[type(rule)], [])  # noqa: E731
+    monkeypatch.setattr(loop, "look", seen)
+    question = Question(BARE, BARE, None, DATA, np.ones(6, bool), 9)
+    choice = loop._choice(_loop([])._replace(rule=ShareRule()), BARE, question, 9)
+    assert choice.winner is not None and choice.winner.effect.name == believed
+    assert type(choice.rule) is (ShareRule if unseen < 1 else SoonRule)
+    cases[SoonRule][0].__dict__["_soon_unseen"] = 0.9
+    nobody = loop._choice(_loop([])._replace(rule=ShareRule()), BARE, question, 9)
+    assert (nobody.winner is None) == (unseen > 1) and nobody.seen.sound == cases[ShareRule]

@@ -371,8 +371,8 @@ MUTANTS = (
     Mutant(
         "the least likely of even laws is first",
         "diagnose/look.py",
-        "sorted(even, key=lambda case: -case.gain)",
-        "sorted(even, key=lambda case: case.gain)",
+        "sorted(even, key=net, reverse=True)",
+        "sorted(even, key=net)",
         "test_search.py::test_the_likeliest_of_those_that_shares_cannot_tell_is_first",
     ),
     Mutant(

@@ -263,6 +263,9 @@ def test_the_likeliest_of_those_that_shares_cannot_tell_is_first():
     first = [case.effect.name for case in _likelier_first(cases, ShareRule())]
     assert first == ["dead_zone", "motor_gain", "torsional_spring"]  # the last removes far less, likely as it is
     assert _likelier_first([], ShareRule()) == []
+    cases[1].directions = 40  # 92 nat, paid
+    assert _likelier_first(cases, ShareRule())[0].effect.name == "motor_gain"
+    assert _likelier_first(cases, LikelihoodRule()) == cases  # its worth is the likelihood
 
 
 def test_laws_of_other_causes_that_explain_the_same_are_rivals():

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from ..model.state_space import StateSpaceModel
 from .accept import AbstractRule
 from .case import Case, Fit, refitted
-from .evidence import Question, Screen, Screened
+from .evidence import Question, Screen, Screened, price
 from .keys import Key, covered, key_of, replaced, rest_of, words
 from .outcome import Disputed, Step
 from .propose import extended, proposals, seeded, surroundings
@@ -187,9 +187,10 @@ def _disputed(
 
 
 def _likelier_first(sound: list[Case], rule: AbstractRule) -> list[Case]:
-    """The likeliest of those that the rule cannot tell from the best in front."""
-    even = [case for case in sound if rule.even(sound[0], case)]
-    return sorted(even, key=lambda case: -case.gain) + [case for case in sound if not any(case is e for e in even)]
+    """The likeliest, its price paid, of those whose errors cannot tell them from the best in front."""
+    even = [case for case in sound if rule.multistep and rule.even(sound[0], case)]
+    net = lambda case: case.gain - price(case.directions, case.readings)  # noqa: E731
+    return sorted(even, key=net, reverse=True) + [case for case in sound if not any(case is e for e in even)]
 
 
 def _named_first(sound: list[Case], rule: AbstractRule) -> list[Case]:

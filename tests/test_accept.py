@@ -121,6 +121,21 @@ def test_a_refit_keeps_what_the_share_promised(numbers, believed):
     assert ShareRule().sound(Numbers(_screened(), **numbers)).believed == believed
 
 
+@pytest.mark.parametrize(
+    ("candidate", "left_out", "error", "believed"),
+    [
+        (FREE, 0.3, 0.84, True),
+        (FREE, 0.3, 0.86, False),
+        (FREE, 0.15, 0.71, False),  # half of it is not seen on what is left out
+        (FREE, 0.15, 0.69, True),
+        (LINEAR, 0.15, 0.86, True),  # one number
+    ],
+)
+def test_what_has_no_name_is_worth_the_whole_share_after_its_refit(candidate, left_out, error, believed):
+    evidence = Numbers(_screened(inside=0.3, left_out=left_out, candidate=candidate), error=error)
+    assert ShareRule().sound(evidence).believed == believed
+
+
 @pytest.mark.parametrize(("unseen", "believed"), [(0.7, True), (0.92, False), (9.7, False)])
 def test_what_the_refit_gains_has_to_be_there_on_motions_that_it_left_out(unseen, believed):
     assert ShareRule().believes(Numbers(_screened(), error=0.2, unseen=unseen)).believed == believed

@@ -90,13 +90,13 @@ def test_em_rests_where_nothing_moves(changes, rests):
 def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
     tried = []
 
-    def em_step(model, *_):
+    def e_step(model, *_, key):
         tried.append(float(model.log_q[0]))
-        loglik = np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)])
-        return model, SimpleNamespace(used=np.array([True, False])), loglik, None
+        return SimpleNamespace(loglik=np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)]))
 
-    monkeypatch.setattr(loop, "em_step", em_step)
-    settled = loop._settle_noise(MODEL, DATA, None, RULE, jax.random.key(0))
+    monkeypatch.setattr(loop, "e_step", e_step)
+    monkeypatch.setattr(loop, "kept", lambda *_: np.array([True, False]))
+    settled = loop._settle_noise(MODEL, DATA, None, jax.random.key(0))
     np.testing.assert_allclose(tried, 2 * np.log([1.0, 0.3, 0.1, 0.03, 0.01]))
     np.testing.assert_allclose(settled.log_q, 2 * np.log(0.1))
 

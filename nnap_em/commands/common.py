@@ -26,9 +26,11 @@ from ..em.predict import GIVEN
 from ..em.store import fingerprint
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
+from ..numerics.traced import keep_on
 from ..portable.export import ExportError
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
+from ..storage.shelf import Shelf
 from ..systems import specs
 
 
@@ -41,6 +43,8 @@ WARNINGS = (RigWarning, DataWarning)
 MODEL, AFTER = "model.npz", "after.npz"
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
+TRACED = "traced"
+"""Folder of the programs before they were compiled, in that of the compiled ones."""
 MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
@@ -50,13 +54,16 @@ Say = Callable[[str], None]
 
 
 def set_up() -> None:
-    """64-bit numbers, every core, and compiled programs kept for the next call if there is a place for them."""
+    """64-bit numbers, every core, and programs kept for the next call, traced and compiled, if there is a place."""
     jax.config.update("jax_enable_x64", True)
     if not jax.distributed.is_initialized():  # or they are dealt out
         if "JAX_NUM_CPU_DEVICES" not in os.environ:
             with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
                 jax.config.update("jax_num_cpu_devices", min(MOST, cores()))
         use_every_device()
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if chosen:
+        keep_on(Shelf(Path(chosen) / TRACED))
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -68,6 +75,7 @@ def set_up() -> None:
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
+        keep_on(Shelf(folder / TRACED))
 
 
 @contextmanager

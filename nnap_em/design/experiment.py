@@ -84,7 +84,7 @@ def design_experiment(
     Raises DesignError where the rig has no input, a start is out of the limits, or there is nothing to ask.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     posterior = smooth(fitted, data)
     path, used = np.asarray(posterior.state.mean), np.asarray(kept(posterior, data))
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)

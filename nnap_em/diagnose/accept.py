@@ -230,11 +230,15 @@ class ShareRule(ErrorRule):
     def sound(self, evidence: Evidence) -> Verdict:
         """Whether it is far from none and the error falls.
 
-        One-step likelihood has no say: in a quick refit the noise has not settled, and the true law can lose nats.
+        One-step likelihood has no say: in a quick refit the noise has not settled, and the true law can lose nats. What
+        has no name, many numbers that fit many things a little, must be worth the whole of the least share.
         """
         if evidence.certainty <= self.certain:
             return Verdict(False, f"is {evidence.certainty:.1f} standard deviations from none only")
-        return self._falls(evidence.error)
+        worth, verdict = self.worth(evidence), self._falls(evidence.error)
+        if verdict.believed and not evidence.screened.candidate.start.named and worth < self.least:
+            return Verdict(False, f"{verdict.reason}, {worth:.0%} as far as recordings left out say so: has no name")
+        return verdict
 
     def believes(self, evidence: Evidence) -> Verdict:
         """Whether the error falls on what was left out of the refit, too.

@@ -122,7 +122,7 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     if all(same):  # one probe, or one given twice
         same = [False] * len(same)
     pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
-    leaves = [jnp.asarray(a[0] if one else pad(a)) for a, one in zip(whole, same, strict=True)]
+    leaves = [np.asarray(a[0]) if one else pad(a) for a, one in zip(whole, same, strict=True)]
     axes = [None if one else 0 for one in same]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
 

@@ -57,7 +57,7 @@ def beginning(data: Dataset, length: int) -> Dataset:
 
 def _cut(tree: _Tree, length: int) -> _Tree:
     """All of it, over no more rows than a short horizon needs."""
-    return jax.tree.map(lambda a: a[:, :SHORT], tree) if length <= SHORT else tree
+    return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if length <= SHORT else tree  # a view, no program
 
 
 def asked(loop: Loop, now: Hypothesis, length: int) -> tuple[Question, Bool[np.ndarray, " seq"]]:

@@ -8,7 +8,6 @@ import math
 from typing import Any, NamedTuple, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
@@ -235,7 +234,7 @@ def close_the_loop(
     white; else, as on real machines, shares of the multi-step error, and touches from outside are left out before.
     Raises FitError when no sequence can be followed.
     """
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     stages: Stages = {}
 
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
@@ -29,7 +29,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
     clock = np.asarray(data.t)[valid]
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
-    fast, slow, back, fast_back = np.asarray(jax.vmap(model.unknown)(ends))
+    fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
     # what rises between .4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
     viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
     return Around(
@@ -50,6 +50,12 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         rig.friction,
         rig.input_columns,
     )
+
+
+@eqx.filter_jit
+def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
+    """Of the friction map at joint velocities."""
+    return jax.vmap(unknown)(v)
 
 
 def proposals(around: Around, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:

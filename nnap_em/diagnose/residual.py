@@ -163,7 +163,7 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     small: a slow force comes out whole, single kicks do not.  Innovations are those of the Kalman filter of the model
     linearised about the smoothed distribution by cubature, whichever smoother gave that.
     """
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     posterior = smooth(fitted, data)
     outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
     innovation, force, std, lacked, lacked_std, state, predicted, u = outcome

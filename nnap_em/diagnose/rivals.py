@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ..data.dataset import Dataset
@@ -93,7 +93,7 @@ def _is(key: Key, effect: AbstractEffect) -> bool:
 
 def _settled(fitted: Identified, data: Dataset) -> Identified:
     """A quick refit after EM over the whole length."""
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     loop = _loop(fitted, data)
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     return finished(fitted._replace(state=grow(loop, now, loop.longest, loop.longest)), data)
@@ -105,7 +105,7 @@ def _loop(fitted: Identified, data: Dataset) -> Loop:
 
 def _question(fitted: Identified, data: Dataset, place: int | None) -> Question:
     """What a fit lacks without one of its effects, over the whole length."""
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     now = now if place is None else now.without(place)
     loop = _loop(fitted, data)

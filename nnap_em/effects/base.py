@@ -85,7 +85,13 @@ class Around(NamedTuple):
 
     def inertia(self, joint: int) -> float:
         """Of everything behind a joint, with all joints at zero [kg m^2]."""
-        return float(self.system.mass(jnp.zeros(len(self.system.coordinates)))[joint - 1, joint - 1])
+        return float(np.asarray(_still(self.system))[joint - 1])
+
+
+@eqx.filter_jit
+def _still(system: AbstractSystem) -> Float[Array, " dof"]:
+    """Inertia behind every joint with all joints at zero."""
+    return jnp.diagonal(system.mass(jnp.zeros(len(system.coordinates))))
 
 
 class Candidate(NamedTuple):

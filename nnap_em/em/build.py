@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig, RigError
@@ -49,9 +49,14 @@ def build_system(rig: Rig) -> AbstractSystem:
     values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.parameters.items()}
     system = systems[rig.system].declared(values, rig.input_joints, rig.machine)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(system.coordinates)))
-    if np.linalg.eigvalsh(np.asarray(jax.vmap(system.mass)(jnp.asarray(q, float)))).min() <= 0:
+    if np.linalg.eigvalsh(np.asarray(_masses(system, jnp.asarray(q, float)))).min() <= 0:
         raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
     return system
+
+
+@eqx.filter_jit
+def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof dof"]:
+    return jax.vmap(system.mass)(q)
 
 
 def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:

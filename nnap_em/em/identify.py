@@ -130,7 +130,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     Only where the noise of the readings is not what the model says: where it is, one-step likelihood is efficient, and
     its curvature says how sure it is.
     """
-    data = Dataset(*map(jnp.asarray, data))
+    data = jax.device_put(data)
     if white_readings(data):
         return fitted
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=jax.random.key(0))

@@ -10,6 +10,7 @@ from ..model.base import AbstractModel, Prepared, prepare
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
+from ..numerics.rows import rows
 from ..smoother.kalman import TANGENT, Cubature, Tangent, linear_reading
 from ..smoother.posterior import Posterior
 from .prior import ParameterPrior
@@ -21,14 +22,14 @@ def local(
 ) -> Local:
     """The model of one sequence, linearised about the Gaussians of `path`, and its sensitivities at their means."""
     prepared = prepare(model, seq)
-    affine = jax.vmap(lambda state, u: linearise(model, state, u))(path, prepared.inputs)
+    affine = rows(lambda state, u: linearise(model, state, u), path, prepared.inputs)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, prepared.inputs)
-    by_force, by_parameter, feels, of_reading = _sensitivities(model, prior, path.mean, seq, prepared.inputs)
+    by_force, by_parameter, feels, of_reading = _sensitivities(model, prior, path, seq, prepared.inputs)
     return Local(prepared, affine, reading, by_force, by_parameter, of_reading, feels)
 
 
 def _sensitivities(
-    model: StateSpaceModel, prior: ParameterPrior, path: Float[Array, "time state"], seq: Dataset, inputs: Inputs
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, inputs: Inputs
 ) -> tuple[
     Float[Array, "time state dof"],
     Float[Array, "time state param"],
@@ -39,11 +40,13 @@ def _sensitivities(
     value, held = prior.read(model), prior.held(model)
     free = np.flatnonzero(~held)
     dof = len(model.system.coordinates)
-    still = jnp.zeros(dof, path.dtype)
+    still = jnp.zeros(dof, path.mean.dtype)
     z = jnp.concatenate([still, value[free]])  # a force, and the parameters that do not act as forces held over a step
     by_z = jax.jacfwd(lambda z: prior.write(model, value.at[free].set(z[dof:])).inputs(seq))(z)
 
-    def row(x, u, by_z):
+    def row(state, u, by_z):
+        x = state.mean
+
         def both(z, u):
             now = prior.write(model, value.at[free].set(z[dof:]))
             return now.transition(x, u, z[:dof]), now.emission(x, u, z[:dof])
@@ -68,7 +71,7 @@ def _sensitivities(
             of_reading = of_reading if feels is None else of_reading.at[:, held].set(feels @ push)
         return by_force, by_parameter, feels, of_reading
 
-    return jax.vmap(row)(path, inputs, by_z)
+    return rows(row, path, inputs, by_z)
 
 
 def locals_along(

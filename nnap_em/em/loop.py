@@ -19,7 +19,7 @@ from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
-from .mstep import AbstractMStep, MStepInfo, between
+from .mstep import AbstractMStep, MStepInfo, between, kept
 
 
 class EMState(NamedTuple):
@@ -129,7 +129,7 @@ def fit(
     """
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     if state.epoch == 0:
-        model = _settle_noise(state.model, horizon(data, schedule.first), smoother, m_step, state.key)
+        model = _settle_noise(state.model, horizon(data, schedule.first), smoother, state.key)
         state = state._replace(model=model, best=model)
     while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
         seen = schedule.horizon(state.epoch, longest)
@@ -164,15 +164,14 @@ def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EM
     return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
 
 
-def _settle_noise(
-    model: AbstractModel, data: Dataset, smoother, m_step, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)
-):
+def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
     """`model` with its process noise scaled by the likeliest of `scales`: nobody knows how far its motion is off."""
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
-    for trial in trials:
-        _, info, loglik, _ = em_step(trial, data, smoother, m_step.early(), key)
-        logliks.append(float(np.mean(np.asarray(loglik)[np.asarray(info.used)])) if np.any(info.used) else -math.inf)
+    for trial in trials:  # the step that would follow has no say
+        posterior = e_step(trial, data, smoother, key=key)
+        used = np.asarray(kept(posterior, data))
+        logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)
     return trials[int(np.argmax(logliks))]
 
 

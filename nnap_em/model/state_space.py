@@ -94,6 +94,7 @@ class StateSpaceModel(AbstractModel):
         acceleration = hooks.acceleration(self.effects, scene, memory, force)
         return *scene.v, *acceleration, *hooks.drift(self.effects, scene, memory)
 
+    @eqx.filter_jit
     def transition(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " state"]:

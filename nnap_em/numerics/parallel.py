@@ -23,6 +23,8 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Int
 
+from .traced import traced
+
 AXIS = "seq"
 _mesh: contextvars.ContextVar[Mesh | None] = contextvars.ContextVar("nnap_em_mesh", default=None)
 
@@ -122,7 +124,7 @@ def _program(function: Callable) -> Callable:
         return jax.shard_map(share, mesh=mesh, check_vma=False, **specs)(numbers, batch)
 
     run.__name__ = run.__qualname__ = f"each{function.__name__}"
-    return eqx.filter_jit(run)
+    return traced(run, function)
 
 
 def at_home(tree: Any) -> Any:
@@ -130,10 +132,17 @@ def at_home(tree: Any) -> Any:
 
     A program is compiled once for arrays that are bound to a device, and once more where one of them is not.
     """
-    arrays, rest = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arrays)):
+    home = jax.local_devices()[0]
+    abroad = lambda a: isinstance(a, jax.Array | np.ndarray) and not _bound_to(a, home)  # noqa: E731
+    arrays, rest = eqx.partition(tree, abroad)  # to put a whole model where it is takes milliseconds
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree)):
         return tree
-    return eqx.combine(jax.device_put(arrays, jax.local_devices()[0]), rest)
+    return eqx.combine(jax.device_put(arrays, home), rest)
+
+
+def _bound_to(a: Any, device: Any) -> bool:
+    """Whether an array is committed to this device, and to no other."""
+    return isinstance(a, jax.Array) and not isinstance(a, Tracer) and a.committed and a.devices() == {device}
 
 
 def _place(tree, sharding: NamedSharding):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ..model.base import Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower, product, spd_solve, symmetric, upper_solve
+from ..numerics.rows import rows
 
 
 class Affine(NamedTuple):
@@ -192,7 +193,7 @@ def kalman_filter(
 
 def relinearised(model, about: Gaussian, seq: Prepared, linearise: Callable) -> Filtered:
     """Filter of `model` with all steps linearised about a path at once [Bell 1994]."""
-    affine = jax.vmap(lambda state, u: linearise(model, state, u))(about, seq.inputs)
+    affine = rows(lambda state, u: linearise(model, state, u), about, seq.inputs)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(about.mean, seq.inputs)
     return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, seq)
 

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..numerics.gaussian import Gaussian
@@ -24,8 +25,9 @@ class StartBank(eqx.Module):
 
     def __init__(self, counts: tuple[int, ...]):
         """`counts` hypotheses along each state (1: as it is)."""
-        lines = [jnp.linspace(-REACH, REACH, n, dtype=float) if n > 1 else jnp.zeros(1) for n in counts]
-        self.offsets = jnp.stack([a.ravel() for a in jnp.meshgrid(*lines, indexing="ij")], axis=-1)
+        lines = [np.linspace(-REACH, REACH, n) if n > 1 else np.zeros(1) for n in counts]
+        grid = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=-1)
+        self.offsets = jnp.asarray(grid, float)
         self.shrink = jnp.asarray([1.2 * REACH / (n - 1) if n > 1 else 1.0 for n in counts], float)
 
     def padded(self, states: int) -> "StartBank":

@@ -1,0 +1,149 @@
+"""Programs that are kept as they were traced, so that the next run neither traces nor lowers them again.
+
+JAX's own cache spares a run the compiling alone: to know what it looks for it traces and lowers the program first,
+which took 14 of the 66 s of a diagnosis that had all its programs at hand.  Here a program is known by what decides it
+before it is traced: the package's own text, the versions of what it stands on, and its arguments but for the numbers in
+their arrays.  What else could decide it, say an effect of a user's own, is not looked for: such a program is not kept.
+"""
+
+import functools
+import hashlib
+import importlib.metadata
+import io
+import logging
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+from jax.core import Tracer
+
+KNOWN = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
+"""Packages whose text a key stands for, by its own hash or by their version."""
+STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
+
+
+@runtime_checkable
+class Shelf(Protocol):
+    """Where programs lie between runs."""
+
+    def get(self, key: str) -> bytes | None:
+        """What was put there under this key, if anything."""
+        ...
+
+    def put(self, key: str, content: bytes) -> None:
+        """Keep it, if there is room."""
+        ...
+
+
+class _Kept:
+    """The shelf in use, and the programs made ready in this process."""
+
+    shelf: ClassVar[Shelf | None] = None
+    ready: ClassVar[dict[Any, Callable]] = {}
+
+
+def keep_on(shelf: Shelf | None) -> None:
+    """Keep programs there from here on; None: nowhere, as at first.  Commands do."""
+    _Kept.shelf = shelf
+
+
+def traced(run: Callable, function: Callable) -> Callable:
+    """`run(*arguments)`, which is decided by `function`, compiled: its arguments but for arrays are constants of it."""
+    plain = eqx.filter_jit(run)
+
+    def call(*arguments):
+        leaves, structure = jax.tree.flatten(arguments)
+        if _Kept.shelf is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
+            return plain(*arguments)
+        known = function, structure, tuple(_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
+        if known not in _Kept.ready:
+            _Kept.ready[known] = _ready(run, function, arguments, _Kept.shelf) or (lambda *_: plain(*arguments))
+        return _Kept.ready[known](*(leaf for leaf in leaves if eqx.is_array(leaf)))
+
+    return call
+
+
+def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> Callable | None:
+    """The program, from the shelf or traced and laid there; None where it cannot be kept."""
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    arrays, inside = jax.tree.flatten(dynamic)
+    try:
+        key = _key(function, arrays, inside, static)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
+        return None
+    found = _unpacked(shelf.get(key))
+    if found is None:
+        told = []
+
+        def flat(*arrays):
+            out, outside = jax.tree.flatten(run(*eqx.combine(jax.tree.unflatten(inside, arrays), static)))
+            told.append(outside)
+            return out
+
+        flat.__name__ = flat.__qualname__ = run.__name__
+        exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
+        shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
+        found = exported, told[-1]
+    exported, outside = found
+
+    def again(*arrays):
+        return exported.call(*arrays)
+
+    again.__name__ = again.__qualname__ = run.__name__
+    program = jax.jit(again)
+    return lambda *arrays: jax.tree.unflatten(outside, program(*arrays))
+
+
+def _unpacked(content: bytes | None) -> tuple[jax.export.Exported, Any] | None:
+    """What lies on the shelf; None for what is not whole."""
+    if content is None:
+        return None
+    try:
+        program, outside = pickle.loads(content)
+        return jax.export.deserialize(bytearray(program)), outside
+    except Exception as error:  # whatever it is that was damaged: it is made anew
+        logging.getLogger(__name__).debug("a kept program cannot be read: %s", error)
+        return None
+
+
+def _shape(a: jax.Array) -> tuple[str, bool]:
+    return str(jax.typeof(a)), getattr(a, "weak_type", False)  # a random key has none
+
+
+def _key(function: Callable, arrays: list[jax.Array], inside: Any, static: Any) -> str:
+    """What decides a program, as one number."""
+    text = io.BytesIO()
+    pickler = _Telling(text)
+    pickler.fast = True  # the same whichever objects are the same
+    pickler.dump((function, inside, [_shape(a) for a in arrays], static))
+    return hashlib.sha256(_surroundings() + text.getvalue()).hexdigest()
+
+
+class _Telling(pickle.Pickler):
+    """Tells what it is given, in every process alike; refuses what it cannot tell whole."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        """As `pickle` has it."""
+        if isinstance(obj, jax.sharding.Mesh):
+            return repr, (f"{obj.axis_names} {obj.devices.shape}",)
+        if obj in (str, repr) or not (isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__"))):
+            return NotImplemented
+        package, code = str(obj.__module__).partition(".")[0], getattr(obj, "__code__", None)
+        if package not in KNOWN or ("<" in obj.__qualname__ and getattr(obj, "__closure__", ()) is not None):
+            raise pickle.PicklingError(f"it holds {obj.__module__}.{obj.__qualname__}")
+        return str, (f"{obj.__module__}.{obj.__qualname__} {code and code.co_firstlineno}",)
+
+
+@functools.cache
+def _surroundings() -> bytes:
+    """The package's text, what it stands on and how JAX is set, as one number."""
+    package, told = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        told.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in STANDS_ON]
+    told.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
+    return told.digest()

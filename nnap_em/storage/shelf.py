@@ -1,0 +1,25 @@
+"""A folder of things under keys, shared by all processes; to keep them is a favour, never a need."""
+
+from contextlib import suppress
+from pathlib import Path
+
+from .files import replace_bytes
+
+
+class Shelf:
+    """One file for each key; each is there whole or not at all."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def get(self, key: str) -> bytes | None:
+        """What was put there under this key, if anything that can be read."""
+        try:
+            return (self.folder / key).read_bytes()
+        except OSError:
+            return None
+
+    def put(self, key: str, content: bytes) -> None:
+        """Keep it, if there is room."""
+        with suppress(OSError):
+            replace_bytes(self.folder / key, content)

@@ -1,0 +1,50 @@
+"""Rows in blocks: what all at once give, whatever the length, and differentiable both ways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.numerics.gaussian import WIDE, Gaussian
+from nnap_em.numerics.rows import BLOCK, rows
+
+
+def _path(mean):
+    return Gaussian(mean, jnp.broadcast_to(jnp.eye(mean.shape[-1]), (*mean.shape, mean.shape[-1])))
+
+
+def _one(state, scale):
+    return {"wave": jnp.sin(scale * state.mean), "sum": jnp.sum(state.cov @ state.mean * scale)}
+
+
+def _all(function, *trees):
+    return jax.vmap(function)(*trees)
+
+
+@pytest.mark.parametrize("states", [3, WIDE + 1])
+@pytest.mark.parametrize("length", [1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5])
+def test_rows_in_blocks_are_the_rows_all_at_once(length, states):
+    rng = np.random.default_rng(length)
+    x, scale = jnp.asarray(rng.normal(size=(length, states))), jnp.asarray(rng.normal(size=length))
+    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)  # noqa: E731
+    jax.tree.map(same, rows(_one, _path(x), scale), _all(_one, _path(x), scale))
+
+
+@pytest.mark.parametrize(("states", "loops"), [(WIDE, 1), (WIDE + 1, 0)])
+def test_only_few_states_are_cut_in_blocks(states, loops):
+    """Programs of many states in blocks take gigabytes to compile."""
+    x, scale = jnp.ones((70, states)), jnp.ones(70)
+    told = str(jax.make_jaxpr(lambda x, scale: rows(_one, _path(x), scale))(x, scale))
+    assert told.count("scan[") == loops
+
+
+def test_blocks_may_be_batched_and_differentiated():
+    rng = np.random.default_rng(0)
+    x, scale = jnp.asarray(rng.normal(size=(2, 40, 3))), jnp.asarray(rng.normal(size=(2, 40)))
+
+    def total(over):
+        return lambda x: jnp.sum(jax.vmap(lambda x, s: over(_one, _path(x), s)["wave"])(x, scale) ** 2)
+
+    blocks, whole = total(rows), total(_all)
+    for derive in (jax.jacfwd, jax.grad):  # sums in another order
+        np.testing.assert_allclose(derive(blocks)(x), derive(whole)(x), rtol=1e-12, atol=1e-12)

@@ -1,0 +1,173 @@
+"""Programs that are kept between runs: the same numbers, found again, and never another program's."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from shell import ENVIRONMENT, ROOT
+
+from nnap_em.em.loop import e_step
+from nnap_em.model.simulate import paper_model, paper_sweep, sweep_experiment
+from nnap_em.numerics import parallel, traced
+from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.start import StartBank
+from nnap_em.storage.shelf import Shelf
+
+
+@pytest.fixture
+def shelf(tmp_path, monkeypatch):
+    """A shelf in use, in a process that has no program yet."""
+    found = Shelf(tmp_path / "shelf")
+    monkeypatch.setattr(traced._Kept, "shelf", found)
+    monkeypatch.setattr(traced._Kept, "ready", {})
+    return found
+
+
+def _kept(shelf: Shelf) -> set[str]:
+    return {path.name for path in shelf.folder.glob("*")}
+
+
+@pytest.fixture(scope="module")
+def work():
+    """A model with a learned friction map, and logs of it."""
+    model = paper_model()
+    return model, sweep_experiment(model, paper_sweep, 3, 40, key=jax.random.key(0)).data
+
+
+def _smoothed(work, smoother, monkeypatch):
+    """`e_step` as the next process would do it."""
+    monkeypatch.setattr(traced._Kept, "ready", {})
+    parallel._program.cache_clear()
+    return e_step(work[0], work[1], smoother, key=jax.random.key(0))
+
+
+def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(shelf, work, monkeypatch):
+    smoother, calls = CubatureSmoother(StartBank((1, 3, 1, 1))), []
+    plain = e_step(work[0], work[1], smoother, key=jax.random.key(0))
+    first = _smoothed(work, smoother, monkeypatch)
+    assert len(_kept(shelf)) == 1
+    transition = type(work[0]).transition
+    monkeypatch.setattr(type(work[0]), "transition", lambda *args: calls.append(1) or transition(*args))
+    again = _smoothed(work, smoother, monkeypatch)
+    assert not calls and len(_kept(shelf)) == 1
+    for a, b, c in zip(*map(jax.tree.leaves, (plain, first, again)), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(b, c)
+    assert type(again) is type(plain)
+
+
+@pytest.mark.parametrize("other", ["smoother", "constant", "shape", "type"])
+def test_what_decides_a_program_makes_another(shelf, work, monkeypatch, other):
+    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1))), work
+    _smoothed(work, smoother, monkeypatch)
+    if other == "smoother":
+        smoother = CubatureSmoother(smoother.bank)
+    elif other == "constant":
+        model = dataclasses.replace(model, substeps=3)
+    elif other == "shape":
+        data = jax.tree.map(lambda a: a[:, :30], data)
+    else:
+        data = data._replace(u=data.u.astype(jnp.float32))
+    with jax.numpy_dtype_promotion("standard"):
+        found = _smoothed((model, data), smoother, monkeypatch)
+        assert len(_kept(shelf)) == 2
+        monkeypatch.setattr(traced._Kept, "shelf", None)
+        np.testing.assert_array_equal(found.state.mean, _smoothed((model, data), smoother, monkeypatch).state.mean)
+
+
+def test_other_numbers_are_no_other_program(shelf, work, monkeypatch):
+    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1))), work
+    first = _smoothed(work, smoother, monkeypatch)
+    heavier = dataclasses.replace(model, log_q=model.log_q + 1.0)
+    second = _smoothed((heavier, data), smoother, monkeypatch)
+    assert len(_kept(shelf)) == 1
+    assert np.abs(np.asarray(first.state.cov - second.state.cov)).max() > 0
+
+
+def test_another_text_of_the_package_makes_another(shelf, work, monkeypatch):
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    _smoothed(work, smoother, monkeypatch)
+    monkeypatch.setattr(traced, "_surroundings", lambda: b"after an edit")
+    _smoothed(work, smoother, monkeypatch)
+    assert len(_kept(shelf)) == 2
+
+
+def _own(common, one):
+    return common * one
+
+
+def test_what_a_key_cannot_tell_is_not_kept(shelf):
+    """A function of another package may say something else tomorrow under the same name."""
+    np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(2.0), jnp.arange(3.0)), [0.0, 2.0, 4.0])
+    assert not _kept(shelf)
+
+
+def test_a_closure_is_told_by_nothing():
+    def made(slope):
+        return lambda v: slope * v
+
+    made.__module__ = "nnap_em.somewhere"
+    inside = made(2.0)
+    inside.__module__ = "nnap_em.somewhere"
+    with pytest.raises(traced.pickle.PicklingError, match="somewhere"):
+        traced._key(len, [], None, inside)
+
+
+def test_what_is_damaged_is_made_anew(shelf, work, monkeypatch):
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    first = _smoothed(work, smoother, monkeypatch)
+    (name,) = _kept(shelf)
+    whole = (shelf.folder / name).read_bytes()
+    (shelf.folder / name).write_bytes(whole[: len(whole) // 2])
+    again = _smoothed(work, smoother, monkeypatch)
+    np.testing.assert_array_equal(first.state.mean, again.state.mean)
+    assert len((shelf.folder / name).read_bytes()) == len(whole)
+
+
+def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(traced._Kept, "shelf", Shelf(tmp_path / "file"))
+    monkeypatch.setattr(traced._Kept, "ready", {})
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    assert np.isfinite(np.asarray(_smoothed(work, smoother, monkeypatch).state.mean)).all()
+
+
+TWO = """
+import json, sys
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from nnap_em.em.loop import e_step
+from nnap_em.model.simulate import paper_model, paper_sweep, sweep_experiment
+from nnap_em.numerics import parallel, profile, traced
+from nnap_em.smoother.gaussian import CubatureSmoother
+from nnap_em.smoother.start import StartBank
+from nnap_em.storage.shelf import Shelf
+from pathlib import Path
+traced.keep_on(Shelf(Path(sys.argv[1])))
+parallel.use_every_device()
+model = paper_model()
+data = sweep_experiment(model, paper_sweep, 3, 40, key=jax.random.key(0)).data
+with profile.profiling() as told:
+    found = e_step(model, data, CubatureSmoother(StartBank((1, 3, 1, 1))), key=jax.random.key(0))
+spent = told.spent["each_smooth"]
+print(json.dumps([jax.device_count(), sum(spent["trace"]), float(np.sum(np.asarray(found.state.mean) ** 2))]))
+"""
+
+
+def test_over_two_devices_another_process_finds_it(tmp_path):
+    """Keys do not hang on what differs among processes, addresses of functions say."""
+
+    def run():
+        command, two = [sys.executable, "-c", TWO, str(tmp_path)], {"JAX_NUM_CPU_DEVICES": "2"}
+        done = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT | two, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)
+
+    first, again = run(), run()
+    assert len(list(tmp_path.glob("*"))) == 1
+    assert first[0] == again[0] == 2 and first[2] == again[2]
+    assert again[1] < 0.2 * first[1]

@@ -107,6 +107,23 @@ def test_what_a_key_cannot_tell_is_not_kept(shelf):
     assert not _kept(shelf)
 
 
+def _called_back(common, one):
+    return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), one.dtype), one, vmap_method="sequential")
+
+
+def _wrong(common, one):
+    raise ZeroDivisionError("told by the function")
+
+
+def test_what_cannot_be_written_down_runs_all_the_same(shelf, monkeypatch):
+    for function in (_called_back, _wrong):
+        monkeypatch.setattr(function, "__module__", "nnap_em.somewhere")
+    np.testing.assert_array_equal(parallel.each(_called_back, None, jnp.arange(3.0)), [0.0, 2.0, 4.0])
+    assert not _kept(shelf)
+    with pytest.raises(ZeroDivisionError, match="told by the function"):
+        parallel.each(_wrong, None, jnp.arange(3.0))
+
+
 def test_a_closure_is_told_by_nothing():
     def made(slope):
         return lambda v: slope * v

@@ -85,8 +85,12 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
             return out
 
         flat.__name__ = flat.__qualname__ = run.__name__
-        exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
-        shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
+        try:
+            exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
+            shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
+        except Exception as error:  # not everything can be written down; what is wrong with `run` is told by `run`
+            logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
+            return None
         found = exported, told[-1]
     exported, outside = found
 

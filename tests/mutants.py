@@ -90,8 +90,8 @@ MUTANTS = (
     Mutant(
         "a kept program whatever it was made of",
         "numerics/traced.py",
-        "pickler.dump((function, inside, ",
-        "pickler.dump((function, ",
+        "for a in arrays], static))",
+        "for a in arrays]))",
         "test_traced.py::test_what_decides_a_program_makes_another[constant]",
     ),
     Mutant(

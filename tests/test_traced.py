@@ -132,7 +132,7 @@ def test_a_closure_is_told_by_nothing():
     inside = made(2.0)
     inside.__module__ = "nnap_em.somewhere"
     with pytest.raises(traced.pickle.PicklingError, match="somewhere"):
-        traced._key(len, [], None, inside)
+        traced._key(len, [], inside)
 
 
 def test_what_is_damaged_is_made_anew(shelf, work, monkeypatch):

@@ -71,7 +71,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, inside = jax.tree.flatten(dynamic)
     try:
-        key = _key(function, arrays, inside, static)
+        key = _key(function, arrays, static)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
@@ -118,12 +118,12 @@ def _shape(a: jax.Array) -> tuple[str, bool]:
     return str(jax.typeof(a)), getattr(a, "weak_type", False)  # a random key has none
 
 
-def _key(function: Callable, arrays: list[jax.Array], inside: Any, static: Any) -> str:
+def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
     """What decides a program, as one number."""
     text = io.BytesIO()
     pickler = _Telling(text)
     pickler.fast = True  # the same whichever objects are the same
-    pickler.dump((function, inside, [_shape(a) for a in arrays], static))
+    pickler.dump((function, [_shape(a) for a in arrays], static))
     return hashlib.sha256(_surroundings() + text.getvalue()).hexdigest()
 
 

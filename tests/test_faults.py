@@ -48,6 +48,8 @@ def denied(*_):
 
 def replace_bytes(path, content):
     global count
+    if path.parent.name == "traced":  # programs for other runs: how many are missing is no part of this one
+        return whole(path, content)
     count += 1
     if now := when in (str(count), path.name):
         if fault in ("in a write", "before the rename"):
@@ -186,8 +188,10 @@ CHAINS: dict[str, list[Fault]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
 def test_a_chain_of_faults_is_survived(rig, tmp_path, command):
-    """The numbers are those of an unbroken run, in this process, which keeps nothing of a diagnosis."""
-    assert cli.main(_order(command, rig, tmp_path / "whole", "--quiet")) == 0
+    """The numbers are those of an unbroken run."""
+    whole = _start(_order(command, rig, tmp_path / "whole"))
+    _, said = whole.communicate(timeout=300)
+    assert whole.returncode == 0, said
     _survives(command, rig, tmp_path / "broken", CHAINS[command[0]])
     left = numbers(tmp_path / "broken")
     assert left == numbers(tmp_path / "whole")

@@ -154,6 +154,14 @@ def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):
     assert np.isfinite(np.asarray(_smoothed(work, smoother, monkeypatch).state.mean)).all()
 
 
+def test_what_a_killed_process_left_half_written_goes(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    (tmp_path / f".key.{dead.pid}.part").write_text("half")
+    (tmp_path / "key").write_text("whole")
+    assert _kept(Shelf(tmp_path)) == {"key"}
+
+
 TWO = """
 import json, sys
 import jax, numpy as np

@@ -3,14 +3,16 @@
 from contextlib import suppress
 from pathlib import Path
 
-from .files import replace_bytes
+from .files import replace_bytes, sweep
 
 
 class Shelf:
-    """One file for each key; each is there whole or not at all."""
+    """One file for each key; each is there whole or not at all.  What killed processes left half written goes."""
 
     def __init__(self, folder: Path):
         self.folder = folder
+        with suppress(OSError):
+            sweep(folder)
 
     def get(self, key: str) -> bytes | None:
         """What was put there under this key, if anything that can be read."""

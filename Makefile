@@ -1,6 +1,7 @@
 # make demo | make test | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
 PYTHON ?= python3
-PYTEST_FLAGS ?= -n 2
+# A worker takes whole files, so that what a file sets up is made once; tests/costs.py has the order.
+PYTEST_FLAGS ?= -n 2 --dist loadfile --no-loadscope-reorder --durations 20
 # What `make matrix` runs, and with which interpreters; one that is not there is left out.
 MATRIX_PYTHONS ?= python3.11 python3.12 python3.13
 MATRIX_FLAGS ?= -n 2 -m "not slow"
@@ -35,7 +36,7 @@ matrix:
 			test $$age = oldest && bounds="--constraint constraints.txt" || bounds="--upgrade --upgrade-strategy eager"; \
 			{ test -x $$bin/python || $$python -m venv $${bin%/bin}; } && \
 			$$bin/python -m pip --disable-pip-version-check install --quiet $$bounds --editable '.[test]' && \
-			echo "== $$python, $$age:" $$($$bin/python -m pip freeze | grep -E "^(jax|equinox|diffrax|optax|optimistix|numpy)==") && \
+			echo "== $$python, $$age:" $$($$bin/python -m pip freeze | grep -E "^(jax|equinox|diffrax|optax|numpy)==") && \
 			$$bin/pytest $(MATRIX_FLAGS) || failed="$$failed $$python-$$age"; \
 		done; \
 	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }

@@ -191,11 +191,14 @@ def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_p
     assert paths
     for path in paths:
         owner = read_rig(path, specs)
+        if specs[owner.system].declare:
+            continue  # a machine from a file: test_draft_machine.py
         found = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
         assert not found.notes
         (tmp_path / "rig.toml").write_text(_filled(found.text))
         rig = read_rig(tmp_path / "rig.toml", specs)
-        assert (rig.dt, rig.clock, rig.measured) == (owner.dt, owner.clock, owner.measured)
+        assert (rig.dt, rig.clock) == (owner.dt, owner.clock)
+        assert rig.measured[: len(owner.measured)] == owner.measured  # an owner may leave out the rates of a file
         assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == dict(
             zip(owner.input_columns, owner.input_joints, strict=True)
         )

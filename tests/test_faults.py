@@ -1,17 +1,20 @@
 """kill -9, Ctrl-C and disks that are full: the last good state is kept and told, and the numbers are those of no fault.
 
-The commands run in processes of their own and are really killed: between writes, in the middle of one, and at moments
-drawn from a seed.
+Every kind of fault hits a command whose steps cost nothing, in this process.  One run of each real command is killed in
+a process of its own; `benchmarks/faults.py` kills many, at moments drawn from a seed.
 """
 
+import errno
+import math
 import os
-import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import jax
@@ -24,7 +27,10 @@ from shell import ENVIRONMENT
 
 from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
+from nnap_em.commands import identify as identify_command
 from nnap_em.effects import catalogue
+from nnap_em.em.identify import Identified
+from nnap_em.em.store import load
 from nnap_em.storage import files, journal
 from nnap_em.storage.files import StoreError, sweep
 from nnap_em.storage.journal import HERE, Journal, digest, keeping, step
@@ -33,45 +39,6 @@ SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=6, tests=1, steps=80, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
 FOUND = {"identify": [], "diagnose": ["torsional_spring"]}
 IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
-FAULTY = """
-import errno, os, resource, signal, sys, types
-from nnap_em.commands import cli
-from nnap_em.storage import files
-
-fault, when = sys.argv[1:3]
-whole, count = files.replace_bytes, 0
-
-
-def denied(*_):
-    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-def replace_bytes(path, content):
-    global count
-    if path.parent.name == "traced":  # programs for other runs: how many are missing is no part of this one
-        return whole(path, content)
-    count += 1
-    if now := when in (str(count), path.name):
-        if fault in ("in a write", "before the rename"):
-            part = path.with_name(f".{path.name}.{os.getpid()}.part")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(content[: len(content) // 2] if fault == "in a write" else content)
-        if fault == "full disk":
-            resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, resource.RLIM_INFINITY))
-        elif fault == "unwritable":
-            files.os = types.SimpleNamespace(replace=denied, getpid=os.getpid, fsync=os.fsync)
-        elif fault == "Ctrl-C before a write":
-            os.kill(os.getpid(), signal.SIGINT)
-        elif fault != "after a write":
-            os.kill(os.getpid(), signal.SIGKILL)
-    whole(path, content)
-    if now:
-        os.kill(os.getpid(), signal.SIGINT if fault == "Ctrl-C after a write" else signal.SIGKILL)
-
-
-files.replace_bytes = replace_bytes
-sys.exit(cli.main(sys.argv[3:]))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -86,115 +53,190 @@ def _order(command, rig: Path, out: Path, *more) -> list[str]:
     return [command[0], str(rig), "--out", str(out), *command[1:], *more]
 
 
-def _start(order: list[str], fault: str = "", when: int | str = 0) -> subprocess.Popen:
-    first = ["-c", FAULTY, fault, str(when)] if fault else ["-m", "nnap_em.commands.cli"]
-    return subprocess.Popen([sys.executable, *first, *order], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
-
-
-def _written(out: Path) -> list[int]:
-    """Tells one state of the finished steps from the next."""
-    return sorted(path.stat().st_mtime_ns for path in out.glob("unfinished/*.npz"))
-
-
-def _fault_at_some_time(order: list[str], out: Path, kind: signal.Signals, count: int, delay: float):
-    """A signal from outside, some time after a number of new finished steps."""
-    run, before = _start(order), _written(out)
-    while run.poll() is None and count:
-        time.sleep(0.005)
-        now = _written(out)
-        count, before = count - (now != before), now
-    time.sleep(delay)
-    assert run.poll() is None, "it was over too soon"
-    run.send_signal(kind)
-    _, said = run.communicate(timeout=120)
-    return run.returncode, said
-
-
 def _told(said: str) -> str:
     """The last line, which is no traceback."""
     assert "Traceback" not in said, said
     return said.strip().splitlines()[-1]
 
 
-KILLS = ("in a write", "before the rename", "after a write")
-ERRORS = {"full disk": "File too large", "unwritable": "Permission denied"}
-LONG, SHORT = 4.0, 0.3
-"""Seconds within which a moment is drawn: of the start of a command, of a step."""
-Fault = tuple[str, int | str]
-"""What happens, and at which write (or after how many, where it comes from outside)."""
+class Killed(BaseException):
+    """What SIGKILL leaves on the disk: no command catches it."""
 
 
-def _meet(fault: Fault, order: list[str], out: Path, rng: random.Random) -> tuple[int, str]:
-    kind, when = fault
-    if kind in ("kill", "Ctrl-C"):
-        assert isinstance(when, int)
-        delay = rng.uniform(0.0, SHORT if when else LONG)
-        return _fault_at_some_time(order, out, signal.SIGKILL if kind == "kill" else signal.SIGINT, when, delay)
-    run = _start(order, kind, when)
-    _, said = run.communicate(timeout=300)
-    return run.returncode, said
+def _denied(*_):
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def _survives(command, rig: Path, out: Path, faults: list[Fault]) -> None:
-    """One run that meets all the faults, one after the other, and then goes on to its end."""
-    rng = random.Random(1)
-    more: list[str] = []
-    for fault in faults:
-        code, said = _meet(fault, _order(command, rig, out, *more), out, rng)
-        if fault[0] in (*KILLS, "kill"):
-            assert code == -signal.SIGKILL, said
-        elif "Ctrl-C" in fault[0]:
-            assert code == 130, said
-            assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _told(said))
+def _faulty(kind: str, when: int | str):
+    """`files.replace_bytes` with a fault at its n-th call, or at the file of a name."""
+    whole, count = files.replace_bytes, 0
+
+    def replace_bytes(path: Path, content: bytes) -> None:
+        nonlocal count
+        count += 1
+        if when not in (count, path.name):
+            return whole(path, content)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if kind == "in a write":
+            part.write_bytes(content[: len(content) // 2])
+        elif kind == "before the rename":
+            part.write_bytes(content)
+        elif kind == "full disk":
+            limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
+            try:
+                whole(path, content)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        elif kind == "unwritable":
+            own = files.os
+            files.os = types.SimpleNamespace(replace=_denied, getpid=os.getpid, fsync=os.fsync)
+            try:
+                whole(path, content)
+            finally:
+                files.os = own
+        elif kind == "Ctrl-C before a write":
+            os.kill(os.getpid(), signal.SIGINT)
         else:
-            assert code == 2, said
-            reason = rf"error: .*unfinished/\w+-\w+\.npz: {ERRORS[fault[0]]}; stopped .*; to go on: .*--resume"
-            assert re.search(reason, _told(said)), said
+            whole(path, content)
+            if kind == "Ctrl-C after a write":
+                os.kill(os.getpid(), signal.SIGINT)
+        raise Killed
+
+    return replace_bytes
+
+
+@step(lambda *_: HERE)
+def _toy(x, i):
+    return np.cos(x + i)
+
+
+def _toy_identify(fitted: Identified):
+    """`identify` of twelve steps of NumPy, whose numbers stand for the log-likelihoods of `fitted`."""
+
+    def identify(rig, data, *, watch, **_):
+        x = np.arange(3.0)
+        for i in range(12):
+            x = _toy(x, i)
+        state = fitted.state._replace(loglik=x)
+        watch(state, data.t.shape[1], np.ones(len(data.t), bool))
+        return fitted._replace(state=state)
+
+    return identify
+
+
+ERRORS = {"full disk": "File too large", "unwritable": "Permission denied"}
+FAULTS: list[tuple[str, int | str]] = [
+    ("in a write", 1),
+    ("in a write", 3),
+    ("before the rename", 2),
+    ("after a write", 1),
+    ("full disk", 2),
+    ("Ctrl-C before a write", 2),
+    ("Ctrl-C after a write", 1),
+    ("unwritable", 2),
+    ("in a write", "model.npz"),
+    ("Ctrl-C after a write", "model.npz"),
+    ("in a write", "friction.csv"),
+    ("full disk", "friction.csv"),
+    ("before the rename", "report.json"),
+]
+
+
+def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, capsys):
+    """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
+    monkeypatch.setattr(identify_command, "identify", _toy_identify(load(whole["identify"] / "model.npz")))
+    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) == 0
+    capsys.readouterr()
+    out, more, kept = tmp_path / "broken", (), 0
+    for kind, when in FAULTS:
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "replace_bytes", _faulty(kind, when))
+            try:
+                code = cli.main(_order(IDENTIFY, rig, out, *more))
+            except Killed:
+                code = None
+        said = capsys.readouterr().err
+        if "Ctrl-C" in kind:
+            assert code == 130
+            assert re.search(r"stopped .*; to go on: nnap-em identify .*--resume", _told(said))
+        elif kind in ERRORS:
+            assert code == 2
+            file = when if isinstance(when, str) else r"unfinished/_toy-\w+\.npz"
+            assert re.search(rf"error: .*{file}: {ERRORS[kind]}; stopped .*; to go on: .*--resume", _told(said))
             assert not list(out.rglob(".*.part"))
-        more = ["--resume"]
-    run = _start(_order(command, rig, out, *more))
-    _, said = run.communicate(timeout=300)
-    assert run.returncode == 0, said
-    assert "resumed" in said
-    assert not list(out.rglob(".*.part"))
-    assert not (out / "unfinished").exists()
+        else:
+            assert code is None
+        steps = len(list(out.glob("unfinished/*.npz")))
+        assert steps >= kept  # nothing is lost
+        more, kept = ("--resume",), steps
+    assert kept == 12
+    assert cli.main(_order(IDENTIFY, rig, out, "--resume")) == 0
+    assert "resumed with 12 finished steps" in capsys.readouterr().err
+    assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
+    left = numbers(out)
+    assert left == numbers(tmp_path / "whole")
+    assert left["report"]["log_likelihood"][0] == pytest.approx(_toy_after(12))
 
 
-CHAINS: dict[str, list[Fault]] = {
-    "identify": [
-        ("kill", 0),
-        ("in a write", 2),
-        ("before the rename", 2),
-        ("after a write", 1),
-        ("full disk", 2),
-        ("Ctrl-C", 1),
-        ("kill", 1),
-        ("in a write", "friction.csv"),
-    ],
-    "diagnose": [
-        ("kill", 0),
-        ("in a write", 9),
-        ("kill", 6),
-        ("full disk", 4),
-        ("before the rename", 5),
-        ("Ctrl-C", 4),
-        ("Ctrl-C before a write", 3),
-        ("unwritable", 3),
-        ("after a write", "before.npz"),
-    ],
-}
+def _toy_after(steps: int) -> float:
+    """The first number of the toy by hand."""
+    x = 0.0
+    for i in range(steps):
+        x = math.cos(x + i)
+    return x
+
+
+def _start(order: list[str]) -> subprocess.Popen:
+    program = [sys.executable, "-m", "nnap_em.commands.cli"]
+    return subprocess.Popen([*program, *order], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def whole(rig) -> dict[str, Path]:
+    """Unbroken runs by the name of the command, as those that are broken: in processes of their own."""
+    outs = {command[0]: rig.parent / f"whole {command[0]}" for command in (IDENTIFY, DIAGNOSE)}
+    for run in [_start(_order(command, rig, outs[command[0]])) for command in (IDENTIFY, DIAGNOSE)]:
+        _, said = run.communicate(timeout=300)
+        assert run.returncode == 0, said
+    return outs
+
+
+def _steps(out: Path) -> list[int]:
+    """Tells one state of the finished steps from the next."""
+    return sorted(path.stat().st_mtime_ns for path in out.glob("unfinished/*.npz"))
+
+
+def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
+    """A signal from outside after a number of new finished steps."""
+    run, before = _start(order), _steps(out)
+    while run.poll() is None and count:
+        time.sleep(0.005)
+        now = _steps(out)
+        count, before = count - (now != before), now
+    assert run.poll() is None, "it was over too soon"
+    run.send_signal(kind)
+    _, said = run.communicate(timeout=120)
+    return run.returncode, said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
-def test_a_chain_of_faults_is_survived(rig, tmp_path, command):
-    """The numbers are those of an unbroken run."""
-    whole = _start(_order(command, rig, tmp_path / "whole"))
-    _, said = whole.communicate(timeout=300)
-    assert whole.returncode == 0, said
-    _survives(command, rig, tmp_path / "broken", CHAINS[command[0]])
-    left = numbers(tmp_path / "broken")
-    assert left == numbers(tmp_path / "whole")
+def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, whole, tmp_path, command):
+    """By SIGKILL, and then by Ctrl-C."""
+    out = tmp_path / "broken"
+    code, said = _struck(_order(command, rig, out), out, signal.SIGKILL, 4)
+    assert code == -signal.SIGKILL, said
+    code, said = _struck(_order(command, rig, out, "--resume"), out, signal.SIGINT, 2)
+    assert code == 130, said
+    assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _told(said))
+    run = _start(_order(command, rig, out, "--resume"))
+    _, said = run.communicate(timeout=300)
+    assert run.returncode == 0 and "resumed" in said, said
+    assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
+    left = numbers(out)
+    assert left == numbers(whole[command[0]])
     assert all(len(left[name][0]) > 20 for name in left if name.endswith(".npz"))
     assert [effect["name"] for effect in left["report"].get("effects", [])] == FOUND[command[0]]
 
@@ -208,9 +250,9 @@ def stopped(rig) -> dict[str, Path]:
     outs = {}
     for command, count in ((IDENTIFY, 1), (DIAGNOSE, 2)):
         out = outs[command[0]] = rig.parent / f"stopped {command[0]}"
-        run = _start(_order(command, rig, out), "after a write", count)
-        run.communicate(timeout=300)
-        assert run.returncode == -signal.SIGKILL
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(files, "replace_bytes", _faulty("after a write", count))
+            cli.main(_order(command, rig, out, "--quiet"))
     return outs
 
 

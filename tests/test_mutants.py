@@ -6,14 +6,7 @@ import re
 import pytest
 from mutants import MUTANTS, ROOT, copy, run
 
-OFTEN = (
-    "sign of friction",
-    "gain of the backward pass transposed",
-    "input one row late",
-    "a missing reading taken for 0",
-    "log weight of the readings missing",
-    "M-step without its prior",
-)
+OFTEN = ("sign of friction", "M-step without its prior")
 """The others: `benchmarks/mutation.py`."""
 CHOSEN = [mutant for mutant in MUTANTS if mutant.what in OFTEN]
 
@@ -30,8 +23,8 @@ def test_every_mutant_is_a_change_of_one_place_and_names_a_test():
 
 
 def test_a_copy_is_green(tmp_path):
-    """The first two of their tests: the whole suite runs them all on the package itself."""
-    found = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN[:2]))
+    """Their tests pass where nothing is broken."""
+    found = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN))
     assert (found.passed, found.failed) == (2, 0), found.said
 
 

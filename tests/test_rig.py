@@ -1,6 +1,7 @@
 """rig.toml: what is declared comes back, what is wrong is refused by name and with a mend."""
 
 import re
+import shutil
 
 import pytest
 from hypothesis import given, settings
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, write_rig
 from nnap_em.data.units import parameter_unit
 from nnap_em.storage.files import replace_text
+from nnap_em.systems import specs
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")
@@ -269,10 +271,12 @@ def test_every_shared_rig_is_read_and_written_back(shared, tmp_path):
     paths = sorted((shared / "data").glob("*/*/rig.toml"))
     assert paths
     for path in paths:
-        rig = read_rig(path, SYSTEMS)
+        rig = read_rig(path, specs)
         assert rig.name == path.parent.name
+        for model in path.parent.glob("*.xml"):
+            shutil.copy(model, tmp_path)
         write_rig(rig, tmp_path / "rig.toml")
-        assert read_rig(tmp_path / "rig.toml", SYSTEMS) == rig
+        assert read_rig(tmp_path / "rig.toml", specs) == rig
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):

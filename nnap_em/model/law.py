@@ -1,13 +1,14 @@
 """The engineer's friction law, and how well it describes a learned curve."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jaxtyping import Array, Bool, Float
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
 
 
 class StribeckLaw(eqx.Module):
@@ -45,24 +46,25 @@ UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: ("N"
 class LawFit(NamedTuple):
     """The Stribeck law nearest to a learned curve, per joint; the columns are PARAMETERS."""
 
-    value: Float[Array, "dof param"]
-    std: Float[Array, "dof param"]
+    value: Float[np.ndarray, "dof param"]
+    std: Float[np.ndarray, "dof param"]
     """What the curve leaves undetermined has the standard deviation of the prior: the curve's whole range."""
-    velocity: Float[Array, "dof node"]
+    velocity: Float[np.ndarray, "dof node"]
     """[rad/s]"""
-    difference: Float[Array, "dof node"]
+    difference: Float[np.ndarray, "dof node"]
     """Curve minus law [N m]."""
-    difference_std: Float[Array, "dof node"]
+    difference_std: Float[np.ndarray, "dof node"]
 
     @property
-    def departs(self) -> Bool[Array, "dof node"]:
+    def departs(self) -> Bool[np.ndarray, "dof node"]:
         """Velocities at which the curve is not this law: more than 2 standard deviations away."""
-        return jnp.abs(self.difference) > 2 * self.difference_std
+        return np.abs(self.difference) > 2 * self.difference_std
 
 
-@eqx.filter_jit
 def fit_law(
-    velocity: Float[Array, "dof node"], torque: Float[Array, "dof node"], cov: Float[Array, "dof node node"]
+    velocity: Float[Array | np.ndarray, "dof node"],
+    torque: Float[Array | np.ndarray, "dof node"],
+    cov: Float[Array | np.ndarray, "dof node node"],
 ) -> LawFit:
     """Generalised least squares of the Stribeck law to a table of torque [N m] over velocity [rad/s], joint by joint.
 
@@ -71,57 +73,71 @@ def fit_law(
     The nugget (a tenth of the torque's standard deviation, half a percent of its range) is what the shape of the
     learned curve itself may err where its covariance is all but singular.
     """
-    return jax.vmap(_fit_joint)(velocity, torque, cov)
+    joints = [_fit_joint(*map(np.asarray, table)) for table in zip(velocity, torque, cov, strict=True)]
+    return LawFit(*(np.stack(column) for column in zip(*joints, strict=True)))
 
 
-def _curve(value: Float[Array, " param"], v: Float[Array, " node"]) -> Float[Array, " node"]:
-    return StribeckLaw(*value[:5, None])(v) + value[5]
+def _curve(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, " node"]:
+    """Torque of the law over velocity [N m], the constant included."""
+    coulomb, breakaway, stribeck, viscous, smooth, offset = value
+    level = coulomb + (breakaway - coulomb) * np.exp(-((v / stribeck) ** 2))
+    return offset - level * np.tanh(v / smooth) - viscous * v
 
 
-def _fit_joint(v: Float[Array, " node"], torque: Float[Array, " node"], cov: Float[Array, "node node"]) -> LawFit:
-    top = jnp.max(jnp.abs(v))
-    scale = jnp.maximum(jnp.max(jnp.abs(torque)), 1e-9)
-    wide = jnp.stack([scale, scale, top, scale / top, top, scale])
-    cov = cov + jnp.diag(0.01 * jnp.diag(cov) + (0.005 * scale) ** 2)
-    factor = jnp.linalg.cholesky(cov)
+def _slopes(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, "node param"]:
+    """Derivatives of `_curve` by its parameters."""
+    coulomb, breakaway, stribeck, _, smooth, _ = value
+    dip, sign = np.exp(-((v / stribeck) ** 2)), np.tanh(v / smooth)
+    level = coulomb + (breakaway - coulomb) * dip
+    by_stribeck = -2 * (breakaway - coulomb) * dip * v**2 / stribeck**3 * sign
+    by_smooth = level * (1 - sign**2) * v / smooth**2
+    return np.stack([-(1 - dip) * sign, -dip * sign, by_stribeck, -v, by_smooth, np.ones_like(v)], axis=1)
 
-    def whiten(a):
-        return jax.scipy.linalg.solve_triangular(factor, a, lower=True)
+
+def _fit_joint(
+    v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], cov: Float[np.ndarray, "node node"]
+) -> LawFit:
+    top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
+    wide = np.array([scale, scale, top, scale / top, top, scale])
+    cov = cov + np.diag(0.01 * np.diag(cov) + (0.005 * scale) ** 2)
+    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
 
     def natural(z):
         """Logarithms keep the first five positive and the breakaway torque above the Coulomb torque."""
-        positive = jnp.exp(z[:5])
-        return wide * jnp.concatenate([positive, z[5:]]).at[1].add(positive[0])
+        value = wide * np.concatenate([np.exp(z[:5]), z[5:]])
+        value[1] += value[0]
+        return value
+
+    def by_z(z):
+        """Derivatives of `natural`."""
+        factors = np.diag(wide * np.concatenate([np.exp(z[:5]), [1.0]]))
+        factors[1, 0] = factors[0, 0]
+        return factors
+
+    # priors so weak that they only hold what the curve does not determine
+    levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
+    levels, times = levels / wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 3.0
 
     def residual(z, start):
-        """Curve minus law, and priors so weak that they only hold what the curve does not determine."""
         value = natural(z)
-        levels = jnp.stack([value[0], value[1] - value[0], value[3], value[5]]) / wide[jnp.asarray([0, 1, 3, 5])]
-        return jnp.concatenate([whiten(torque - _curve(value, v)), levels, (z - start)[jnp.asarray([2, 4])] / 3.0])
+        return np.concatenate([whitener @ (torque - _curve(value, v)), levels @ value, times @ (z - start)])
 
-    def solve(start):
-        solver = optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-        found = optimistix.least_squares(residual, solver, start, args=start, max_steps=200, throw=False)
-        return found.value, jnp.sum(residual(found.value, start) ** 2)
+    def jacobian(z, start):
+        by_value, slopes = by_z(z), _slopes(natural(z), v)
+        return np.concatenate([-whitener @ slopes @ by_value, levels @ by_value, times])
 
-    knees = jnp.log(jnp.asarray([0.02, 0.1, 0.4], v.dtype))
-    levels = jnp.full(9, jnp.log(0.3), v.dtype)
-    starts = jnp.stack(
-        [levels, levels, jnp.repeat(knees, 3), levels, jnp.tile(knees, 3) - 1.5, jnp.zeros_like(levels)], 1
-    )
-    z, misfit = jax.vmap(solve)(starts)
-    value = natural(z[jnp.nanargmin(misfit)])
-    jac = jax.jacfwd(_curve)(value, v) * wide[None]
-    white = whiten(jac)
-    posterior = jnp.linalg.inv(white.T @ white + jnp.eye(6, dtype=v.dtype))
-    rest = jnp.diag(cov) - jnp.sum((jac @ posterior) * jac, axis=1)
-    return LawFit(
-        value,
-        wide * jnp.sqrt(jnp.diag(posterior)),
-        v,
-        torque - _curve(value, v),
-        jnp.sqrt(jnp.maximum(rest, (0.005 * scale) ** 2)),
-    )
+    fits = []
+    for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]), repeat=2):
+        start = np.array([np.log(0.3), np.log(0.3), knee, np.log(0.3), sharpness - 1.5, 0.0])
+        with np.errstate(over="ignore"):  # a step too far: the next one is shorter
+            fits.append(least_squares(residual, start, jacobian, method="lm", xtol=1e-8, args=(start,)))
+    value = natural(min(fits, key=lambda fit: fit.cost).x)
+    jac = _slopes(value, v) * wide
+    white = whitener @ jac
+    posterior = np.linalg.inv(white.T @ white + np.eye(6))
+    rest = np.diag(cov) - np.sum((jac @ posterior) * jac, axis=1)
+    std = wide * np.sqrt(np.diag(posterior))
+    return LawFit(value, std, v, torque - _curve(value, v), np.sqrt(np.maximum(rest, (0.005 * scale) ** 2)))
 
 
 def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> list[str]:

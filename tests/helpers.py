@@ -1,7 +1,9 @@
 """What several tests make: logs and their text, a declared model, and what a search knows of it."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import plant
@@ -16,6 +18,17 @@ from nnap_em.model.state_space import StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import systems
 from nnap_em.systems.slide import Slide
+
+
+@contextlib.contextmanager
+def optimised() -> Iterator[None]:
+    """Compile to run fast what is compiled inside: for tests that run longer than they compile."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 def swing_rig(**changes) -> Rig:

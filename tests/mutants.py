@@ -1076,6 +1076,20 @@ MUTANTS = (
         "nnls(basis, torque * weight)",
         "test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve",
     ),
+    Mutant(
+        "placebo that keeps its columns in place",
+        "diagnose/shares.py",
+        "np.roll(own[:count, ..., nuisance:], by, axis=0)",
+        "np.roll(own[:count, ..., nuisance:], 0, axis=0)",
+        "test_forks.py::test_a_placebo_keeps_a_column_s_numbers_and_loses_what_it_explains",
+    ),
+    Mutant(
+        "suspects whatever chance does",
+        "diagnose/accept.py",
+        "promise >= max(self.hint, self.above * chance)",
+        "promise >= self.hint",
+        "test_accept.py::test_a_suspect_removes_half_of_the_bar_and_twice_what_chance_does",
+    ),
 )
 
 

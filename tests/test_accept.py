@@ -159,6 +159,15 @@ def test_recordings_disagree_where_what_would_be_enough_harms_some():
     assert not LikelihoodRule().disputed(_screened(folds=(0.8, 0.8, 0.8, -0.6)))
 
 
+@pytest.mark.parametrize(
+    ("share", "chance", "suspected"),
+    [(0.075, 0.0, True), (0.074, 0.0, False), (0.12, 0.06, True), (0.12, 0.061, False), (0.9, 0.46, False)],
+)
+def test_a_suspect_removes_half_of_the_bar_and_twice_what_chance_does(share, chance, suspected):
+    assert ShareRule().suspected(share, chance) == suspected
+    assert not LikelihoodRule().suspected(share, chance)
+
+
 def test_fifteen_per_cent_is_worth_a_refit_whatever_the_readings():
     rule = ShareRule()
     assert rule.worth_a_refit(0.15, 10) and not rule.worth_a_refit(0.149, 10**9)

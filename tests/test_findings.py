@@ -11,10 +11,10 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.findings import advice, disputes, entry, findings, undecided, verdict
+from nnap_em.diagnose.findings import advice, disputes, entry, findings, suspected, undecided, verdict
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import key_of
-from nnap_em.diagnose.outcome import Closed, Disputed, Step
+from nnap_em.diagnose.outcome import Closed, Disputed, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 from nnap_em.em.identify import begin
@@ -117,10 +117,25 @@ def test_what_cannot_be_told_is_a_verdict():
     assert "cannot tell" not in verdict([], None, 3)
 
 
+def test_a_suspect_is_named_with_its_share_and_the_chance_level():
+    step = Step(ROWS, (), (), None, 3, suspects=(Suspect(key_of(_law("motor_gain")), 0.18, 0.03),))
+    (suspect,) = suspected(_closed(ARM)._replace(steps=(step,)))
+    assert (suspect.name, suspect.joint, suspect.share_of_error, suspect.chance) == ("motor_gain", 2, 0.18, 0.03)
+    assert suspect.description == (
+        "motor gain at joint 2 would remove 18% of the squared prediction error, where chance removes up to 3%"
+    )
+    assert verdict([], None, 3, (), [suspect]).startswith("No effect is certain to be missing. Suspected: motor gain")
+    assert "certain" not in verdict([], None) and not suspected(_closed(ARM))
+    assert any("motor gain at joint 2" in text and "record" in text for text in advice([], [], (), [suspect]))
+
+
 @pytest.mark.slow
 def test_the_page_tells_what_is_in_doubt(tmp_path):
     logs = Logs(("a.csv", "b.csv"), _data(ARM), ("time", "u", "theta1", "theta2"))
-    write_diagnosis(tmp_path, _doubtful(), [], logs, None, seed=0, began=0.0, say=lambda text: None)
+    doubtful = _doubtful()
+    suspects = (Suspect(key_of(_law("motor_gain")), 0.18, 0.03),)
+    doubtful = doubtful._replace(steps=(*doubtful.steps[:-1], doubtful.steps[-1]._replace(suspects=suspects)))
+    write_diagnosis(tmp_path, doubtful, [], logs, None, seed=0, began=0.0, say=lambda text: None)
     report, html = json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
     assert report["effects"] == [] and report["disagreements"][0]["files"] == ["b.csv"]
     assert [(rival["name"], rival["joint"]) for rival in report["cannot_tell"]] == [
@@ -128,6 +143,8 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
         ("torsional_spring", 1),
     ]
     assert "b.csv says the opposite" in html and "cannot tell what" in html
+    assert [(each["name"], each["chance"]) for each in report["suspects"]] == [("motor_gain", 0.03)]
+    assert "<h2>Suspects" in html.replace(' id="suspects"', "") and "chance removes up to 3%" in html
 
 
 @pytest.mark.slow

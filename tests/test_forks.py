@@ -16,7 +16,7 @@ from nnap_em.diagnose.columns import candidate_columns, tracks
 from nnap_em.diagnose.evidence import Question
 from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.propose import proposals, surroundings
-from nnap_em.diagnose.shares import Rows, fold_of, motions, project, share, times
+from nnap_em.diagnose.shares import Rows, fold_of, motions, project, share, shifted, times
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.multistep import Forks, errors, finish, forks, grid_of, huber, ratio, robust_scale, weighed
 from nnap_em.em.noise import third_differences, white_readings
@@ -284,6 +284,39 @@ def test_what_happens_at_one_moment_of_every_recording_is_no_law():
     rows = Rows(e, x, fold, block, 1.0, np.zeros(0))
     told = [share(rows, slice(0, 1), np.ones(1), at_any_time=any_time)[1] for any_time in (False, True)]
     assert told[0] > 0.9 and abs(told[1]) < 1e-6
+
+
+def _as_rows(found: Forks) -> Rows:
+    """Rows of candidate columns that no nuisance touches; a sequence is a fold."""
+    error, columns = found.error.reshape(-1), found.columns.reshape(-1, found.columns.shape[-1])
+    fold = np.repeat(np.arange(len(found.error)), found.error[0].size)
+    return Rows(error, columns, fold, fold, 1.0, np.zeros(0))
+
+
+def test_a_placebo_keeps_a_column_s_numbers_and_loses_what_it_explains():
+    """A signal of the time since the start of a sequence, whose phase differs among 12 sequences of 60 starts."""
+    rng = np.random.default_rng(0)
+    phase = rng.uniform(0, 6, 12)[:, None]
+    signal = np.sin(0.9 * np.arange(60)[None] ** 1.2 + phase)[:, :, None, None]
+    nuisance = np.ones((12, 60, 1, 1, 1))
+    found = Forks(0.8 * signal + 0.6 * rng.normal(size=signal.shape), np.concatenate([nuisance, signal[..., None]], -1),
+                  np.ones(1))  # fmt: skip
+    found.error[:, 50:] = np.nan  # ends that nobody reads take no part
+    moved = shifted(found, 1, rng)
+    np.testing.assert_array_equal(moved.columns[..., 0], found.columns[..., 0])
+    np.testing.assert_array_equal(moved.columns[:, 50:], found.columns[:, 50:])
+    for a, b in zip(moved.columns[:, :50, ..., 1], found.columns[:, :50, ..., 1], strict=True):
+        assert not np.array_equal(a, b)
+        np.testing.assert_array_equal(np.sort(a, axis=0), np.sort(b, axis=0))
+    read = lambda f: f._replace(error=f.error[:, :50], columns=f.columns[:, :50])  # noqa: E731
+    true, chance = (share(_as_rows(read(f)), slice(1, 2), np.ones(1))[1] for f in (found, moved))
+    assert true == pytest.approx(0.32 / (0.32 + 0.36), abs=4 / np.sqrt(600))  # of the variance; its standard error
+    assert chance < 4 / np.sqrt(600)
+
+
+def test_a_sequence_of_few_starts_is_not_shifted():
+    found = Forks(np.zeros((1, 7, 1, 1)), np.arange(7.0).reshape(1, 7, 1, 1, 1), np.ones(1))
+    np.testing.assert_array_equal(shifted(found, 0, np.random.default_rng(0)).columns, found.columns)
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

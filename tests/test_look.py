@@ -7,8 +7,12 @@ import plant
 import pytest
 from helpers import around, declared_model
 
+from nnap_em.diagnose.accept import LikelihoodRule, ShareRule
 from nnap_em.diagnose.case import held_out_gain
+from nnap_em.diagnose.evidence import Projected, Screen
 from nnap_em.diagnose.keys import key_of, replaced
+from nnap_em.diagnose.look import Look, suspects
+from nnap_em.diagnose.outcome import Step
 from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
 from nnap_em.model.state_space import with_effects
@@ -66,3 +70,34 @@ def test_a_stop_that_yields_is_none():
     assert eqx.tree_at(lambda s: s.stiffness, stop, half + 0.01).possible()
     assert not eqx.tree_at(lambda s: s.stiffness, stop, half - 0.01).possible()
     assert not eqx.tree_at(lambda s: s.lower, stop, stop.upper - 0.1).possible()
+
+
+def _seen(*shares: tuple[str, float]) -> Look:
+    """A look that screened these laws, best first."""
+    screened = tuple(((name, 2, None, ()), share) for name, share in shares)
+    return Look(Step(20, screened, (), None, 3), Screen((), Projected(np.zeros(0), np.zeros((0, 0)))), [], [])
+
+
+SCREENED = (("unknown_function", 0.32), ("one_sided_loss", 0.25), ("load_friction", 0.21), ("payload", 0.18))
+
+
+@pytest.mark.parametrize(
+    ("chance", "names"),
+    [
+        (0.0, ["one_sided_loss", "load_friction", "unknown_function"]),  # .18 is less than .6 of the best
+        (0.11, ["one_sided_loss", "unknown_function"]),  # .21 is within twice the chance level
+        (0.17, []),
+    ],
+)
+def test_suspects_are_near_the_best_and_over_chance_with_named_laws_first(chance, names):
+    found = suspects(_seen(*SCREENED), ShareRule(), lambda: chance)
+    assert [suspect.key[0] for suspect in found] == names
+    assert all(suspect.chance == chance for suspect in found)
+
+
+def test_chance_is_not_measured_where_nothing_is_suspected():
+    def never():
+        raise AssertionError
+
+    assert suspects(_seen(("payload", 0.05)), ShareRule(), never) == ()
+    assert suspects(_seen(("payload", 0.9)), LikelihoodRule(), never) == ()

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from arm import JOINTS, declared, friction, machine, recorded
-from helpers import csv_text
+from helpers import csv_text, optimised
 from machine_files import errors
 from machines import arm
 
@@ -381,5 +381,6 @@ def test_friction_of_a_joint_without_encoder_is_told_by_an_inertial_sensor_at_th
     """Logs from MuJoCo, 8 s in all."""
     data, x = recorded(machine(2, imu=True), JOINTS[:2], 0)
     data = Dataset(*(part[:4, :200] for part in data))
-    fitted = identify(declared(tmp_path, 2, imu=True), data, key=jax.random.key(0))
+    with optimised():
+        fitted = identify(declared(tmp_path, 2, imu=True), data, key=jax.random.key(0))
     assert max(errors(fitted.model.unknown, friction(JOINTS[:2]), x[:4, :200])) < 0.08

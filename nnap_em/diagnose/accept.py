@@ -12,7 +12,7 @@ import equinox as eqx
 from ..effects import Candidate
 from .evidence import Evidence, Question, Screen, Screened, Worth, price
 from .screen import score_test
-from .shares import members, parts, share_test
+from .shares import chance_test, members, parts, share_test
 
 SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
@@ -58,6 +58,14 @@ class AbstractRule(eqx.Module):
 
     def disputed(self, screened: Screened) -> bool:
         """Whether recordings disagree about a candidate that would be worth a refit were it not for some of them."""
+        return False
+
+    def chance(self, question: Question, candidates: Sequence[Candidate]) -> float | None:
+        """Largest promise of any candidate whose meaning is taken away; None where this rule measures no such level."""
+        return None
+
+    def suspected(self, promise: float, chance: float = 0.0) -> bool:
+        """True for a candidate that is listed as a suspect where it is not accepted."""
         return False
 
     @abstractmethod
@@ -181,6 +189,11 @@ class ShareRule(ErrorRule):
     """Share by which it may rise on any."""
     matters: float = eqx.field(static=True, default=0.1)
     """Share of the declared model's error that a later law must remove as well: what chance can of the whole."""
+    hint: float = eqx.field(static=True, default=0.075)
+    """Share of the squared error from which on a law is a suspect, half of `least`: on two real rigs as recorded, with
+    17 and 20 recordings, the best of 600 candidates removed .02 and .04."""
+    above: float = eqx.field(static=True, default=2.0)
+    """Multiple of the chance level that a suspect must reach: the best of two placebos is as large once in three."""
 
     def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
         """By shares of the multi-step error."""
@@ -201,6 +214,15 @@ class ShareRule(ErrorRule):
         assert share is not None
         enough = share.least >= self.least and share.least * share.left >= self.matters
         return enough and self._same(screened) and not self._agreed(screened)
+
+    def chance(self, question: Question, candidates: Sequence[Candidate]) -> float:
+        """Largest share of any candidate whose columns are shifted in time [0 to 1]."""
+        screens = chance_test(question, candidates)
+        return max(self.promise(each, question.readings) for screen in screens for each in screen.screened)
+
+    def suspected(self, promise: float, chance: float = 0.0) -> bool:
+        """True for a share that is neither small nor within what chance can."""
+        return promise >= max(self.hint, self.above * chance)
 
     @staticmethod
     def _same(screened: Screened) -> bool:

@@ -116,16 +116,24 @@ def findings(closed: Closed) -> list[Finding]:
 
 
 def verdict(
-    found: Sequence[Finding], error: Mapping[str, Any] | None, failed: int = 0, rivals: Sequence[Key] = ()
+    found: Sequence[Finding],
+    error: Mapping[str, Any] | None,
+    failed: int = 0,
+    rivals: Sequence[Key] = (),
+    suspects: Sequence["SuspectReport"] = (),
 ) -> str:
-    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly, and
-    `rivals` explain the same of what is left.
+    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
+    `rivals` explain the same of what is left, and `suspects` remove more than chance.
     """
     if not found and rivals:
         return (
             f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "
             "same; none is added."
         )
+    if not found and suspects:
+        first, *more = suspects
+        others = f" ({len(more)} more below)" if more else ""
+        return f"No effect is certain to be missing. Suspected: {first.description}{others}."
     if not found and failed:
         return (
             "No single effect of the catalogue is certain to be missing, but the declared model does not explain "
@@ -199,14 +207,50 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
     return out
 
 
+class SuspectReport(NamedTuple):
+    """A law that removes more of the error than chance and was not accepted, as it is reported."""
+
+    name: str
+    joint: int | None
+    channel: str | None
+    inputs: list[str]
+    share_of_error: float
+    """Share of the squared prediction error that it would remove [0 to 1]."""
+    chance: float
+    """Largest such share of any law whose columns are shifted in time [0 to 1]."""
+    description: str
+    confirm: str
+    """An experiment that would show it."""
+
+
+def suspected(closed: Closed) -> list[SuspectReport]:
+    """Suspects of the last round, best first."""
+    out = []
+    for each in closed.steps[-1].suspects if closed.steps else ():
+        name, joint, channel, inputs = each.key
+        text = (
+            f"{words(each.key)} would remove {each.share:.0%} of the squared prediction error, "
+            f"where chance removes up to {each.chance:.0%}"
+        )
+        law = catalogue[name]
+        out.append(SuspectReport(law.key(), joint, channel, list(inputs), each.share, each.chance, text, law.confirm))
+    return out
+
+
 def undecided(closed: Closed) -> tuple[Key, ...]:
     """Laws of other causes that explain the same of what is left, so that none of them was added."""
     return closed.steps[-1].rivals if closed.steps else ()
 
 
-def advice(found: Sequence[Finding], disputed: Sequence[Dispute] = (), rivals: Sequence[Key] = ()) -> list[str]:
-    """What to look at next."""
+def advice(
+    found: Sequence[Finding],
+    disputed: Sequence[Dispute] = (),
+    rivals: Sequence[Key] = (),
+    suspects: Sequence["SuspectReport"] = (),
+) -> list[str]:
+    """Sentences on the next measurement."""
     out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
+    out += [f"Suspected: {each.description}. {MORE} {each.confirm}".strip() for each in suspects]
     out += [f"{told.description}: look at what is different there." for told in disputed]
     for finding in found:
         if finding.effect.confirm:
@@ -218,6 +262,10 @@ def advice(found: Sequence[Finding], disputed: Sequence[Dispute] = (), rivals: S
             "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
         )
     return out
+
+
+MORE = "To be sure, record as many different motions again and diagnose all together."
+"""Advice for every suspect: what three recordings of a real arm left open, eleven decided."""
 
 
 def entry(finding: Finding) -> dict[str, Any]:

@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from ..effects import catalogue
 from ..model.state_space import StateSpaceModel
 from .accept import AbstractRule
 from .case import Case, Fit, refitted
 from .evidence import Question, Screen, Screened, price
 from .keys import Key, covered, key_of, replaced, rest_of, words
-from .outcome import Disputed, Step
+from .outcome import Disputed, Step, Suspect
 from .propose import extended, proposals, seeded, surroundings
 from .refit import Trial
 from .screen import unlike
@@ -184,6 +185,23 @@ def _disputed(
         if key not in best or best[key].share < told.share:
             best[key] = told
     return tuple(sorted(best.values(), key=lambda told: -told.share))
+
+
+def suspects(seen: Look, rule: AbstractRule, chance: Callable[[], float | None]) -> tuple[Suspect, ...]:
+    """Laws that removed more than chance in a look after which none was accepted: those near the best, and of these
+    the named ones first.  `chance` measures the chance level of that look, which takes time.
+    """
+    over = [(key, promise) for key, promise in seen.step.screened if rule.suspected(promise)]
+    level = chance() if over else None
+    if level is None:
+        return ()
+    near = [(key, promise) for key, promise in over if promise >= rule.near * over[0][1]]
+    near.sort(key=lambda entry: not catalogue[entry[0][0]].named)
+    return tuple(Suspect(key, promise, level) for key, promise in near[:MOST] if rule.suspected(promise, level))
+
+
+MOST = 4
+"""Suspects that are listed: the right law was the fourth on a real arm with three recordings."""
 
 
 def _likelier_first(sound: list[Case], rule: AbstractRule) -> list[Case]:

@@ -28,7 +28,7 @@ from .grow import Loop, Stages, asked, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
 from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
-from .look import EFFORT, Effort, Look, Say, alike, look
+from .look import EFFORT, Effort, Look, Say, alike, look, suspects
 from .outcome import Closed, Step
 from .quantised import quantised
 from .refit import refit
@@ -55,6 +55,10 @@ def _search(loop: Loop, now: Hypothesis, length: int, steps: list[Step]) -> tupl
         rule, seen, winner, further, behind = _choice(loop, now, question, length)
         steps.append(seen.step)
         if winner is None:
+            if not seen.step.rivals:
+                candidates = [screened.candidate for screened in seen.screen.screened]
+                chance = functools.partial(rule.chance, question, candidates)
+                steps[-1] = seen.step._replace(suspects=suspects(seen, rule, chance))
             break
         key = key_of(winner.effect)
         found = _found(rule, winner, seen, behind, length)

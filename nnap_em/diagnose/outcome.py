@@ -19,6 +19,16 @@ class Disputed(NamedTuple):
     """Share by which the error of the worst part of them would rise."""
 
 
+class Suspect(NamedTuple):
+    """A law that removes more of the error than chance, and was not accepted."""
+
+    key: Key
+    share: float
+    """Of the squared multi-step error, before any refit."""
+    chance: float
+    """Largest share of any candidate whose columns are shifted in time."""
+
+
 class Step(NamedTuple):
     """What was seen at one look, for the report."""
 
@@ -35,6 +45,8 @@ class Step(NamedTuple):
     """Best first."""
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""
+    suspects: tuple[Suspect, ...] = ()
+    """Best first; empty where a law was accepted."""
 
 
 class Intervention(NamedTuple):

@@ -136,7 +136,10 @@ def spans(candidates: Sequence[Candidate]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
-@step(lambda *_: Removed(HERE, HERE, HERE, HERE, HERE, HERE, Projected(HERE, HERE)))
+_FORM = Removed(HERE, HERE, HERE, HERE, HERE, HERE, Projected(HERE, HERE))
+
+
+@step(lambda *_: _FORM)
 def removed(
     base: StateSpaceModel,
     model: StateSpaceModel,
@@ -147,11 +150,62 @@ def removed(
     used: Bool[np.ndarray, " seq"],
     recording: Int[np.ndarray, " seq"],
 ) -> Removed:
-    """What every candidate removes of the multi-step errors of `model`, which is `base` and its effects."""
+    """Shares of the multi-step errors of `model`, which is `base` and its effects, that every candidate removes."""
+    found = _forked(base, model, weights, candidates, path, data)
+    return _removed(found, model, weights, candidates, path, data, used, recording)
+
+
+SHIFTS = 2
+"""Placebos of which the largest share counts: of three to five on eleven data sets the first two held the largest."""
+SHIFTABLE = 8
+"""Starts of a sequence below which a shift would leave its columns where they are."""
+
+
+@step(lambda *_: (_FORM,) * SHIFTS)
+def placebos(
+    base: StateSpaceModel,
+    model: StateSpaceModel,
+    weights: Weights,
+    candidates: Sequence[Candidate],
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    recording: Int[np.ndarray, " seq"],
+) -> tuple[Removed, ...]:
+    """The same as `removed` for candidates that have lost their meaning: chance can do as much on these data.
+
+    The seed of the shifts is fixed, so that the same data give the same level.
+    """
+    found, rng = _forked(base, model, weights, candidates, path, data), np.random.default_rng(0)
+    count = weights.nodes.size + weights.prior.size
+    moved = (shifted(found, count, rng) for _ in range(SHIFTS))
+    return tuple(_removed(one, model, weights, candidates, path, data, used, recording) for one in moved)
+
+
+def shifted(found: Forks, nuisance: int, rng: np.random.Generator) -> Forks:
+    """Errors beside candidate columns of another time of their own sequence.
+
+    The columns behind the first `nuisance` ones are rolled over the starts of each sequence, by a quarter to three
+    quarters of them: they keep their size, their colour and their number.
+    """
+    columns = found.columns.copy()
+    for error, own in zip(found.error, columns, strict=True):
+        count = int(np.isfinite(error).any(axis=(1, 2)).sum())
+        if count >= SHIFTABLE:
+            by = rng.integers(count // 4, 3 * count // 4 + 1)
+            own[:count, ..., nuisance:] = np.roll(own[:count, ..., nuisance:], by, axis=0)
+    return found._replace(columns=columns)
+
+
+def _forked(base, model, weights, candidates, path, data) -> Forks:
+    """Multi-step errors with the columns of all candidates."""
     track = tracks(model, path, each(_inputs, model, data))
     along = candidate_columns(eqx.tree_at(lambda m: m.unknown, base, model.unknown), candidates)
     track = jax.tree.map(np.asarray, track)
-    found = forks(model, weights, path, data, lambda some: along(jax.tree.map(lambda a: a[some], track)))
+    return forks(model, weights, path, data, lambda some: along(jax.tree.map(lambda a: a[some], track)))
+
+
+def _removed(found: Forks, model, weights, candidates, path, data, used, recording) -> Removed:
     part, clock = parts(model, path, data, used, recording), _clock(model, data)
     rows = project(found, model, weights, used, part, times(clock, data, recording, BLOCKS))
     timed = ["time" in c.start.signals(model.system) for c in candidates]
@@ -196,29 +250,33 @@ def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
 
 def share_test(question: Question, candidates: Sequence[Candidate]) -> Screen:
     """The share of the multi-step error that every candidate removes."""
+    return _screen(removed(*_asked(question, candidates)), question, candidates)
+
+
+def chance_test(question: Question, candidates: Sequence[Candidate]) -> list[Screen]:
+    """The same screen of every placebo."""
+    return [_screen(one, question, candidates) for one in placebos(*_asked(question, candidates))]
+
+
+def _asked(question: Question, candidates: Sequence[Candidate]) -> tuple:
     now = question.now
     weights = now.m_step.weights(now.model)
-    told = removed(
-        question.bare.model,
-        now.model,
-        weights,
-        candidates,
-        question.path,
-        question.data,
-        question.used,
-        question.recording,
-    )
+    about = (question.path, question.data, question.used, question.recording)
+    return question.bare.model, now.model, weights, candidates, *about
+
+
+def _screen(shares: Removed, question: Question, candidates: Sequence[Candidate]) -> Screen:
     screened = tuple(
         Screened(
             candidate,
-            told.coefficients[here],
-            round(float(told.directions[i])),
+            shares.coefficients[here],
+            round(float(shares.directions[i])),
             math.nan,
-            Share(float(told.inside[i]), float(told.left_out[i]), tuple(told.folds[i].tolist()), question.left),
+            Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()), question.left),
         )
         for i, (candidate, here) in enumerate(zip(candidates, spans(candidates), strict=True))
     )
-    return Screen(screened, told.projected, told.members)
+    return Screen(screened, shares.projected, shares.members)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:

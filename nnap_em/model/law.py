@@ -130,7 +130,7 @@ def _fit_joint(
     for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]), repeat=2):
         start = np.array([np.log(0.3), np.log(0.3), knee, np.log(0.3), sharpness - 1.5, 0.0])
         with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-            fits.append(least_squares(residual, start, jacobian, method="lm", xtol=1e-8, args=(start,)))
+            fits.append(least_squares(residual, start, jacobian, method="lm", xtol=1e-8, args=(start,)))  # type: ignore
     value = natural(min(fits, key=lambda fit: fit.cost).x)
     jac = _slopes(value, v) * wide
     white = whitener @ jac

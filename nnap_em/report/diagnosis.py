@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..data.rig import Rig
-from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, undecided, verdict
+from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.outcome import Closed, Intervention, Step
 from ..diagnose.residual import Names, Residual, names_of, residual, tests
@@ -60,9 +60,10 @@ def write_diagnosis(
         *_found_pictures(found),
         *_search_pictures(closed.steps, closed.before.rig.named),
     ]
-    disputed, rivals = disputes(closed, train.files), undecided(closed)
+    disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
+    failed = sum(t.p_value < 0.01 and not t.slight for t in told["before"])
     document = shared(closed.before, train, test, seed=seed, began=began) | {
-        "verdict": verdict(found, error, sum(t.p_value < 0.01 and not t.slight for t in told["before"]), rivals),
+        "verdict": verdict(found, error, failed, rivals, suspects),
         "effects": [entry(f) for f in found],
         "interventions": [_touch(touch, train.files) for touch in closed.interventions],
         "error": error,
@@ -74,7 +75,8 @@ def write_diagnosis(
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
         "disagreements": [d._asdict() for d in disputed],
         "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
-        "next": [*advice(found, disputed, rivals), *_experiment(closed.before.rig)],
+        "suspects": [suspect._asdict() for suspect in suspects],
+        "next": [*advice(found, disputed, rivals, suspects), *_experiment(closed.before.rig)],
     }
     named = closed.before.rig.named
     write_json(out / "report.json", document, named)

@@ -7,11 +7,11 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose.interventions import Intervention, touches, without
-from nnap_em.diagnose.residual import Names, Residual
 from nnap_em.report.diagnosis import _touch
 from nnap_em.report.page import page
 from nnap_em.report.tables import write_json
+from nnap_em.residual.interventions import Intervention, touches, without
+from nnap_em.residual.residual import Names, Residual
 from nnap_em.systems import specs
 
 DT = 0.01

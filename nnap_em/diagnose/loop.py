@@ -20,19 +20,19 @@ from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
+from ..residual.innovations import white_innovations
+from ..residual.interventions import untouched
 from ..systems import AbstractSystem
 from .accept import AbstractRule, LikelihoodRule, ShareRule
 from .case import Case, trimmed
 from .evidence import Question
 from .grow import Loop, Stages, asked, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
-from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
 from .look import EFFORT, Effort, Look, Say, alike, look
 from .outcome import Closed, Step
 from .quantised import quantised
 from .refit import refit
-from .residual import white_innovations
 from .rivals import EVEN, apart
 from .undo import Difference, concluded, needed
 

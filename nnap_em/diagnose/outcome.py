@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ..em.identify import Identified
+from ..residual.interventions import Intervention
 from .hypothesis import Found
 from .keys import Key
 
@@ -35,26 +36,6 @@ class Step(NamedTuple):
     """Best first."""
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""
-
-
-class Intervention(NamedTuple):
-    """A push on one joint that no law explains."""
-
-    sequence: int
-    joint: int
-    """Counted from 1."""
-    first: int
-    """First row."""
-    last: int
-    """Last row."""
-    from_s: float
-    to_s: float
-    """On the clock of the log [s]."""
-    size: float
-    """Largest mean over a bell [N m, or N]."""
-    std: float
-    """How large such means are where nothing touches."""
-    unit: str
 
 
 class Closed(NamedTuple):

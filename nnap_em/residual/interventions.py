@@ -19,7 +19,6 @@ from ..data.dataset import Dataset
 from ..em.build import measure_scales
 from ..em.identify import Identified
 from ..em.loop import FitError
-from .outcome import Intervention
 from .residual import Names, Residual, names_of, residual
 
 WIDTHS = (0.2, 0.4, 0.8)
@@ -48,6 +47,26 @@ MARGIN, LEAST = 0.1, 0.5
 """Time [s] left out before and after a touch; length [s] of a piece between two that is of use."""
 ROUNDS = 3
 """Fits anew at most: a fit that was spared one touch sees another better."""
+
+
+class Intervention(NamedTuple):
+    """A push on one joint that no law explains."""
+
+    sequence: int
+    joint: int
+    """Counted from 1."""
+    first: int
+    """First row."""
+    last: int
+    """Last row."""
+    from_s: float
+    to_s: float
+    """On the clock of the log [s]."""
+    size: float
+    """Largest mean over a bell [N m, or N]."""
+    std: float
+    """How large such means are where nothing touches."""
+    unit: str
 
 
 class Bell(NamedTuple):

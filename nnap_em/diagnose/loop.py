@@ -21,7 +21,7 @@ from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
 from ..residual.innovations import white_innovations
-from ..residual.interventions import untouched
+from ..residual.undisturbed import disturbance_free
 from ..systems import AbstractSystem
 from .accept import AbstractRule, LikelihoodRule, ShareRule
 from .case import Case, trimmed
@@ -264,7 +264,7 @@ def close_the_loop(
             return apart(outcome, data)
         say("one-step errors follow each other, so that their likelihood proves nothing: multi-step errors decide")
         return closed(ShareRule())
-    before, data, touches, pieces = untouched(fitted, before, data)
+    before, data, touches, pieces = disturbance_free(fitted, before, data)
     if touches:
         say(f"{len(touches)} touches from outside: their rows are left out")
     return closed(ShareRule())._replace(interventions=touches, pieces=pieces)

@@ -1,4 +1,4 @@
-"""What a search leaves behind: every look at it, and the models before and after."""
+"""Results of a search: its rounds, and the models before and after."""
 
 from typing import NamedTuple
 
@@ -39,13 +39,13 @@ class Step(NamedTuple):
 
 
 class Closed(NamedTuple):
-    """The outcome."""
+    """Outcome of a search: the fits before and after, the effects found, and the rounds that led to them."""
 
     before: Identified
     after: Identified
     found: tuple[Found, ...]
     steps: tuple[Step, ...]
     interventions: tuple[Intervention, ...] = ()
-    """Touches from outside, which no fit saw."""
+    """External disturbances, whose rows are in no fit."""
     pieces: tuple[int, ...] = ()
-    """Of which recording every sequence of the fits is a piece; empty: each is one."""
+    """Recording that every sequence of the fits is a piece of; empty if each is a recording."""

@@ -1,1 +1,1 @@
-"""What a fit leaves unexplained: innovations and their tests, the missing force, disturbances from outside."""
+"""Innovations of a fit and their tests, the generalised force that it lacks, external disturbances."""

@@ -18,7 +18,7 @@ from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, 
 SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
 """Sizes below which a failed test is called small."""
 WHITE = 0.25
-"""Largest autocorrelation of the innovations of a model whose noise is what it says; .4 to .5 on real machines."""
+"""Largest autocorrelation at which innovations count as white; .4 to .5 on real machines."""
 
 
 class Test(NamedTuple):
@@ -30,16 +30,16 @@ class Test(NamedTuple):
     p_value: float
     """Corrected for the number of tests [Holm 1979]."""
     size: float
-    """How far from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
+    """Distance from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
     deviation minus 1; mean over standard deviation; correlation."""
     meaning: str
-    """One sentence."""
+    """The result in one sentence."""
     slight: bool
     """True where it failed by a size too small to matter."""
 
 
 def white_innovations(fitted: Identified, data: Dataset) -> bool:
-    """Whether one-step errors of every reading hardly remember each other."""
+    """True if the innovations of every reading are white: no autocorrelation reaches `WHITE`."""
     left = residual(fitted, data)
     e = left.innovation[left.used]
     sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
@@ -47,7 +47,7 @@ def white_innovations(fitted: Identified, data: Dataset) -> bool:
 
 
 def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
-    """Name and value of all that an innovation of the same row must not depend on, as known one row before."""
+    """Names and values of all, known one row before, that the innovations of a right model do not depend on."""
     for i, name in enumerate(names.inputs):
         before = np.concatenate([np.full_like(found.u[:, :1, i], np.nan), found.u[:, :-1, i]], axis=1)
         yield name, before
@@ -67,7 +67,7 @@ def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarra
 
 
 def tests(found: Residual, names: Names) -> list[Test]:
-    """All tests of the innovations of every measured channel, over the sequences that were followed."""
+    """All tests of the innovations of every measured channel, over the sequences that did not diverge."""
     found = found.followed()
     rows: list[tuple[str, str, tuple[float, float, float]]] = []
     for i, channel in enumerate(names.measured):

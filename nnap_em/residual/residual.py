@@ -1,6 +1,5 @@
-"""What a fitted model leaves unexplained: innovations, the generalised force it lacks, and tests of both.
+"""Innovations of a fitted model, and the generalised force that it lacks, at smoothed states.
 
-Innovations of a right model are white, normal, of variance 1, and have nothing to do with inputs, states or time.
 [Sarkka & Svensson 2023, "Bayesian Filtering and Smoothing", 2nd ed.; Bar-Shalom, Li & Kirubarajan 2001, "Estimation
 with Applications to Tracking and Navigation", section 5.4]
 """
@@ -26,7 +25,7 @@ from ..smoother.kalman import CUBATURE, relinearised
 
 
 class Names(NamedTuple):
-    """What the columns of a `Residual` are called."""
+    """Names and units of the columns of a `Residual`."""
 
     coordinates: tuple[str, ...]
     rates: tuple[str, ...]
@@ -52,7 +51,7 @@ class Names(NamedTuple):
         return state_unit(self.rotary[place % dof], rate=place >= dof)
 
     def joint(self, joint: int) -> str:
-        """A joint, counted from 1, as a reader finds it."""
+        """Name of a joint, counted from 1, for a reader."""
         return joint_called(self.coordinates, joint)
 
     def force_unit(self, joint: int) -> str:
@@ -61,7 +60,7 @@ class Names(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """What is left over of every sequence, in the coordinates that `Names` names."""
+    """Innovations, missing force and states of every sequence, in the coordinates that `Names` names."""
 
     innovation: Float[np.ndarray, "seq time obs"]
     """Reading minus its one-step prediction, over the standard deviation of that; NaN where not measured."""
@@ -70,28 +69,28 @@ class Residual(NamedTuple):
     force_std: Float[np.ndarray, "seq time dof"]
     """Standard deviation of it given all readings."""
     lacked: Float[np.ndarray, "seq time dof"]
-    """The same beside the model without its effects, on the paths that it finds with them: the component-plus-residual
-    of a regression.  Paths of a model that lacks much are wrong themselves; these show what it lacked.
+    """The force that the model without its effects lacks, on the paths smoothed with them: the component-plus-residual
+    of a regression.  The paths of a model that lacks much are wrong themselves.
     [Larsen & McCleary 1972, Technometrics 14, 781]"""
     lacked_std: Float[np.ndarray, "seq time dof"]
     state: Float[np.ndarray, "seq time state"]
     """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
-    """Coordinates and rates predicted from the rows before: what an innovation must not depend on."""
+    """Coordinates and rates predicted from the rows before; the innovations of a right model do not depend on them."""
     u: Float[np.ndarray, "seq time input"]
-    """What reaches the joints of the inputs, with the effects of the model [N m, or N]."""
+    """Generalised forces of the inputs at their joints, with the effects of the model [N m, or N]."""
     t: Float[np.ndarray, "seq time"]
     """[s]"""
     valid: Bool[np.ndarray, "seq time"]
     used: Bool[np.ndarray, " seq"]
-    """False where the track was lost; such a sequence takes part in no test and no figure."""
+    """False for a diverged sequence, which takes part in no test and no figure."""
 
     def without_effects(self) -> "Residual":
-        """With `lacked` as the force."""
+        """The residual with `lacked` as its force."""
         return self._replace(force=self.lacked, force_std=self.lacked_std)
 
     def followed(self) -> "Residual":
-        """Of the sequences that were."""
+        """The residual of the sequences that did not diverge."""
         return Residual(*(part[self.used] for part in self))
 
 

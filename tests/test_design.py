@@ -26,13 +26,13 @@ from nnap_em.design.questions import Apart, Friction, Several, Told, after, shar
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
-from nnap_em.diagnose.residual import names_of
 from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import drawn_paths
 from nnap_em.em.store import load
 from nnap_em.em.weights import Weights
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.design_plots import motion_figure
+from nnap_em.residual.residual import names_of
 from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from shell import ROOT
 
-FOLDERS = ("numerics", "storage", "data", "systems", "effects", "model", "smoother", "em", "diagnose", "design",
-           "report", "portable", "commands")  # fmt: skip
+FOLDERS = ("numerics", "storage", "data", "systems", "effects", "model", "smoother", "em", "residual", "curves",
+           "diagnose", "design", "report", "portable", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 

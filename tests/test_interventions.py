@@ -7,11 +7,12 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose.interventions import Intervention, touches, without
-from nnap_em.diagnose.residual import Names, Residual
 from nnap_em.report.diagnosis import _touch
 from nnap_em.report.page import page
 from nnap_em.report.tables import write_json
+from nnap_em.residual.interventions import Intervention, disturbances
+from nnap_em.residual.residual import Names, Residual
+from nnap_em.residual.undisturbed import without
 from nnap_em.systems import specs
 
 DT = 0.01
@@ -38,7 +39,7 @@ def _left(law=lambda x, v: 0.0 * x, push=0.0, seed=0, sequences=5, rows=501, noi
 
 @pytest.mark.parametrize("push", [1.0, -1.0])
 def test_a_push_is_found_with_its_time_sign_and_size(push):
-    (found,) = touches(_left(push=push), NAMES, DT, LEAST)
+    (found,) = disturbances(_left(push=push), NAMES, DT, LEAST)
     assert (found.sequence, found.joint, found.unit) == (2, 1, "N")
     assert abs(found.from_s - 1.5) < 0.1 and abs(found.to_s - 1.8) < 0.1
     assert abs(found.size - push) < 0.3 and 0 < found.std < 0.25
@@ -57,11 +58,11 @@ def test_a_push_is_found_with_its_time_sign_and_size(push):
 def test_what_all_recordings_repeat_is_no_touch(law):
     """100 s of each: a false one in 300 s would be seen once in three runs, and none is."""
     for seed in range(4):
-        assert touches(_left(law, seed=seed), NAMES, DT, LEAST) == ()
+        assert disturbances(_left(law, seed=seed), NAMES, DT, LEAST) == ()
 
 
 def test_a_push_beside_a_law_is_found():
-    (found,) = touches(_left(lambda x, v: -1.0 * x, push=3.0), NAMES, DT, LEAST)
+    (found,) = disturbances(_left(lambda x, v: -1.0 * x, push=3.0), NAMES, DT, LEAST)
     assert found.sequence == 2 and abs(found.from_s - 1.5) < 0.1 and found.size > 0
 
 
@@ -69,15 +70,15 @@ def test_a_recording_that_differs_all_the_time_is_no_touch():
     left = _left()
     force = left.force.copy()
     force[3] += 2.0
-    assert touches(left._replace(force=force), NAMES, DT, LEAST) == ()
+    assert disturbances(left._replace(force=force), NAMES, DT, LEAST) == ()
 
 
 def test_padding_and_what_is_too_small_to_matter():
     left = _left(push=1.0)
     padded = [np.pad(a, [(0, 0), (0, 40), *[(0, 0)] * (a.ndim - 2)], constant_values=9.0) for a in left[:-2]]
     valid = np.pad(left.valid, [(0, 0), (0, 40)])
-    assert touches(Residual(*padded, valid, left.used), NAMES, DT, LEAST) == touches(left, NAMES, DT, LEAST)
-    assert touches(left, NAMES, DT, np.asarray([5.0])) == ()
+    assert disturbances(Residual(*padded, valid, left.used), NAMES, DT, LEAST) == disturbances(left, NAMES, DT, LEAST)
+    assert disturbances(left, NAMES, DT, np.asarray([5.0])) == ()
 
 
 def _data():

@@ -7,11 +7,11 @@ from html.parser import HTMLParser
 import pytest
 
 from nnap_em.diagnose.keys import words
-from nnap_em.diagnose.statistics import LEVEL
 from nnap_em.effects import catalogue
 from nnap_em.report.page import Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, number, with_std
+from nnap_em.residual.statistics import LEVEL
 
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
 SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'

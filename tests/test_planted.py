@@ -15,7 +15,6 @@ from planted_table import score, table
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose.outcome import Intervention
 from nnap_em.effects import AbstractEffect
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss
 from nnap_em.effects.base import JointEffect, a
@@ -28,6 +27,7 @@ from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.diagnosis import _touch
+from nnap_em.residual.interventions import Intervention
 from nnap_em.systems import specs
 from nnap_em.systems.arm import TwoLinkArm
 

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.diagnose.residual import Names, Residual
 from nnap_em.effects.base import Curve
 from nnap_em.em.identify import FrictionTable
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure
 from nnap_em.report.friction_plots import friction_figure
 from nnap_em.report.residual_plots import innovation_figure, residual_figure
+from nnap_em.residual.residual import Names, Residual
 
 SEQUENCES, ROWS, DT = 8, 200, 0.01
 

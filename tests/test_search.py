@@ -440,7 +440,7 @@ def test_likelihood_is_believed_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(loop, "close", close)
     monkeypatch.setattr(loop, "white_readings", lambda data: readings)
     monkeypatch.setattr(loop, "white_innovations", lambda fitted, data: innovations)
-    monkeypatch.setattr(loop, "untouched", lambda fit, fitted, data: (fitted, data, (), ()))
+    monkeypatch.setattr(loop, "disturbance_free", lambda fit, fitted, data: (fitted, data, (), ()))
     loop.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert rules == asked
     rules.clear()

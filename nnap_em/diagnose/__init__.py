@@ -1,1 +1,1 @@
-"""What a fitted model lacks: residuals, screening, refits, the search and its findings."""
+"""Search for the effects that a fitted model lacks: screening, refits, the rule that decides, and the findings."""

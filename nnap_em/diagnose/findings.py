@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
@@ -17,7 +18,6 @@ from ..systems import AbstractSystem
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, rest_of, words
 from .outcome import Closed
-from .shapes import Shape, shape
 
 
 class Estimate(NamedTuple):

@@ -20,19 +20,19 @@ from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
+from ..residual.innovations import white_innovations
+from ..residual.undisturbed import disturbance_free
 from ..systems import AbstractSystem
 from .accept import AbstractRule, LikelihoodRule, ShareRule
 from .case import Case, trimmed
 from .evidence import Question
 from .grow import Loop, Stages, asked, grow, playoff, settle, taken
 from .hypothesis import Found, Hypothesis
-from .interventions import untouched
 from .keys import Key, key_of, replaced, rest_of, words
 from .look import EFFORT, Effort, Look, Say, alike, look, suspects
 from .outcome import Closed, Step
 from .quantised import quantised
 from .refit import refit
-from .residual import white_innovations
 from .rivals import EVEN, apart
 from .undo import Difference, concluded, needed
 
@@ -268,7 +268,7 @@ def close_the_loop(
             return apart(outcome, data)
         say("one-step errors follow each other, so that their likelihood proves nothing: multi-step errors decide")
         return closed(ShareRule())
-    before, data, touches, pieces = untouched(fitted, before, data)
+    before, data, touches, pieces = disturbance_free(fitted, before, data)
     if touches:
         say(f"{len(touches)} touches from outside: their rows are left out")
     return closed(ShareRule())._replace(interventions=touches, pieces=pieces)

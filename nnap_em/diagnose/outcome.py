@@ -1,8 +1,9 @@
-"""What a search leaves behind: every look at it, and the models before and after."""
+"""Results of a search: its rounds, and the models before and after."""
 
 from typing import NamedTuple
 
 from ..em.identify import Identified
+from ..residual.interventions import Intervention
 from .hypothesis import Found
 from .keys import Key
 
@@ -49,34 +50,14 @@ class Step(NamedTuple):
     """Best first; empty where a law was accepted."""
 
 
-class Intervention(NamedTuple):
-    """A push on one joint that no law explains."""
-
-    sequence: int
-    joint: int
-    """Counted from 1."""
-    first: int
-    """First row."""
-    last: int
-    """Last row."""
-    from_s: float
-    to_s: float
-    """On the clock of the log [s]."""
-    size: float
-    """Largest mean over a bell [N m, or N]."""
-    std: float
-    """How large such means are where nothing touches."""
-    unit: str
-
-
 class Closed(NamedTuple):
-    """The outcome."""
+    """Outcome of a search: the fits before and after, the effects found, and the rounds that led to them."""
 
     before: Identified
     after: Identified
     found: tuple[Found, ...]
     steps: tuple[Step, ...]
     interventions: tuple[Intervention, ...] = ()
-    """Touches from outside, which no fit saw."""
+    """External disturbances, whose rows are in no fit."""
     pieces: tuple[int, ...] = ()
-    """Of which recording every sequence of the fits is a piece; empty: each is one."""
+    """Recording that every sequence of the fits is a piece of; empty if each is a recording."""

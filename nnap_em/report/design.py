@@ -12,7 +12,7 @@ from ..data.formats import write_csv
 from ..design.experiment import Design
 from ..design.questions import Told, after
 from ..diagnose.keys import key_of, listed, words
-from ..diagnose.residual import names_of
+from ..residual.residual import names_of
 from ..storage.files import replace_text
 from .design_plots import bands_figure, motion_figure
 from .document import versions

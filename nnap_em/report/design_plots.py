@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..design.experiment import Design
-from ..diagnose.residual import Names
+from ..residual.residual import Names
 from .style import AFTER, BEFORE, READING, ZERO, head, limits, panels, styled, symbol
 
 

@@ -12,11 +12,13 @@ from ..data.logs import Logs
 from ..data.rig import Rig
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
 from ..diagnose.keys import Key, key_of, words
-from ..diagnose.outcome import Closed, Intervention, Step
-from ..diagnose.residual import Names, Residual, names_of, residual, tests
+from ..diagnose.outcome import Closed, Step
 from ..effects import catalogue
 from ..em.identify import FrictionTable, friction_table
 from ..em.predict import GIVEN, Prediction
+from ..residual.innovations import tests
+from ..residual.interventions import Intervention
+from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.files import replace_text
 from .document import errors, noise, parameters, predictions, shared
 from .effect_plots import effect_figure, screen_figure

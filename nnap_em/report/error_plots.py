@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from ..diagnose.residual import Names
+from ..residual.residual import Names
 from .style import ACROSS, AFTER, BEFORE, band, dotted, head, limits, panels, styled, symbol
 
 _SIDES = {"before": (BEFORE, "s"), "fit": (AFTER, "o"), "after": (AFTER, "o")}

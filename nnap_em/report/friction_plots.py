@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ..diagnose.residual import Names
 from ..em.identify import FrictionTable
+from ..residual.residual import Names
 from .style import ACROSS, AFTER, BEFORE, band, density, head, limits, panels, styled, symbol
 
 

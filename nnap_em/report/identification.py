@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..diagnose.keys import listed
-from ..diagnose.residual import names_of
 from ..em.identify import FrictionTable, Identified, friction_table
 from ..em.predict import smooth
+from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
 from .document import errors, friction_law, noise, parameters, predictions, shared
 from .error_plots import error_figure

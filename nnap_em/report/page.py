@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from ..diagnose.statistics import LEVEL
+from ..residual.statistics import LEVEL
 from . import wording
 from .vocabulary import MEANINGS, WORDS
 from .wording import finite, number, ratio

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..diagnose.residual import Names, Residual
-from ..diagnose.statistics import LAGS, autocorrelation
+from ..residual.residual import Names, Residual
+from ..residual.statistics import LAGS, autocorrelation
 from .style import ACROSS, AFTER, BEFORE, NORMAL_90, ZERO, dotted, head, styled, symbol
 
 

@@ -1,4 +1,4 @@
-"""Shapes that stand at one place of a learned curve: what each looks like, and how it is told."""
+"""Shapes at one place of a learned curve, as a step or a hinge: columns for a fit, numbers and words."""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,9 +26,9 @@ class View(NamedTuple):
     length: float
     turns: bool
     whole: bool
-    """True for an angle that goes round, known all around."""
+    """True for an angle that goes round and is known all around."""
     start: float
-    """Where what is known begins, and how far it goes [z]."""
+    """Start and length of the known part [z]."""
     span: float
     fine: float
     """Distance of the basis functions [z]."""
@@ -44,8 +44,8 @@ class View(NamedTuple):
         return self.low + self.length * (z % 1.0 if self.turns else z)
 
 
-class Told(NamedTuple):
-    """A shape with its numbers, and in words."""
+class Description(NamedTuple):
+    """A shape with its numbers and in words."""
 
     kind: str
     numbers: dict[str, tuple[float, str]]
@@ -56,38 +56,38 @@ class Family(NamedTuple):
     """Shapes of one form: sums of columns whose sizes are free, at places of a grid."""
 
     columns: Callable[[View, Places], Columns]
-    tell: Callable[[View, Place, Size], Told]
-    """From the view, a place and the sizes."""
+    describe: Callable[[View, Place, Size], Description]
+    """Description from the view, a place and the sizes."""
     grid: Places
     free: tuple[int, ...]
     """Numbers of a place that may leave the grid."""
     price: int
-    """Numbers that it spends, beside the mean."""
+    """Number of its free numbers, beside the mean."""
 
 
-def say(value: float, unit: str) -> str:
-    """A number as a reader wants it."""
+def quantity(value: float, unit: str) -> str:
+    """A number in three digits, with its unit."""
     return f"{value:.3g} {unit}".rstrip()
 
 
 def forms(view: View) -> list[Family]:
-    """Shapes of one place, the simplest first; of an angle that goes round only what joins itself."""
+    """Shapes of one place, the simplest first; of an angle that goes round only those that close."""
     within = view.start + view.span * np.linspace(0.0, 1.0, 41)
     around = np.linspace(0, 1, 41) if view.whole else within  # with both ends: what is polished stays in its grid
     widths = np.geomspace(0.3 * view.fine, max(0.25 * view.span, view.fine), 8)
-    bump = Family(_bump, _tell_bump, product(around, np.log(widths)), (0, 1), 3)
+    bump = Family(_bump, _describe_bump, product(around, np.log(widths)), (0, 1), 3)
     if view.whole:
         return [bump]
     inner, coarse = within[4:-4], within[4:-4:2]
     zones = product(coarse, coarse)
     zones = zones[zones[:, 1] - zones[:, 0] > 0.09 * view.span]
     line, parabola, cubic = (
-        Family(partial(_powers, k), partial(_tell_powers, k), np.zeros((1, 0)), (), k) for k in (1, 2, 3)
+        Family(partial(_powers, k), partial(_describe_powers, k), np.zeros((1, 0)), (), k) for k in (1, 2, 3)
     )
-    hinge = Family(_hinge, _tell_hinge, product(inner, [-1.0, 1.0]), (0,), 2)
-    step = Family(_step, _tell_step, product(within[2:-2], np.log(widths)), (0, 1), 3)
-    zone = Family(_zone, _tell_zone, zones, (0, 1), 3)
-    bend = Family(_bend, _tell_bend, inner[:, None], (0,), 3)
+    hinge = Family(_hinge, _describe_hinge, product(inner, [-1.0, 1.0]), (0,), 2)
+    step = Family(_step, _describe_step, product(within[2:-2], np.log(widths)), (0, 1), 3)
+    zone = Family(_zone, _describe_zone, zones, (0, 1), 3)
+    bend = Family(_bend, _describe_bend, inner[:, None], (0,), 3)
     return [line, parabola, hinge, step, bump, cubic, zone, bend]
 
 
@@ -106,29 +106,30 @@ def _powers(order: int, view: View, place: Places) -> Columns:
     return np.stack([view.z**k for k in range(1, order + 1)], axis=1)[None]
 
 
-def _tell_powers(order: int, view: View, place: Place, size: Size) -> Told:
+def _describe_powers(order: int, view: View, place: Place, size: Size) -> Description:
     per, powers = view.per, np.arange(1, order + 1)
     first, middle, last = (
         float(size @ (powers * z ** (powers - 1))) / view.length for z in view.start + view.span * np.linspace(0, 1, 3)
     )
     if order == 1:
-        return Told("line", {"slope": (first, per)}, f"nearly a straight line in {view.name}, slope {say(first, per)}")
+        words = f"nearly a straight line in {view.name}, slope {quantity(first, per)}"
+        return Description("line", {"slope": (first, per)}, words)
     numbers = {"slope_first": (first, per), "slope_middle": (middle, per), "slope_last": (last, per)}
     kind = "parabola" if order == 2 else "cubic"
-    words = f"a {kind} in {view.name}, slopes {first:.3g}, {middle:.3g} and {say(last, per)} from end to end"
-    return Told(kind, numbers, words)
+    words = f"a {kind} in {view.name}, slopes {first:.3g}, {middle:.3g} and {quantity(last, per)} from end to end"
+    return Description(kind, numbers, words)
 
 
 def _hinge(view: View, place: Places) -> Columns:
     return np.maximum(0.0, place[:, 1:] * (view.z - place[:, :1]))[..., None]
 
 
-def _tell_hinge(view: View, place: Place, size: Size) -> Told:
+def _describe_hinge(view: View, place: Place, size: Size) -> Description:
     slope, per, at = place[1] * size[0] / view.length, view.per, view.at(place[0])
     side, other = ("above", "below") if place[1] > 0 else ("below", "above")
-    words = f"a hinge in {view.name} at {say(at, view.across)}: flat {other}, slope {say(slope, per)} {side}"
+    words = f"a hinge in {view.name} at {quantity(at, view.across)}: flat {other}, slope {quantity(slope, per)} {side}"
     numbers = {"place": (at, view.across), f"slope_{side}": (slope, per), f"slope_{other}": (0.0, per)}
-    return Told("hinge", numbers, words)
+    return Description("hinge", numbers, words)
 
 
 def _bend(view: View, place: Places) -> Columns:
@@ -136,11 +137,12 @@ def _bend(view: View, place: Places) -> Columns:
     return np.stack([view.z - place - above, above], axis=2)
 
 
-def _tell_bend(view: View, place: Place, size: Size) -> Told:
+def _describe_bend(view: View, place: Place, size: Size) -> Description:
     (below, above), per, at = size / view.length, view.per, view.at(place[0])
-    words = f"a bend in {view.name} at {say(at, view.across)}: slope {say(below, per)} below, {say(above, per)} above"
+    slopes = f"slope {quantity(below, per)} below, {quantity(above, per)} above"
+    words = f"a bend in {view.name} at {quantity(at, view.across)}: {slopes}"
     numbers = {"place": (at, view.across), "slope_below": (below, per), "slope_above": (above, per)}
-    return Told("bend", numbers, words)
+    return Description("bend", numbers, words)
 
 
 def _zone(view: View, place: Places) -> Columns:
@@ -148,42 +150,42 @@ def _zone(view: View, place: Places) -> Columns:
     return (np.maximum(0.0, above) + np.minimum(0.0, below))[..., None]
 
 
-def _tell_zone(view: View, place: Place, size: Size) -> Told:
+def _describe_zone(view: View, place: Place, size: Size) -> Description:
     slope, per = size[0] / view.length, view.per
     low, high = view.at(place[0]), view.at(place[1])
-    words = f"flat in {view.name} from {low:.3g} to {say(high, view.across)}, slope {say(slope, per)} outside"
+    words = f"flat in {view.name} from {low:.3g} to {quantity(high, view.across)}, slope {quantity(slope, per)} outside"
     numbers = {"from": (low, view.across), "to": (high, view.across), "slope": (slope, per)}
-    return Told("dead zone", numbers, words)
+    return Description("dead zone", numbers, words)
 
 
 def _step(view: View, place: Places) -> Columns:
     return ndtr((view.z - place[:, :1]) / np.exp(place[:, 1:]))[..., None]
 
 
-def _tell_step(view: View, place: Place, size: Size) -> Told:
+def _describe_step(view: View, place: Place, size: Size) -> Description:
     wide = 2.563 * np.exp(place[1])  # from 10 to 90 % of a cumulative normal distribution
     at, over = view.at(place[0]), view.length * max(wide, view.fine)
     numbers = {"place": (at, view.across), "height": (size[0], view.unit), "transition": (over, view.across)}
-    way, tall = "up" if size[0] > 0 else "down", say(abs(size[0]), view.unit)
-    words = f"a step {way} at {view.name} = {say(at, view.across)}, {tall} high"
+    way, tall = "up" if size[0] > 0 else "down", quantity(abs(size[0]), view.unit)
+    words = f"a step {way} at {view.name} = {quantity(at, view.across)}, {tall} high"
     if wide < 1.5 * view.fine:
         over = numbers["transition"] = 1.5 * view.fine * view.length, view.across
-        return Told("step", numbers, f"{words} (or a transition no wider than {say(*over)})")
+        return Description("step", numbers, f"{words} (or a transition no wider than {quantity(*over)})")
     if wide < view.span / 3:
-        return Told("step", numbers, f"{words}, over {say(over, view.across)}")
-    words = f"a slope in {view.name} about {say(at, view.across)} that levels off on both sides, {tall} {way}"
-    return Told("saturation", numbers, f"{words} over {say(over, view.across)}")
+        return Description("step", numbers, f"{words}, over {quantity(over, view.across)}")
+    words = f"a slope in {view.name} about {quantity(at, view.across)} that levels off on both sides, {tall} {way}"
+    return Description("saturation", numbers, f"{words} over {quantity(over, view.across)}")
 
 
 def _bump(view: View, place: Places) -> Columns:
     return np.exp(-0.5 * (_away(view, place[:, 0]) / np.exp(place[:, 1:])) ** 2)[..., None]
 
 
-def _tell_bump(view: View, place: Place, size: Size) -> Told:
+def _describe_bump(view: View, place: Place, size: Size) -> Description:
     wide = view.length * max(2.355 * np.exp(place[1]), 1.5 * view.fine)
     bound = "at most " if wide <= 1.5 * view.fine * view.length else "about "
     kind, tall = ("bump", "high") if size[0] > 0 else ("dip", "deep")
-    at, height = view.at(place[0]), say(abs(size[0]), view.unit)
-    words = f"a {kind} at {view.name} = {say(at, view.across)}, {bound}{say(wide, view.across)} wide, {height} {tall}"
+    at, height, width = view.at(place[0]), quantity(abs(size[0]), view.unit), quantity(wide, view.across)
+    words = f"a {kind} at {view.name} = {quantity(at, view.across)}, {bound}{width} wide, {height} {tall}"
     numbers = {"place": (at, view.across), "height": (size[0], view.unit), "width": (wide, view.across)}
-    return Told(kind, numbers, words)
+    return Description(kind, numbers, words)

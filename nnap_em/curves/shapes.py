@@ -1,4 +1,4 @@
-"""A learned curve in words: the simplest of a few shapes that explains it, as the basis of the curve would show it."""
+"""Choice of the simplest shape that explains a learned curve, compared in the basis of the curve."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,29 +8,29 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from ..effects.base import Curve
-from .forms import Family, Told, View, forms, say
+from .forms import Description, Family, View, forms, quantity
 from .waves import waves
 
 EXPLAINS = 0.85
-"""Share of the variance, adjusted for the numbers spent, from which on a shape is named: a sine is 81 % of a square."""
+"""Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square."""
 FLOOR = 0.05
-"""Times the rms of the curve: no difference below it counts, since curves bend with what else the model lacks."""
+"""Smallest difference that counts, in rms of the curve: curves bend with all else that the model lacks."""
 KNOWN = 0.5
-"""Standard deviation, in rms of the curve, up to which it is looked at."""
-EVEN = 2.0
-"""Difference in the information criterion that is no evidence [Kass & Raftery 1995]: the simpler shape is told."""
+"""Largest standard deviation, in rms of the curve, at which the curve counts as known."""
+INDISTINGUISHABLE = 2.0
+"""Largest difference in the Schwarz criterion that is no evidence, so the simpler shape wins [Kass & Raftery 1995]."""
 
 
 class Shape(NamedTuple):
-    """What a curve looks like."""
+    """The simplest shape that explains a curve."""
 
     kind: str
     numbers: dict[str, tuple[float, str]]
-    """By name: a value and its unit."""
+    """Value and unit of each number, by its name."""
     explains: float
     """Share of the variance of the curve, weighted by how well it is known."""
     resolution: float
-    """Distance of the basis functions, in units of the signal: no transition, bump or dip is seen to be narrower."""
+    """Distance of the basis functions, in units of the signal: no narrower transition, bump or dip can be seen."""
     known: tuple[float, float]
     """The range of the signal in which the curve is known; of an angle it may pass the end of the turn."""
     rivals: tuple[str, ...]
@@ -38,7 +38,7 @@ class Shape(NamedTuple):
     words: str
 
     def entry(self) -> dict[str, Any]:
-        """As the report has it."""
+        """The entry `shape` of `report.json`."""
         numbers = {name: {"value": value, "unit": unit} for name, (value, unit) in self.numbers.items()}
         return {"kind": self.kind, "numbers": numbers} | {n: getattr(self, n) for n in Shape._fields[2:-1]}
 
@@ -52,7 +52,7 @@ class _Seen(NamedTuple):
     def fit(
         self, columns: Float[np.ndarray, "place node column"]
     ) -> tuple[Float[np.ndarray, "place column"], Float[np.ndarray, "place direction"]]:
-        """Sizes of the columns by linear least squares, and what is left, for each of many places."""
+        """Sizes of the columns by linear least squares, and the remainder, for each of many places."""
         seen = self.project @ columns
         gram = seen.swapaxes(1, 2) @ seen
         eye = np.eye(gram.shape[1])
@@ -73,7 +73,7 @@ def shape(found: Curve) -> Shape:
         return _smooth(found, np.ones(found.x.shape, bool))
     view, seen = _view(found, known), _seen(found, known)
     total, n = float(seen.target @ seen.target), len(seen.target)
-    tried: list[tuple[float, int, float, Told]] = []
+    tried: list[tuple[float, int, float, Description]] = []
     for family in sorted(waves(view) + forms(view), key=lambda family: family.price):
         if n - family.price < 2:
             continue
@@ -81,17 +81,17 @@ def shape(found: Curve) -> Shape:
         explains = 1 - rss / total
         if 1 - (1 - explains) * n / (n - family.price) >= EXPLAINS:
             criterion = (n + 1) * np.log(rss + known.sum()) + family.price * np.log(n + 1)  # an error at every node
-            tried.append((criterion, family.price, explains, family.tell(view, place, size)))
+            tried.append((criterion, family.price, explains, family.describe(view, place, size)))
     if not tried:
         return _smooth(found, known)
     lowest = min(criterion for criterion, *_ in tried)
-    (_, price, explains, told), *others = [one for one in tried if one[0] < lowest + EVEN]
-    rivals = tuple(dict.fromkeys(t.kind for _, p, _, t in others if t.kind != told.kind and p <= price))
-    words = told.words + _looked(found, known)
+    (_, price, explains, chosen), *others = [one for one in tried if one[0] < lowest + INDISTINGUISHABLE]
+    rivals = tuple(dict.fromkeys(t.kind for _, p, _, t in others if t.kind != chosen.kind and p <= price))
+    words = chosen.words + _looked(found, known)
     if rivals:
         words += f" (a {' or '.join(rivals)} would explain it as well)"
     limits = view.low + view.length * view.start, view.low + view.length * (view.start + view.span)
-    return Shape(told.kind, told.numbers, explains, view.fine * view.length, limits, rivals, words)
+    return Shape(chosen.kind, chosen.numbers, explains, view.fine * view.length, limits, rivals, words)
 
 
 def _known(found: Curve) -> np.ndarray | None:
@@ -104,7 +104,7 @@ def _known(found: Curve) -> np.ndarray | None:
 
 
 def _view(found: Curve, known: np.ndarray) -> View:
-    """The axis of the curve, an angle cut where the widest gap of what is known ends."""
+    """The axis of the curve; an angle is cut at the end of the widest unknown gap."""
     low, length = float(found.x[0]), float(np.ptp(found.x))
     z = (found.x - low) / length
     whole = found.turns and bool(known.mean() > 0.9)
@@ -152,7 +152,7 @@ def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarr
 def _polished(
     left: Callable[[np.ndarray], np.ndarray], start: np.ndarray, free: list[int], low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """A place moved, in its free entries, to where least is left."""
+    """A place whose free entries are moved to the least remainder."""
 
     def moved(part: np.ndarray) -> np.ndarray:
         place = start.copy()
@@ -167,10 +167,10 @@ def _polished(
 
 
 def _smooth(found: Curve, known: np.ndarray) -> Shape:
-    """Where no shape is: where it is largest, and how large it is."""
+    """A curve that no shape explains: the place and the size of its largest value."""
     x, y, unit = found.x[known], found.mean[known], found.unit
     top, size = float(x[int(np.argmax(y))]), float(np.ptp(y))
-    at, tall = say(top, found.signal_unit), say(size, unit)
+    at, tall = quantity(top, found.signal_unit), quantity(size, unit)
     words = f"a smooth function of {found.signal}, largest at {at}, {tall} from trough to peak"
     numbers = {"largest_at": (top, found.signal_unit), "height": (size, unit)}
     fine, limits = _fine(found) * float(np.ptp(found.x)), (float(x[0]), float(x[-1]))
@@ -184,6 +184,6 @@ def _fine(found: Curve) -> float:
 
 
 def _looked(found: Curve, known: np.ndarray) -> str:
-    """Over how much of its range, where that is not nearly all of it."""
+    """Words for the known share of the range, unless it is nearly all of it."""
     share = known.mean()
     return "" if share > 0.9 else f", seen on {100 * share:.0f} % of the range of {found.signal}"

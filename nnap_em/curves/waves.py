@@ -1,12 +1,12 @@
-"""Shapes that repeat along a learned curve: ripples and square waves, and how they are told."""
+"""Periodic shapes of a learned curve, ripples and square waves: columns for a fit, numbers and words."""
 
 import numpy as np
 
-from .forms import Columns, Family, Place, Places, Size, Told, View, product, say
+from .forms import Columns, Description, Family, Place, Places, Size, View, product, quantity
 
 
 def waves(view: View) -> list[Family]:
-    """Shapes that repeat, the simplest first; what repeats not even once is none."""
+    """Periodic shapes, the simplest first; a shape repeats at least once within the known part."""
     finest = 0.5 / view.fine
     part = np.arange(1.4 / view.span, 0.96 * finest, 0.3 / view.span)
     rates = np.arange(1.0, finest + 0.5) if view.whole else part
@@ -17,10 +17,10 @@ def waves(view: View) -> list[Family]:
     pairs = np.stack([low, high - low], axis=1)[enough & ((high - low) * view.span > 0.89)]
     cycles = product(rates[rates <= 0.8 * finest], np.linspace(0, 1, 17), [0.2, 0.35, 0.5, 0.65, 0.8])
     found = [
-        Family(_ripples, _tell_ripple, once, (), 3),
-        Family(_ripples, _tell_ripple, rates[:, None], () if view.whole else (0,), 3),
-        Family(_square, _tell_square, cycles, (1, 2) if view.whole else (0, 1, 2), 4),
-        Family(_ripples, _tell_two, pairs, () if view.whole else (0, 1), 6),
+        Family(_ripples, _describe_ripple, once, (), 3),
+        Family(_ripples, _describe_ripple, rates[:, None], () if view.whole else (0,), 3),
+        Family(_square, _describe_square, cycles, (1, 2) if view.whole else (0, 1, 2), 4),
+        Family(_ripples, _describe_two, pairs, () if view.whole else (0, 1), 6),
     ]
     return [family for family in found if len(family.grid)]
 
@@ -32,7 +32,7 @@ def _ripples(view: View, place: Places) -> Columns:
 
 
 def _rate(view: View, wave: float) -> tuple[str, tuple[float, str], str]:
-    """How often it repeats: periods a turn of an angle, Hz in time, else the period."""
+    """Rate of repetition: periods a turn of an angle, Hz in time, else the period."""
     if view.across == "rad":
         often = 2 * np.pi * wave / view.length
         return "periods_per_turn", (often, ""), f"{often:.3g}"
@@ -55,22 +55,21 @@ def _wave(view: View, wave: float, cos: float, sin: float) -> tuple[float, float
 
 
 def _least(view: View, wave: float) -> str:
-    """What the basis, and the prior of its weights, show too small."""
+    """Words for an amplitude that the basis, and the prior of its weights, make too small."""
     return "at least " if wave > 0.4 / view.fine else ""
 
 
-def _tell_ripple(view: View, place: Place, size: Size) -> Told:
+def _describe_ripple(view: View, place: Place, size: Size) -> Description:
     key, rate, text = _rate(view, place[0])
     amplitude, phase = _wave(view, place[0], *size)
-    words = (
-        f"a ripple in {view.name} of {_of(view, text)}, amplitude {_least(view, place[0])}{say(amplitude, view.unit)}"
-    )
+    tall = _least(view, place[0]) + quantity(amplitude, view.unit)
+    words = f"a ripple in {view.name} of {_of(view, text)}, amplitude {tall}"
     if 3 * place[0] > 0.48 / view.fine:
         words += ", overtones not seen"
-    return Told("ripple", {key: rate, "amplitude": (amplitude, view.unit), "phase": (phase, "rad")}, words)
+    return Description("ripple", {key: rate, "amplitude": (amplitude, view.unit), "phase": (phase, "rad")}, words)
 
 
-def _tell_two(view: View, place: Place, size: Size) -> Told:
+def _describe_two(view: View, place: Place, size: Size) -> Description:
     numbers, texts, tall = {}, [], []
     for i, wave in enumerate(np.cumsum(place)):
         key, rate, text = _rate(view, wave)
@@ -80,7 +79,7 @@ def _tell_two(view: View, place: Place, size: Size) -> Told:
         texts, tall = [*texts, text], [*tall, f"{_least(view, wave)}{amplitude:.3g}"]
     often = _of(view, " and ".join(texts))
     words = f"two ripples in {view.name} of {often}, amplitudes {tall[0]} and {tall[1]} {view.unit}"
-    return Told("two ripples", numbers, words)
+    return Description("two ripples", numbers, words)
 
 
 def _square(view: View, place: Places) -> Columns:
@@ -90,7 +89,7 @@ def _square(view: View, place: Places) -> Columns:
     return np.clip((0.5 * duty - np.abs(cycle)) / edge + 0.5, 0.0, 1.0)[..., None]
 
 
-def _tell_square(view: View, place: Place, size: Size) -> Told:
+def _describe_square(view: View, place: Place, size: Size) -> Description:
     wave, phase, duty = place
     phase, duty = (phase, duty) if size[0] > 0 else (phase + 0.5, 1 - duty)
     key, rate, text = _rate(view, wave)
@@ -100,8 +99,8 @@ def _tell_square(view: View, place: Place, size: Size) -> Told:
     up, down = view.at(rises), view.at(rises + duty / wave)
     numbers = {key: rate, "amplitude": (amplitude, view.unit), "duty": (duty, ""), "rises_at": (up, view.across)}
     if view.whole and wave == 1.0:
-        high = say(2 * amplitude, view.unit)
-        words = f"a step up at {view.name} = {up:.3g} and down again at {say(down, view.across)}, {high} high"
-        return Told("square wave", numbers, words)
-    words = f"a square wave in {view.name} of {_of(view, text)}, {say(amplitude, view.unit)} to either side"
-    return Told("square wave", numbers, words + f", high for {100 * duty:.0f} % of the period")
+        high = quantity(2 * amplitude, view.unit)
+        words = f"a step up at {view.name} = {up:.3g} and down again at {quantity(down, view.across)}, {high} high"
+        return Description("square wave", numbers, words)
+    words = f"a square wave in {view.name} of {_of(view, text)}, {quantity(amplitude, view.unit)} to either side"
+    return Description("square wave", numbers, words + f", high for {100 * duty:.0f} % of the period")

@@ -1,6 +1,6 @@
-"""Tests that innovations of a right model pass: white, normal, of variance 1, and linked to nothing known before.
+"""Tests that the innovations of a right model pass: white, normal, of variance 1, independent of all known before.
 
-Each gives its statistic, its p-value, and a size: how far from a right model, whatever the number of samples.
+Each gives its statistic, its p-value, and a size, the distance from a right model whatever the number of samples.
 [Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4]
 """
 
@@ -16,7 +16,7 @@ LAGS = 20
 LEVEL = 0.05
 """Corrected p-value below which a test counts as failed."""
 _GROUPS, _GROUP = 20, 50
-"""Groups at least, readings in a group at least where these are enough."""
+"""Least number of groups, and least number of readings in a group where there are enough."""
 
 
 def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:

@@ -1,11 +1,10 @@
-"""What a fitted model leaves unexplained: innovations, the generalised force it lacks, and tests of both.
+"""Innovations of a fitted model, and the generalised force that it lacks, at smoothed states.
 
-Innovations of a right model are white, normal, of variance 1, and have nothing to do with inputs, states or time.
 [Sarkka & Svensson 2023, "Bayesian Filtering and Smoothing", 2nd ed.; Bar-Shalom, Li & Kirubarajan 2001, "Estimation
 with Applications to Tracking and Navigation", section 5.4]
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -23,16 +22,10 @@ from ..model.base import prepare
 from ..model.state_space import with_effects
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, relinearised
-from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, whiteness
-
-SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
-"""Sizes below which a failed test is called small."""
-WHITE = 0.25
-"""Largest autocorrelation of the innovations of a model whose noise is what it says; .4 to .5 on real machines."""
 
 
 class Names(NamedTuple):
-    """What the columns of a `Residual` are called."""
+    """Names and units of the columns of a `Residual`."""
 
     coordinates: tuple[str, ...]
     rates: tuple[str, ...]
@@ -58,7 +51,7 @@ class Names(NamedTuple):
         return state_unit(self.rotary[place % dof], rate=place >= dof)
 
     def joint(self, joint: int) -> str:
-        """A joint, counted from 1, as a reader finds it."""
+        """Name of a joint, counted from 1, for a reader."""
         return joint_called(self.coordinates, joint)
 
     def force_unit(self, joint: int) -> str:
@@ -67,7 +60,7 @@ class Names(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """What is left over of every sequence, in the coordinates that `Names` names."""
+    """Innovations, missing force and states of every sequence, in the coordinates that `Names` names."""
 
     innovation: Float[np.ndarray, "seq time obs"]
     """Reading minus its one-step prediction, over the standard deviation of that; NaN where not measured."""
@@ -76,46 +69,29 @@ class Residual(NamedTuple):
     force_std: Float[np.ndarray, "seq time dof"]
     """Standard deviation of it given all readings."""
     lacked: Float[np.ndarray, "seq time dof"]
-    """The same beside the model without its effects, on the paths that it finds with them: the component-plus-residual
-    of a regression.  Paths of a model that lacks much are wrong themselves; these show what it lacked.
+    """The force that the model without its effects lacks, on the paths smoothed with them: the component-plus-residual
+    of a regression.  The paths of a model that lacks much are wrong themselves.
     [Larsen & McCleary 1972, Technometrics 14, 781]"""
     lacked_std: Float[np.ndarray, "seq time dof"]
     state: Float[np.ndarray, "seq time state"]
     """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
-    """Coordinates and rates predicted from the rows before: what an innovation must not depend on."""
+    """Coordinates and rates predicted from the rows before; the innovations of a right model do not depend on them."""
     u: Float[np.ndarray, "seq time input"]
-    """What reaches the joints of the inputs, with the effects of the model [N m, or N]."""
+    """Generalised forces of the inputs at their joints, with the effects of the model [N m, or N]."""
     t: Float[np.ndarray, "seq time"]
     """[s]"""
     valid: Bool[np.ndarray, "seq time"]
     used: Bool[np.ndarray, " seq"]
-    """False where the track was lost; such a sequence takes part in no test and no figure."""
+    """False for a diverged sequence, which takes part in no test and no figure."""
 
     def without_effects(self) -> "Residual":
-        """With `lacked` as the force."""
+        """The residual with `lacked` as its force."""
         return self._replace(force=self.lacked, force_std=self.lacked_std)
 
     def followed(self) -> "Residual":
-        """Of the sequences that were."""
+        """The residual of the sequences that did not diverge."""
         return Residual(*(part[self.used] for part in self))
-
-
-class Test(NamedTuple):
-    """One test of the innovations of one channel."""
-
-    name: str
-    channel: str
-    statistic: float
-    p_value: float
-    """Corrected for the number of tests [Holm 1979]."""
-    size: float
-    """How far from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
-    deviation minus 1; mean over standard deviation; correlation."""
-    meaning: str
-    """One sentence."""
-    slight: bool
-    """True where it failed by a size too small to matter."""
 
 
 def names_of(fitted: Identified) -> Names:
@@ -170,89 +146,3 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     t, valid = np.asarray(data.t), np.asarray(data.valid)
     used = np.asarray(kept(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
     return Residual(innovation, force, std, lacked, lacked_std, state, predicted, u, t, valid, used)
-
-
-# --- tests
-
-
-def white_innovations(fitted: Identified, data: Dataset) -> bool:
-    """Whether one-step errors of every reading hardly remember each other."""
-    left = residual(fitted, data)
-    e = left.innovation[left.used]
-    sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
-    return bool(sizes) and max(map(abs, sizes)) < WHITE
-
-
-def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
-    """Name and value of all that an innovation of the same row must not depend on, as known one row before."""
-    for i, name in enumerate(names.inputs):
-        before = np.concatenate([np.full_like(found.u[:, :1, i], np.nan), found.u[:, :-1, i]], axis=1)
-        yield name, before
-    dof = len(names.coordinates)
-    for j, name in enumerate(names.coordinates):
-        q = found.predicted[..., j]
-        if names.rotary[j]:
-            yield f"sin({name})", np.sin(q)
-            yield f"cos({name})", np.cos(q)
-        else:
-            yield name, q
-    for j, name in enumerate(names.rates):
-        v = found.predicted[..., dof + j]
-        yield name, v
-        yield f"|{name}| {name}", np.abs(v) * v
-    yield "time", found.t
-
-
-def tests(found: Residual, names: Names) -> list[Test]:
-    """All tests of the innovations of every measured channel, over the sequences that were followed."""
-    found = found.followed()
-    rows: list[tuple[str, str, tuple[float, float, float]]] = []
-    for i, channel in enumerate(names.measured):
-        e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))
-        if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
-            continue
-        rows += [("whiteness", channel, whiteness(e)), ("normality", channel, normality(e))]
-        rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
-        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(found, names)]
-    corrected = holm([p for _, _, (_, p, _) in rows])
-    out = []
-    for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
-        slight = bool(p < LEVEL and abs(size) < SLIGHT[name.split()[0]])
-        out.append(
-            Test(
-                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < LEVEL), size, slight), slight
-            )
-        )
-    return out
-
-
-def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> str:
-    kind = name.split()[0]
-    if kind == "correlation":
-        cause = name.removeprefix("correlation with ")
-        passed = f"Errors in {channel} show no link with {cause}."
-        failed = f"Errors in {channel} change with {cause} (correlation {size:.2g})."
-    else:
-        passed, failed = {
-            "whiteness": (
-                f"One error in {channel} says nothing about the next.",
-                f"Errors in {channel} follow each other (correlation up to {size:.2g}): something acts that lasts.",
-            ),
-            "normality": (
-                f"Errors in {channel} are bell-shaped.",
-                f"Errors in {channel} have {'more' if size > 0 else 'fewer'} outliers than a bell curve, or lean to a "
-                f"side (excess kurtosis {size:.2g}).",
-            ),
-            "spread": (
-                f"Errors in {channel} are as large as the model expects.",
-                f"Errors in {channel} are {abs(size):.1%} {'larger' if size > 0 else 'smaller'} than the model "
-                "expects.",
-            ),
-            "mean": (
-                f"Errors in {channel} average to zero.",
-                f"Errors in {channel} lean to one side (by {size:.2g} standard deviations).",
-            ),
-        }[kind]
-    if not bad:
-        return passed
-    return failed[:-1] + "; certain, but small." if slight else failed

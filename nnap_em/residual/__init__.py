@@ -1,0 +1,1 @@
+"""Innovations of a fit and their tests, the generalised force that it lacks, external disturbances."""

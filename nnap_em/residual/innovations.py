@@ -1,0 +1,121 @@
+"""Tests of the innovations of a fit, channel by channel: each with a size and a sentence for the report.
+
+Innovations of a right model are white, normal, of variance 1, and independent of inputs, states and time.
+[Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4]
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.dataset import Dataset
+from ..em.identify import Identified
+from .residual import Names, Residual, residual
+from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, whiteness
+
+SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
+"""Sizes below which a failed test is called small."""
+WHITE = 0.25
+"""Largest autocorrelation at which innovations count as white; .4 to .5 on real machines."""
+
+
+class Test(NamedTuple):
+    """One test of the innovations of one channel."""
+
+    name: str
+    channel: str
+    statistic: float
+    p_value: float
+    """Corrected for the number of tests [Holm 1979]."""
+    size: float
+    """Distance from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
+    deviation minus 1; mean over standard deviation; correlation."""
+    meaning: str
+    """The result in one sentence."""
+    slight: bool
+    """True where it failed by a size too small to matter."""
+
+
+def white_innovations(fitted: Identified, data: Dataset) -> bool:
+    """True if the innovations of every reading are white: no autocorrelation reaches `WHITE`."""
+    left = residual(fitted, data)
+    e = left.innovation[left.used]
+    sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
+    return bool(sizes) and max(map(abs, sizes)) < WHITE
+
+
+def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
+    """Names and values of all, known one row before, that the innovations of a right model do not depend on."""
+    for i, name in enumerate(names.inputs):
+        before = np.concatenate([np.full_like(found.u[:, :1, i], np.nan), found.u[:, :-1, i]], axis=1)
+        yield name, before
+    dof = len(names.coordinates)
+    for j, name in enumerate(names.coordinates):
+        q = found.predicted[..., j]
+        if names.rotary[j]:
+            yield f"sin({name})", np.sin(q)
+            yield f"cos({name})", np.cos(q)
+        else:
+            yield name, q
+    for j, name in enumerate(names.rates):
+        v = found.predicted[..., dof + j]
+        yield name, v
+        yield f"|{name}| {name}", np.abs(v) * v
+    yield "time", found.t
+
+
+def tests(found: Residual, names: Names) -> list[Test]:
+    """All tests of the innovations of every measured channel, over the sequences that did not diverge."""
+    found = found.followed()
+    rows: list[tuple[str, str, tuple[float, float, float]]] = []
+    for i, channel in enumerate(names.measured):
+        e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))
+        if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
+            continue
+        rows += [("whiteness", channel, whiteness(e)), ("normality", channel, normality(e))]
+        rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
+        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(found, names)]
+    corrected = holm([p for _, _, (_, p, _) in rows])
+    out = []
+    for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
+        slight = bool(p < LEVEL and abs(size) < SLIGHT[name.split()[0]])
+        out.append(
+            Test(
+                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < LEVEL), size, slight), slight
+            )
+        )
+    return out
+
+
+def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> str:
+    kind = name.split()[0]
+    if kind == "correlation":
+        cause = name.removeprefix("correlation with ")
+        passed = f"Errors in {channel} show no link with {cause}."
+        failed = f"Errors in {channel} change with {cause} (correlation {size:.2g})."
+    else:
+        passed, failed = {
+            "whiteness": (
+                f"One error in {channel} says nothing about the next.",
+                f"Errors in {channel} follow each other (correlation up to {size:.2g}): something acts that lasts.",
+            ),
+            "normality": (
+                f"Errors in {channel} are bell-shaped.",
+                f"Errors in {channel} have {'more' if size > 0 else 'fewer'} outliers than a bell curve, or lean to a "
+                f"side (excess kurtosis {size:.2g}).",
+            ),
+            "spread": (
+                f"Errors in {channel} are as large as the model expects.",
+                f"Errors in {channel} are {abs(size):.1%} {'larger' if size > 0 else 'smaller'} than the model "
+                "expects.",
+            ),
+            "mean": (
+                f"Errors in {channel} average to zero.",
+                f"Errors in {channel} lean to one side (by {size:.2g} standard deviations).",
+            ),
+        }[kind]
+    if not bad:
+        return passed
+    return failed[:-1] + "; certain, but small." if slight else failed

@@ -1,0 +1,262 @@
+"""External disturbances: a force for a moment that nothing repeats, as from a hand, a collision, a cable that catches.
+
+The smoothed kicks are auxiliary residuals: where a force acts that the model lacks, they stand out for as long as it
+acts [Harvey & Koopman 1992, J. Bus. Econ. Stat. 10, 377; de Jong & Penzer 1998, J. Am. Stat. Assoc. 93, 796].  On a
+machine they stand out elsewhere too: friction, backlash, an input that jumps.  So a disturbance is compared with the
+missing force of the same recordings at all other times, and with that of neighbours in state space at other moments:
+a force that these share is a law of the machine.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from ..data.dataset import Dataset
+from ..em.build import measure_scales
+from ..em.identify import Identified
+from .residual import Names, Residual, names_of, residual
+
+WIDTHS = (0.2, 0.4, 0.8)
+"""Lengths of the Hann windows over which forces are averaged [s], each twice its width at half height."""
+STEP = 0.03
+"""Time between the windows that are compared [s]."""
+LEVEL = 4.0
+"""Smallest disturbance, in standard deviations: normal noise reaches it once in some thousand windows."""
+MORE = 0.8
+"""Share of `LEVEL` that suffices once another disturbance is certain."""
+ALONE = 2.0
+"""Factor on `LEVEL` at a state that has no neighbours."""
+SMALL = 0.05
+"""Smallest disturbance, as a share of the typical torque of its joint."""
+NEAR, NEIGHBOURS = 1.2, 5
+"""Largest distance of a neighbour in state space, in radians or in rms of rates and inputs; number of neighbours."""
+VIEW, OTHERS = 0.5, 10
+"""The same two numbers for a comparison by the signals of one joint alone."""
+REPEATED = 0.5
+"""Share of a force from which on, as the mean of its neighbours, it is a law of the machine."""
+APART = 1.0
+"""Time between two moments of a recording from which on they are neighbours of each other [s]."""
+EDGE = 0.25
+"""Share of its peak at which a disturbance begins and ends."""
+
+
+class Intervention(NamedTuple):
+    """A push on one joint that no law explains."""
+
+    sequence: int
+    joint: int
+    """Counted from 1."""
+    first: int
+    """First row."""
+    last: int
+    """Last row."""
+    from_s: float
+    to_s: float
+    """On the clock of the log [s]."""
+    size: float
+    """Largest mean over a window [N m, or N]."""
+    std: float
+    """Standard deviation of such means without disturbances [N m, or N]."""
+    unit: str
+
+
+class WindowMean(NamedTuple):
+    """Means of the missing force over Hann windows of one length."""
+
+    mean: Float[np.ndarray, "seq time dof"]
+    """NaN where a window does not fit inside its recording."""
+    std: Float[np.ndarray, "seq time dof"]
+    """Standard deviation of the mean without disturbances."""
+
+
+def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.ndarray, "seq time column"]:
+    """Means over Hann windows of `rows` rows; NaN where one does not fit."""
+    if not a.size:
+        return a
+    kernel = np.hanning(rows + 2)[1:-1]
+    kernel = kernel / kernel.sum()
+    over = lambda a: np.apply_along_axis(lambda row: np.convolve(row, kernel, "same"), 1, a)  # noqa: E731
+    known = np.isfinite(a)
+    return np.where(over(known.astype(float)) > 0.99, over(np.where(known, a, 0.0)), np.nan)
+
+
+def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
+    """Robust standard deviation: disturbances for some tenths of the time do not change it.
+
+    The larger of two: of all recordings by the 80 % quantile, since tails are heavy; of one recording by its median.
+    """
+    size = np.abs(a)
+    if not np.isfinite(size).any():
+        return np.full((len(a), 1), np.inf)
+    own = [1.4826 * np.nanmedian(one) if np.isfinite(one).any() else 0.0 for one in size]
+    return np.maximum(np.nanquantile(size, 0.8) / 1.2816, np.asarray(own))[:, None] + 1e-300
+
+
+def window_mean(force: Float[np.ndarray, "seq time dof"], rows: int) -> WindowMean:
+    """Means over `rows` rows; their standard deviation is larger where the force scatters, as where gears chatter."""
+    mean = averaged(force, rows)
+    scatter = np.sqrt(np.maximum(averaged(force**2, rows) - mean**2, 0.0)) + 1e-300
+    std = np.full(mean.shape, np.nan)
+    for j in range(mean.shape[-1]):
+        m, s = mean[..., j], scatter[..., j]
+        if np.isfinite(m).any():
+            loud = s >= np.nanquantile(s, 0.9)
+            std[..., j] = np.maximum(level(m), 1.4826 * np.nanmedian(np.abs(m[loud]) / s[loud]) * s)
+    return WindowMean(mean, std)
+
+
+class Places(NamedTuple):
+    """The windows that are compared, and the state in the middle of each."""
+
+    seq: Int[np.ndarray, " place"]
+    row: Int[np.ndarray, " place"]
+    state: Float[np.ndarray, "place feature"]
+    """All that a law may depend on, in units in which a distance of `NEAR` is small."""
+    views: tuple[Float[np.ndarray, "place feature"], ...]
+    """All that a law of one joint may depend on: its angle and rate; the input and rate."""
+
+    def away(self, at: int, apart: int) -> Bool[np.ndarray, " place"]:
+        """True for places of another moment than `at`."""
+        return (self.seq != self.seq[at]) | (np.abs(self.row - self.row[at]) >= apart)
+
+
+def places(found: Residual, names: Names, dt: float) -> Places:
+    """One place every `STEP` of all sequences, where the state is known."""
+    dof = len(names.coordinates)
+    q, v, u = found.state[..., :dof], found.state[..., dof:], averaged(found.u, max(3, round(WIDTHS[0] / dt)))
+    seq, row = np.nonzero(np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1) & found.valid)
+    keep = row % max(1, round(STEP / dt)) == 0
+    seq, row = seq[keep], row[keep]
+
+    def scaled(a):
+        a = a[seq, row]
+        return a / (np.sqrt(np.mean(a**2, axis=0)) + 1e-300)
+
+    v, u = scaled(v), scaled(u)
+    angle = [
+        np.stack([np.sin(x), np.cos(x)], axis=1) if turns else scaled(q[..., j : j + 1] - np.mean(x))
+        for j, (x, turns) in enumerate(zip(q[seq, row].T, names.rotary, strict=True))
+    ]
+    views = [np.concatenate([angle[j], v[:, j : j + 1]], axis=1) for j in range(dof)]
+    views += [np.stack([u[:, i], v[:, joint - 1]], axis=1) for i, joint in enumerate(names.joints)]
+    return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(views))
+
+
+def neighbours(here: Places, apart: int) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
+    """The places nearest to each in state space; True for those that count: of another moment, and one a moment."""
+    count = len(here.seq)
+    near = min(128, count)
+    distance, place = KDTree(here.state).query(here.state, k=near, distance_upper_bound=NEAR)
+    distance, place = (a.reshape(count, near) for a in (distance, place))
+    known = np.isfinite(distance)
+    place = np.where(known, place, 0)
+    seq, row = here.seq[place], here.row[place]
+    known &= (seq != here.seq[:, None]) | (np.abs(row - here.row[:, None]) >= apart)
+    moment = seq * (1 + here.row.max(initial=0) // apart) + row // apart
+    counts = np.zeros(place.shape, bool)
+    for k in range(near):
+        twice = np.any(counts[:, :k] & (moment[:, :k] == moment[:, k : k + 1]), axis=1)
+        counts[:, k] = known[:, k] & ~twice & (counts.sum(axis=1) < NEIGHBOURS)
+    return place, counts
+
+
+def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, apart: int) -> float:
+    """The largest share of a force that acts wherever the signals of one joint are the same."""
+    away = here.away(at, apart) & np.isfinite(mean)
+    shares = [0.0]
+    for view in here.views:
+        distance = np.where(away, np.linalg.norm(view - view[at], axis=1), np.inf)
+        order = np.argsort(distance)[:OTHERS]
+        order = order[distance[order] < VIEW]
+        if order.size > 2:
+            shares.append(float(np.mean(mean[order]) / mean[at]))
+    return max(shares)
+
+
+def disturbances(
+    found: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"], bar: float = LEVEL
+) -> tuple[Intervention, ...]:
+    """External disturbances in the missing force, in the order of recordings and times.
+
+    The geometric mean of two numbers is at least `bar` standard deviations: the size of the force, and its difference
+    from the force on neighbours in state space at other moments.  `least`: smallest size for each joint [N m, or N].
+    """
+    known = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
+    force = np.where(known[..., None], found.force, np.nan)
+    force[:, 0] = np.nan  # no reading before it fixes the start
+    here, apart = places(found._replace(valid=known), names, dt), max(1, round(APART / dt))
+    if not here.seq.size:
+        return ()
+    place, counts = neighbours(here, apart)
+    lengths = list(dict.fromkeys(max(3, round(w / dt)) for w in WIDTHS))
+    windows = [window_mean(force, rows) for rows in lengths]
+    out: list[Intervention] = []
+    for j in range(force.shape[-1]):
+        means = [b.mean[here.seq, here.row, j] for b in windows]
+        stds = [b.std[here.seq, here.row, j] for b in windows]
+        sure = np.stack([_sure(m, s, here, place, counts) for m, s in zip(means, stds, strict=True)])
+        sure = np.where(np.abs(np.stack(means)) >= least[j], sure, 0.0) / np.where(counts.any(axis=1), 1.0, ALONE)
+        while sure.max() >= bar:
+            k, at = np.unravel_index(sure.argmax(), sure.shape)
+            i, row, size, std = int(here.seq[at]), int(here.row[at]), float(means[k][at]), float(stds[k][at])
+            first, last = _extent(windows[0].mean[i, :, j], row, math.copysign(1.0, size))
+            beside = np.maximum(min(first, row) - here.row, here.row - max(last, row))
+            reach = np.asarray(lengths)[:, None] // 2  # of a window: those beside it average the same push
+            sure = np.where((here.seq == i) & (beside[None] <= reach), 0.0, sure)
+            clock = float(found.t[i, first]), float(found.t[i, last])
+            touch = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
+            again = any(overlap(touch, other) for other in out)
+            if not again and repeated(means[k], here, int(at), apart) < REPEATED:
+                out.append(touch)
+    return tuple(sorted((t for t in out if not any(_again(t, other, apart) for other in out)), key=in_order))
+
+
+def _again(touch: Intervention, other: Intervention, apart: int) -> bool:
+    """True if another push on the same joint is so near that both are a swing of the machine."""
+    if (touch.sequence, touch.joint) != (other.sequence, other.joint) or touch is other:
+        return False
+    return max(touch.first - other.last, other.first - touch.last) < apart
+
+
+def in_order(touch: Intervention) -> tuple[int, int, int]:
+    """Key of a sort by recording, then time, then joint."""
+    return touch.sequence, touch.first, touch.joint
+
+
+def _sure(mean, std, here: Places, place, counts) -> Float[np.ndarray, " place"]:
+    """Geometric mean of the size of every window and its difference from its neighbours [standard deviations]."""
+    total = np.where(counts & np.isfinite(mean[place]), mean[place], 0.0).sum(axis=1)
+    nearby = total / np.maximum(counts.sum(axis=1), 1)
+    new = mean - nearby
+    table = np.full((here.seq.max() + 1, here.row.max() + 1), np.nan)
+    table[here.seq, here.row] = new
+    product = mean / std * new / level(table)[here.seq, 0]
+    small = (np.abs(nearby) > REPEATED * np.abs(mean)) & (nearby * mean > 0)
+    return np.where(small, 0.0, np.sqrt(np.maximum(np.nan_to_num(product), 0.0)))
+
+
+def _extent(mean: Float[np.ndarray, " time"], row: int, sign: float) -> tuple[int, int]:
+    """First and last row about `row` at which the force is more than a share of its peak."""
+    small = ~(sign * mean > EDGE * sign * mean[row])
+    before, after = np.flatnonzero(small[:row]), np.flatnonzero(small[row:])
+    return int(before[-1] + 1) if before.size else 0, int(row + max(after[0] - 1, 0)) if after.size else mean.size - 1
+
+
+def interventions(fitted: Identified, data: Dataset, bar: float = LEVEL) -> tuple[Intervention, ...]:
+    """External disturbances in `data`, by the smoother of the fit; none where a coordinate is not measured.
+
+    A hidden joint answers whatever pushes the others, so that the pushes cannot be located there.
+    """
+    rig, system = fitted.rig, fitted.model.system
+    if not set(system.coordinates) <= set(rig.measured):
+        return ()
+    least = SMALL * measure_scales(rig, system, data).torque
+    return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least, bar)
+
+
+def overlap(a: Intervention, b: Intervention) -> bool:
+    """True if two disturbances of one joint share a row."""
+    return (a.sequence, a.joint) == (b.sequence, b.joint) and a.first <= b.last and b.first <= a.last

@@ -11,13 +11,22 @@ export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint docs matrix clean
+# Types and documentation side by side; what each says stays together.
+MAKEFLAGS += --jobs=2 --output-sync
+
+.PHONY: demo test check lint docs matrix clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
 
 test: lint docs
 	$(BIN)/pytest $(PYTEST_FLAGS)
+
+# Before each commit: lint, types and the tests that compile no large program.
+check: .venv/.test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright & types=$$!; $(BIN)/pytest $(PYTEST_FLAGS) -q -m "not slow and not large" && wait $$types
 
 lint: .venv/.test
 	$(BIN)/ruff check

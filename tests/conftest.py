@@ -1,3 +1,4 @@
+import gc
 import os
 import signal
 from pathlib import Path
@@ -14,6 +15,8 @@ import pytest
 from costs import Costs
 
 ROOT = Path(__file__).resolve().parents[1]
+
+gc.set_threshold(50_000, 20, 50)  # tracing makes many objects, and few of them are litter
 
 # a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -35,7 +38,7 @@ def _programs():
     yield
     from nnap_em.numerics.programs import let_go
 
-    let_go(20_000)
+    let_go(35_000)
 
 
 @pytest.fixture(scope="session")

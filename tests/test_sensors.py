@@ -382,5 +382,5 @@ def test_friction_of_a_joint_without_encoder_is_told_by_an_inertial_sensor_at_th
     data, x = recorded(machine(2, imu=True), JOINTS[:2], 0)
     data = Dataset(*(part[:4, :200] for part in data))
     with optimised():
-        fitted = identify(declared(tmp_path, 2, imu=True), data, key=jax.random.key(0))
+        fitted = identify(declared(tmp_path, 2, imu=True), data, key=jax.random.key(0), epochs=12)
     assert max(errors(fitted.model.unknown, friction(JOINTS[:2]), x[:4, :200])) < 0.08

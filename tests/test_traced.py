@@ -12,7 +12,7 @@ import pytest
 from shell import ENVIRONMENT, ROOT
 
 from nnap_em.em.loop import e_step
-from nnap_em.model.simulate import paper_model, paper_sweep, sweep_experiment
+from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics import parallel, traced
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
 from nnap_em.smoother.start import StartBank
@@ -34,9 +34,9 @@ def _kept(shelf: Shelf) -> set[str]:
 
 @pytest.fixture(scope="module")
 def work():
-    """A model with a learned friction map, and logs of it."""
-    model = paper_model()
-    return model, sweep_experiment(model, paper_sweep, 3, 40, key=jax.random.key(0)).data
+    """A model and logs of it."""
+    model, sweep = examples["slide"]()
+    return model, sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data
 
 
 def _smoothed(work, smoother, monkeypatch):
@@ -47,7 +47,7 @@ def _smoothed(work, smoother, monkeypatch):
 
 
 def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(shelf, work, monkeypatch):
-    smoother, calls = CubatureSmoother(StartBank((1, 3, 1, 1))), []
+    smoother, calls = CubatureSmoother(StartBank((1, 3))), []
     plain = e_step(work[0], work[1], smoother, key=jax.random.key(0))
     first = _smoothed(work, smoother, monkeypatch)
     assert len(_kept(shelf)) == 1
@@ -63,7 +63,7 @@ def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
 
 @pytest.mark.parametrize("other", ["smoother", "constant", "shape", "type"])
 def test_what_decides_a_program_makes_another(shelf, work, monkeypatch, other):
-    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1))), work
+    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
     _smoothed(work, smoother, monkeypatch)
     if other == "smoother":
         smoother = CubatureSmoother(smoother.bank)
@@ -81,7 +81,7 @@ def test_what_decides_a_program_makes_another(shelf, work, monkeypatch, other):
 
 
 def test_other_numbers_are_no_other_program(shelf, work, monkeypatch):
-    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1))), work
+    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
     first = _smoothed(work, smoother, monkeypatch)
     heavier = dataclasses.replace(model, log_q=model.log_q + 1.0)
     second = _smoothed((heavier, data), smoother, monkeypatch)
@@ -90,7 +90,7 @@ def test_other_numbers_are_no_other_program(shelf, work, monkeypatch):
 
 
 def test_another_text_of_the_package_makes_another(shelf, work, monkeypatch):
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     _smoothed(work, smoother, monkeypatch)
     monkeypatch.setattr(traced, "_surroundings", lambda: b"after an edit")
     _smoothed(work, smoother, monkeypatch)
@@ -136,7 +136,7 @@ def test_a_closure_is_told_by_nothing():
 
 
 def test_what_is_damaged_is_made_anew(shelf, work, monkeypatch):
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     first = _smoothed(work, smoother, monkeypatch)
     (name,) = _kept(shelf)
     whole = (shelf.folder / name).read_bytes()
@@ -150,7 +150,7 @@ def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(traced._Kept, "shelf", Shelf(tmp_path / "file"))
     monkeypatch.setattr(traced._Kept, "ready", {})
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1, 1, 1)))
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     assert np.isfinite(np.asarray(_smoothed(work, smoother, monkeypatch).state.mean)).all()
 
 
@@ -167,7 +167,7 @@ import json, sys
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from nnap_em.em.loop import e_step
-from nnap_em.model.simulate import paper_model, paper_sweep, sweep_experiment
+from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics import parallel, profile, traced
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.start import StartBank
@@ -175,10 +175,10 @@ from nnap_em.storage.shelf import Shelf
 from pathlib import Path
 traced.keep_on(Shelf(Path(sys.argv[1])))
 parallel.use_every_device()
-model = paper_model()
-data = sweep_experiment(model, paper_sweep, 3, 40, key=jax.random.key(0)).data
+model, sweep = examples["slide"]()
+data = sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data
 with profile.profiling() as told:
-    found = e_step(model, data, CubatureSmoother(StartBank((1, 3, 1, 1))), key=jax.random.key(0))
+    found = e_step(model, data, CubatureSmoother(StartBank((1, 3))), key=jax.random.key(0))
 spent = told.spent["each_smooth"]
 print(json.dumps([jax.device_count(), sum(spent["trace"]), float(np.sum(np.asarray(found.state.mean) ** 2))]))
 """

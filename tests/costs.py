@@ -41,6 +41,8 @@ SECONDS = {
     "test_mstep.py": 17,
     "test_scale.py": 17,
     "test_plots.py": 14,
+    "test_inputs.py": 13,
+    "test_store.py": 10,
 }
 """Processor time of the files that take more than ten seconds where nothing is compiled yet [s].
 

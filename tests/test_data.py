@@ -187,6 +187,7 @@ def _reads_without_a_word(path: Path) -> None:
     assert np.isfinite(test.data.y[test.data.valid]).all()
 
 
+@pytest.mark.slow
 def test_every_shared_log_is_read_without_a_word(shared):
     paths = [path for path in sorted((shared / "data").glob("*/*/rig.toml")) if path.parent.name not in MASKED]
     assert len(paths) > 10
@@ -194,6 +195,7 @@ def test_every_shared_log_is_read_without_a_word(shared):
         _reads_without_a_word(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=pytest.mark.xfail(raises=DataWarning, reason=why)) for name, why in MASKED.items()],

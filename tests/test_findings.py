@@ -126,7 +126,9 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     )
     assert verdict([], None, 3, (), [suspect]).startswith("No effect is certain to be missing. Suspected: motor gain")
     assert "certain" not in verdict([], None) and not suspected(_closed(ARM))
-    assert any("motor gain at joint 2" in text and "record" in text for text in advice([], [], (), [suspect]))
+    first, second, *_ = advice([], [], (), [suspect])
+    assert "record as many different motions" in first
+    assert second == f"To see a motor gain at joint 2 by itself: {catalogue['motor_gain'].confirm}"
 
 
 @pytest.mark.slow

@@ -218,6 +218,7 @@ class SuspectReport(NamedTuple):
     """Share of the squared prediction error that it would remove [0 to 1]."""
     chance: float
     """Largest such share of any law whose columns are shifted in time [0 to 1]."""
+    law: str
     description: str
     confirm: str
     """An experiment that would show it."""
@@ -230,10 +231,11 @@ def suspected(closed: Closed) -> list[SuspectReport]:
         name, joint, channel, inputs = each.key
         text = (
             f"{words(each.key)} would remove {each.share:.0%} of the squared prediction error, "
-            f"where chance removes up to {each.chance:.0%}"
+            f"where chance removes {f'up to {each.chance:.0%}' if each.chance >= 0.005 else 'less than 1%'}"
         )
-        law = catalogue[name]
-        out.append(SuspectReport(law.key(), joint, channel, list(inputs), each.share, each.chance, text, law.confirm))
+        place = catalogue[name].key(), joint, channel, list(inputs)
+        report = SuspectReport(*place, each.share, each.chance, words(each.key), text, catalogue[name].confirm)
+        out.append(report)
     return out
 
 
@@ -250,7 +252,8 @@ def advice(
 ) -> list[str]:
     """Sentences on the next measurement."""
     out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
-    out += [f"Suspected: {each.description}. {MORE} {each.confirm}".strip() for each in suspects]
+    out += [MORE] if suspects else []
+    out += [f"To see a {each.law} by itself: {each.confirm}" for each in suspects if each.confirm]
     out += [f"{told.description}: look at what is different there." for told in disputed]
     for finding in found:
         if finding.effect.confirm:
@@ -264,7 +267,7 @@ def advice(
     return out
 
 
-MORE = "To be sure, record as many different motions again and diagnose all together."
+MORE = "To be sure of a suspect, record as many different motions again and diagnose all together."
 """Advice for every suspect: what three recordings of a real arm left open, eleven decided."""
 
 

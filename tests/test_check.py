@@ -63,7 +63,8 @@ def test_a_good_data_set_is_all_ok(slide):
 
 UPRIGHT = """
 <mujoco>
-  <worldbody><body name="column"><joint name="pan" axis="0 0 1"/><inertial pos="0 0 0" mass="4" diaginertia=".02 .02 .02"/>
+  <worldbody><body name="column"><joint name="pan" axis="0 0 1"/>
+    <inertial pos="0 0 0" mass="4" diaginertia=".02 .02 .02"/>
     <body name="roll" pos="0 0 .3"><joint name="shoulder" axis="0 1 0"/>
       <inertial pos="0 0 .1" mass="3" diaginertia=".02 .02 .02"/>
       <body name="upper" pos="0 0 .3"><joint name="twist" axis="0 0 1"/>

@@ -80,7 +80,7 @@ def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, 
 
 
 def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.ndarray, " time"] | None) -> bool:
-    """Whether equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
+    """True where equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
 
     The noise of a column that hardly ever repeats a reading tells as well: `noisy`, without readings at a limit.
     """
@@ -100,7 +100,7 @@ def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
 
 
 def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """Whether the readings right before and right after the run are noise, as elsewhere: no creep, no steps.
+    """True where the readings right before and right after the run are noise, as elsewhere: no creep, no steps.
 
     A value that is held again there is that of an encoder between two steps.
     """
@@ -162,7 +162,7 @@ def _quantum(y: Float[np.ndarray, " time"]) -> float:
 
 
 def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> bool:
-    """Whether it went beyond its limit: by the other column, or by the motion before and after.
+    """True where it went beyond its limit: by the other column, or by the motion before and after.
 
     A rate denies what the motion of its coordinate says: a machine at a stop comes and goes as fast.
     """

@@ -35,7 +35,7 @@ class Part(NamedTuple):
         return self.joints is None and not self.locked
 
     def holds(self, joint: str) -> bool:
-        """Whether a joint is held, at a value or where the file has it."""
+        """True for a joint that is held, at a value or where the file has it."""
         return joint in self.locked or (self.joints is not None and joint not in self.joints)
 
 
@@ -422,7 +422,7 @@ def _closed(model: Any, held: list[bool]) -> Iterator[list[str]]:
 
 
 def _still(model: Any, tendon: int, held: list[bool]) -> bool:
-    """Whether a tendon runs over joints alone, and all are held."""
+    """True for a tendon that runs over joints alone, all of them held."""
     first, count, kind = (
         int(model.tendon_adr[tendon]),
         int(model.tendon_num[tendon]),
@@ -433,7 +433,7 @@ def _still(model: Any, tendon: int, held: list[bool]) -> bool:
 
 
 def _moves(model: Any, actuator: int, held: list[bool]) -> bool:
-    """Whether an actuator drives something that moves."""
+    """True for an actuator that drives something that moves."""
     kinds, acts, end = _mujoco().mjtTrn, int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
     if acts in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
         return not held[end]

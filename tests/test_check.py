@@ -12,10 +12,11 @@ import pytest
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
-from nnap_em.data.rig import Declared, Rig, RigError
-from nnap_em.em.build import build_system
-from nnap_em.em.check import check, gramian
+from nnap_em.data.rig import Declared, Rig, RigError, read_rig
+from nnap_em.em.build import build_system, measure_scales
+from nnap_em.em.check import Finding, check, gramian, torques
 from nnap_em.model.simulate import examples, sweep_experiment
+from nnap_em.systems import specs
 from nnap_em.systems.acrobot import table_i
 
 ROWS, COUNT = 201, 6
@@ -58,6 +59,49 @@ def test_a_good_data_set_is_all_ok(slide):
     assert list(found) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
     assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in found["length"][0][1]
     assert "2 of 2 directions" in found["states"][0][1]
+
+
+UPRIGHT = """
+<mujoco>
+  <worldbody><body name="column"><joint name="pan" axis="0 0 1"/>
+    <inertial pos="0 0 0" mass="4" diaginertia=".02 .02 .02"/>
+    <body name="roll" pos="0 0 .3"><joint name="shoulder" axis="0 1 0"/>
+      <inertial pos="0 0 .1" mass="3" diaginertia=".02 .02 .02"/>
+      <body name="upper" pos="0 0 .3"><joint name="twist" axis="0 0 1"/>
+        <inertial pos="0 0 0" mass="2" diaginertia="1e-4 1e-4 1e-4"/>
+        <body name="lower"><joint name="elbow" axis="0 1 0"/>
+          <inertial pos="0 0 .4" mass="2" diaginertia="1e-4 1e-4 1e-4"/></body></body></body></body></worldbody>
+  <actuator><motor name="tau" joint="twist"/></actuator>
+</mujoco>
+"""
+"""Its joint `twist` bears nothing while the arm is upright; with shoulder and elbow at a quarter turn and half a turn
+of its own between them, 2 kg act .4 m off its axis: 7.8 N m."""
+
+
+def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
+    """In the unit of the file all is well, a thousand times too large is not, and with loads at zero neither was."""
+    (tmp_path / "arm.xml").write_text(UPRIGHT)
+    (tmp_path / "rig.toml").write_text(
+        'format = 1\nname = "arm"\n[model]\ntype = "mjcf"\nfile = "arm.xml"\nfriction = "unknown"\n'
+        '[sampling]\ndt = 0.1\ninput_hold = "zero-order"\nclock = "sequence"\n'
+        '[measurement]\ncolumns = ["pan", "shoulder", "twist", "elbow"]\n'
+    )
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    t = 0.1 * np.arange(ROWS)
+    way = 0.5 * (1 - np.cos(0.1 * np.pi * t))  # so slowly that inertia asks for nothing
+    y = np.stack([0 * t, np.pi / 2 * way, np.pi / 2 * way, np.pi / 2 * way], axis=1)
+    system = build_system(rig)
+    bias = np.asarray(jax.vmap(lambda q: system.bias(q, jnp.zeros(4)))(jnp.asarray(y)))
+    assert np.abs(bias[0, 2]) < 1e-9
+    assert np.max(np.abs(bias[:, 2])) == pytest.approx(2 * 9.81 * 0.4, rel=1e-3)
+
+    def torque(factor: float) -> Finding:
+        data = Dataset(t[None], factor * bias[None, :, 2:3], y[None], np.ones((1, ROWS), bool))
+        return next(f for f in torques(rig, system, data, measure_scales(rig, system, data)) if f.subject == "torque")
+
+    assert torque(1.0).mark == "ok"
+    assert re.search(r"up to 7.8\d N m, gravity and inertia of joint 3 ask for 7.[89]", torque(1.0).text)
+    assert [torque(1e3).mark, torque(1e-4).mark] == ["bad", "bad"]
 
 
 def test_bodies_that_make_no_machine_are_bad_and_nothing_else_is_tried():

@@ -17,7 +17,7 @@ from nnap_em.data.logs import DataWarning, Logs
 from nnap_em.data.lost import retell
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
-from nnap_em.data.spikes import spikes
+from nnap_em.data.spikes import noise, spikes
 from nnap_em.em.check import check
 
 DT, ROWS = 0.01, 501
@@ -85,6 +85,63 @@ def test_an_impact_is_no_spike(level):
         assert _found({"theta1": angle + noise["theta1"], "dtheta1": rate + noise["dtheta1"]}) == {}
     held = np.clip(np.arange(ROWS) - 200.0, 0.0, 60.0)
     assert _found({"x": held}) == {}
+
+
+def _resampled(way: np.ndarray, step: float, part: float = 0.37) -> np.ndarray:
+    """An encoder of coarse steps on the clock of a log that lies between two of its own samples, with eight digits."""
+    held = step * np.round(way / step)
+    return np.array([float(f"{value:.8g}") for value in part * held[:-1] + (1 - part) * held[1:]])
+
+
+@pytest.mark.parametrize("step", [1.5e-3, 0.01])
+def test_the_turning_points_of_a_coarse_encoder_are_no_limit(step):
+    """Half of these 24 were saturated when a straight line told the way on; cut off, all but some are."""
+    angles = [_motion(seed, 0.0)["theta1"] for seed in range(24)]
+    assert [_found({"theta1": _resampled(y, step)}) for y in angles] == [{}] * 24
+    cut = [_resampled(np.minimum(y, np.percentile(y, 90)), step) for y in angles]
+    found = [("saturated", "theta1") in _found({"theta1": y}) for y in cut]
+    assert sum(found) >= 22
+
+
+def _ease(x: np.ndarray) -> np.ndarray:
+    """From 0 to 1 at constant acceleration, then at constant deceleration."""
+    x = np.clip(x, 0.0, 1.0)
+    return np.where(x < 0.5, 2 * x**2, 1 - 2 * (1 - x) ** 2)
+
+
+def test_a_pause_at_the_end_of_the_way_is_no_limit():
+    """It slows down before and speeds up after; at a limit it comes and goes as fast."""
+    t = DT * np.arange(ROWS)
+    for seed in range(10):
+        length, pause = np.random.default_rng(seed).uniform((0.5, 0.05), (1.5, 0.3))
+        way = _ease((t - 0.5) / length) - _ease((t - 0.5 - length - pause) / length)
+        assert _found({"x": way}) == {}
+        moving = way[50 : int(100 * (0.5 + 2 * length + pause))]
+        ((what, rows),) = _found({"x": np.minimum(moving, 0.9)}).items()
+        assert what == ("saturated", "x")
+        assert rows == set(np.flatnonzero(moving >= 0.9).tolist())
+
+
+def test_a_joint_that_stands_still_is_not_stuck():
+    """It sways by a step of its encoder meanwhile, and the log was resampled: seeds 8 and 11 raised alarms."""
+    t = 0.008 * np.arange(626)
+    starts = np.clip([t / 1.5, (t - 2.2) / 1.5, t - 4], 0.0, 1.0)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        way = [0.3, 0.3, -0.4] @ (starts**3 * (10 - 15 * starts + 6 * starts**2))
+        way += 3.6e-6 * np.sin(2 * np.pi * rng.uniform(2, 6) * t + rng.uniform(0, 6))
+        assert _found({"q": _resampled(way, 4e-6, rng.uniform(0.05, 0.95))}) == {}
+
+
+def test_standing_still_tells_no_noise():
+    """Of a column that stands most of the time, the noise is that of the rest; it was 0, and all rows were tried."""
+    moving = _motion(0, 1.0)["theta1"]
+    assert noise(np.append(np.full(900, moving[0]), moving)) == pytest.approx(noise(moving), rel=0.02)
+    still = 1.5e-3 * np.round(np.append(np.zeros(1200), 0.03 * np.sin(0.05 * np.arange(60))) / 1.5e-3)
+    spoilt = still.copy()
+    spoilt[[100, 500, 900]] += 0.05
+    assert noise(spoilt) == pytest.approx(noise(still))  # what moves is too little beside the spikes
+    assert spikes(spoilt).tolist() == [100, 500, 900]
 
 
 RIGS = {

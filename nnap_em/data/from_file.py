@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Sense, of_body, packed, states
-from .mjcf import read_machine
+from .mjcf import Part, read_machine
 from .rig import Declared, RigWarning, SystemSpec, Told, flat, nearest
 
 OF_JOINT = ("armature", "stiffness")
@@ -18,22 +18,39 @@ _UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is no
 def declare(root: Any) -> Told:
     """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
     model = root.table("model")
-    model.check(("type", "friction"), ("file", "uncertain"))
+    model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
     if not isinstance(model.items.get("file"), str) or not model.items["file"]:
         model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
-    machine = read_machine(root.path.parent / str(model.items["file"]))
+    part = _part(model)
+    machine = read_machine(root.path.parent / str(model.items["file"]), part)
     possible = tuple(sense.name for sense in machine.senses if sense.kind in SENSE_UNITS)
     machine = machine._replace(
         file=str(model.items["file"]),
         states=_states(machine, root),
         rubs=model.items.get("friction") == "none",
         senses=tuple(_senses(machine, root)),
+        part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
     _say_left_out(root, machine)
     columns, joints, gears, motored = _inputs(machine, root)
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model))
     return Told(spec, parameters, columns, joints, packed(machine._replace(gears=gears, motored=motored)))
+
+
+def _part(model: Any) -> Part:
+    """The joints of `[model] joints`, and the values of `[model] locked`."""
+    joints = model.items.get("joints")
+    if joints is not None:
+        if not (isinstance(joints, list) and joints and all(type(name) is str for name in joints)):
+            model.refuse("joints", mend='write the names of the joints that move, joints = ["joint1", "joint2"]')
+        joints = tuple(dict.fromkeys(joints))
+    locked = model.table("locked", absent={})
+    for name in locked.items:
+        locked.number(name)
+        if joints and name in joints:
+            locked.refuse(name, "it is among the joints that move", "take it out of one of the two")
+    return Part(joints, {name: locked.number(name) for name in locked.items})
 
 
 def _say_left_out(root: Any, machine: Machine) -> None:

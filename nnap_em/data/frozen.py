@@ -1,6 +1,6 @@
 """Equal readings that are none: of a sensor that is stuck, starts late, or is at the end of its range.
 
-Another column or a jump contradicts a stuck sensor; a trend goes on beyond a limit.
+Another column or a jump contradicts a stuck sensor; its motion goes on beyond a limit.
 """
 
 import math
@@ -16,6 +16,11 @@ from .spikes import LONGEST, noise
 
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
+_SIDE = 10  # rows before and after a run that tell its motion: fewer tell little beside noise, more are no parabola
+_AHEAD = 3  # rows that a parabola through `_SIDE` rows is trusted beyond its end
+_SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
+_SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
+_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise .2 % of the runs have as many
 
 
 class Run(NamedTuple):
@@ -49,8 +54,9 @@ def frozen(
     if full.any():
         yield FULL, np.flatnonzero(full)
     lively = bool(np.sum((lengths > 1) & (lengths < STILL) & ~full[first]) <= 0.002 * y.size)
+    noisy = np.where(full, np.nan, y) if lively else None
     for run in (every[i] for i in np.flatnonzero((lengths >= max(STILL, 3 * usual)) & ~full[first])):
-        if _stuck(name, readings, run, dt, lively):
+        if _stuck(name, readings, run, dt, noisy):
             late = run.first == np.flatnonzero(np.isfinite(y))[0]
             yield "late start" if late else "stuck", np.arange(run.first + (not late), run.end)
 
@@ -73,16 +79,15 @@ def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, 
     return out
 
 
-def _stuck(name: str, readings: Columns, run: Run, dt: float, lively: bool) -> bool:
-    """Whether equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
+def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.ndarray, " time"] | None) -> bool:
+    """True where equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
 
-    A `lively` column hardly ever repeats a reading: its noise tells as well.
+    The noise of a column that hardly ever repeats a reading tells as well: `noisy`, without readings at a limit.
     """
-    y = readings[name]
     away = _travel(name, readings, run, dt)
     if away is not None:
-        return float(np.max(np.abs(away), initial=0.0)) > 1.0 or _jumps(y, run)
-    return _jumps(y, run) or (lively and _alive(y, run))
+        return float(np.max(np.abs(away), initial=0.0)) > 1.0 or _jumps(readings[name], run)
+    return _jumps(readings[name], run) or (noisy is not None and _alive(noisy, run))
 
 
 def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
@@ -95,12 +100,24 @@ def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
 
 
 def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """Whether the readings right before and right after the run are noise, as elsewhere: no creep, no steps."""
+    """True where the readings right before and right after the run are noise, as elsewhere: no creep, no steps.
+
+    A value that is held again there is that of an encoder between two steps.
+    """
+    usual = noise(y)
+    around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
+    if np.sum(around < _SAME * usual) >= _REPEATS:
+        return False
     sides = [part[np.isfinite(part)][:10] for part in (y[: run.first][::-1], y[run.end :])]
     sides = [side for side in sides if side.size >= 8]
     bend, turn = (np.array([np.std(np.diff(side, n)) for side in sides]) for n in (2, 3))
-    least = max(noise(y) / 3, 3 * _quantum(y))
+    least = max(usual / 3, 3 * _quantum(y))
     return len(sides) > 0 and bool(np.all((bend > least) & (turn > bend)))
+
+
+def _steps(side: Float[np.ndarray, " row"]) -> Float[np.ndarray, " step"]:
+    """Sizes of the first steps of a side."""
+    return np.abs(np.diff(side[np.isfinite(side)][: _SIDE + 1]))
 
 
 def _partner(name: str, readings: Columns) -> str | None:
@@ -130,30 +147,52 @@ def _travel(name: str, readings: Columns, run: Run, dt: float) -> Float[np.ndarr
 
 
 def _quantum(y: Float[np.ndarray, " time"]) -> float:
-    """The smallest step of a signal."""
+    """The step of the sensor: the smallest of the column, or the usual one between values that are held in turn.
+
+    A log that was resampled or filtered has steps as small as its digits; the sensor's are between its plateaus.
+    """
     step = np.abs(np.diff(y))
     least = float(np.min(step, where=step > 0, initial=math.inf))
-    return least if math.isfinite(least) else 0.0
+    plateaus = [run for run in runs(y) if run.length >= 3]
+    near = [(a, b) for a, b in pairwise(plateaus) if b.first - a.end <= 3]
+    steps = np.array([abs(y[b.first] - y[a.first]) for a, b in near])
+    steps = steps[steps > 0]
+    usual = float(np.median(steps)) if steps.size >= 3 else 0.0
+    return max(least, usual) if math.isfinite(least) else 0.0
 
 
 def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> bool:
-    """Whether it went beyond its limit: by the other column, or by the trends before and after.
+    """True where it went beyond its limit: by the other column, or by the motion before and after.
 
-    A rate denies what the trends of its coordinate say: a machine at a stop comes and goes as fast.
+    A rate denies what the motion of its coordinate says: a machine at a stop comes and goes as fast.
     """
     y = readings[name]
-    before, after = y[max(run.first - 6, 0) : run.first], y[run.end : run.end + 6]
-    if np.isfinite(before).sum() < 4 or np.isfinite(after).sum() < 4:
+    before, after = y[max(run.first - _SIDE, 0) : run.first], y[run.end : run.end + _SIDE]
+    if np.isfinite(before).sum() < 5 or np.isfinite(after).sum() < 5:
         return False
     away = _travel(name, readings, run, dt)
     if away is not None and (float(np.max(sign * away)) > 1.0 or _partner(name, readings) == f"d{name}"):
         return float(np.max(sign * away)) > 1.0
-    reach = min(run.length / 2, 3.0)
-    slopes = np.array([_slope(before), -_slope(after)])
-    return bool(np.all(sign * slopes * reach > 4 * noise(y) + 4 * _quantum(y)))
+    rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
+    spread, coarse = noise(y), 4 * _quantum(y)
+    for side in (before, after[::-1]):
+        there, doubt = _ahead(side, rows, spread)
+        if np.all(sign * (there - y[run.first]) <= _SURE * doubt + coarse):
+            return False
+    return True
 
 
-def _slope(y: Float[np.ndarray, " row"]) -> float:
-    """Change per row of a straight line through the readings."""
-    k = np.flatnonzero(np.isfinite(y))
-    return float(np.polyfit(k, y[k], 1)[0])
+def _ahead(
+    side: Float[np.ndarray, " row"], rows: Int[np.ndarray, " ahead"], spread: float
+) -> tuple[Float[np.ndarray, " ahead"], Float[np.ndarray, " ahead"]]:
+    """The parabola through a side, some rows beyond its last one, and its standard deviation there.
+
+    A parabola slows down towards a turning point, as a machine does; a straight line would go on.
+    """
+    k = np.flatnonzero(np.isfinite(side))
+    base = np.vander(k - (side.size - 1.0), 3)
+    solve = np.linalg.pinv(base)
+    left = side[k] - base @ (solve @ side[k])
+    spread = max(spread, math.sqrt(left @ left / (k.size - 3)))
+    weights = np.vander(rows.astype(float), 3) @ solve
+    return weights @ side[k], spread * np.maximum(np.sqrt(np.sum(weights**2, axis=1)), 1.0)

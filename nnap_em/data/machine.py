@@ -133,6 +133,8 @@ class Machine(NamedTuple):
     """True where friction of the file acts, because none is learned."""
     senses: tuple[Sense, ...] = ()
     """Of a file all, of a rig those that are measured."""
+    part: tuple[tuple[str, ...] | None, tuple[tuple[str, float], ...]] | None = None
+    """The joints that rig.toml names, and those that it holds with their values; None where all of the file move."""
 
 
 def packed(machine: Machine) -> str:

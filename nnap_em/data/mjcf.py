@@ -1,15 +1,18 @@
 """A machine from MJCF or URDF: MuJoCo's compiler reads the file, what the physics here has no place for is refused."""
 
 import re
+import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from types import MappingProxyType
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
+from .locked import NOTHING, groups, lock
 from .machine import SENSE_UNITS, Body, Gauge, Joint, Machine, Motor, Rotation, Sense, Spot, Vector
-from .rig import RigError
+from .rig import RigError, RigWarning, nearest
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
 
@@ -18,23 +21,51 @@ class MachineError(RigError):
     """A machine file that cannot be used: the message names the file, what stands in the way, and the mend."""
 
 
-def read_machine(path: Path) -> Machine:
-    """The tree of bodies and joints of an MJCF or URDF file, in SI units.
+class Part(NamedTuple):
+    """The joints of a file that move, and the values at which others are held."""
 
+    joints: tuple[str, ...] | None = None
+    """The joints that move; none given: all that are not held."""
+    locked: Mapping[str, float] = MappingProxyType({})
+    """Values of joints that are held [rad or m]."""
+
+    @property
+    def whole(self) -> bool:
+        """True where every joint of the file moves."""
+        return self.joints is None and not self.locked
+
+    def holds(self, joint: str) -> bool:
+        """True for a joint that is held, at a value or where the file has it."""
+        return joint in self.locked or (self.joints is not None and joint not in self.joints)
+
+
+_WHOLE = Part()
+
+
+def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
+    """The tree of bodies and joints of an MJCF or URDF file, or a part of it, in SI units.
+
+    Joints that are held without a value stand where the file has them, or where the joint that they follow says.
     Raises MachineError at what has no place in a model of a tree with a fixed base.
     """
     root = _parse(path)
-    model = _compiled(path, root)
-    _refuse_all(path, model)
+    follows = _mimics(root) if root.tag == "robot" else {}
+    model = _compiled(path, root, part)
+    _refuse_unknown(path, model, part)
+    _refuse_all(path, model, part)
     bodies = _bodies(model)
-    joints = tuple(_joint(model, j) for j in range(model.njnt))
+    numbers = [j for j in range(model.njnt) if int(model.jnt_type[j]) in (_SLIDE, _HINGE)]
+    joints = tuple(_joint(model, j) for j in numbers)
+    driven = [motor for motor in _motors(model, part) if motor.joint in numbers]
     machine = Machine(
         file=path.name,
         gravity=_vector(model.opt.gravity * (model.opt.disableflags & _flag("mjDSBL_GRAVITY") == 0)),
         bodies=bodies,
         joints=joints,
-        motors=tuple(_motors(model)),
-        gauges=tuple(_gauges(model)),
+        motors=tuple(motor._replace(joint=numbers.index(motor.joint)) for motor in driven),
+        gauges=tuple(
+            gauge._replace(joint=numbers.index(gauge.joint)) for gauge in _gauges(model) if gauge.joint in numbers
+        ),
         spots=tuple(
             Spot(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
             for i in range(model.nsite)
@@ -42,8 +73,53 @@ def read_machine(path: Path) -> Machine:
         ),
         senses=tuple(_senses(model)),
     )
+    if not part.whole:
+        joined = range(len(bodies)) if root.tag == "robot" else {int(i) - 1 for i in model.jnt_bodyid}
+        machine = _part(path, machine, part, {**follows, **_couplings(model)}, joined)
     _refuse_names(path, machine)
     return machine
+
+
+def _part(
+    path: Path, machine: Machine, part: Part, follows: Mapping[str, "Follows"], joined: Collection[int]
+) -> Machine:
+    """The machine with its other joints held; warns of bodies without mass that join another."""
+    values = {joint.name: part.locked.get(joint.name, joint.zero) for joint in machine.joints if part.holds(joint.name)}
+    for _ in follows:  # a joint may follow one that follows another
+        for name, law in follows.items():
+            if name in values and law.joint in values and name not in part.locked:
+                values[name] = law.value(values[law.joint])
+    for joint in machine.joints:
+        body = machine.bodies[joint.body]
+        if joint.name in values and (body.mass <= NOTHING or np.trace(body.inertia) <= 10 * NOTHING):
+            found = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
+            warnings.warn(f"{path}: {found}; it is joined to the body that carries it", RigWarning, 2)
+    machine = lock(machine, values, joined)
+    group = groups(machine, {joint.body for joint in machine.joints}.__contains__)
+    for i in sorted({joint.body for joint in machine.joints}):
+        whole = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
+        if sum(body.mass for body in whole) <= NOTHING:
+            joint = next(joint.name for joint in machine.joints if joint.body == i)
+            mend = f"give it an <inertial>, or hold its joint: {_line(joint)}"
+            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", mend)
+    return machine
+
+
+def _line(*joints: str) -> str:
+    """The line of rig.toml that holds joints."""
+    return f"[model] locked = {{ {', '.join(f'{joint} = 0.0' for joint in joints)} }}"
+
+
+def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
+    """Joints of rig.toml that the file does not have."""
+    names = [model.joint(j).name for j in range(model.njnt)]
+    for key, wanted in (("joints", part.joints or ()), ("locked", part.locked)):
+        for name in wanted:
+            if name not in names:
+                refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
+    for j, name in enumerate(names):
+        if name in part.locked and int(model.jnt_type[j]) not in (_SLIDE, _HINGE):
+            refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
 def refuse(path: Path, found: str, mend: str) -> NoReturn:
@@ -78,21 +154,31 @@ def _parse(path: Path) -> ET.Element:
     return root
 
 
-def _compiled(path: Path, root: ET.Element) -> Any:
+def _build(spec: Any, part: Part) -> Any:
+    """MuJoCo's model of a file; that of a part may have bodies without mass, on joints that are held."""
+    if not part.whole:
+        spec.compiler.boundmass = max(spec.compiler.boundmass, 0.1 * NOTHING)
+        spec.compiler.boundinertia = max(spec.compiler.boundinertia, 0.1 * NOTHING)
+        spec.compiler.fusestatic = False
+    return spec.compile()
+
+
+def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
     """MuJoCo's model; where only meshes or textures are missing, without the shapes of bodies that have an inertial."""
     mujoco = _mujoco()
+    if root.tag == "robot":
+        _refuse_urdf(path, root, part)
     try:
         if root.tag == "robot":
-            _refuse_urdf(path, root)
-            return mujoco.MjModel.from_xml_string(_bare_urdf(root))
-        return mujoco.MjModel.from_xml_path(str(path))
+            return _build(mujoco.MjSpec.from_string(_bare_urdf(root)), part)
+        return _build(mujoco.MjSpec.from_file(str(path)), part)
     except ValueError as error:
         said = " ".join(str(error).split())
     if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", said, re.I):
         whole = _included(path, root)
         _strip(path, whole)
         try:
-            return mujoco.MjModel.from_xml_string(ET.tostring(whole, encoding="unicode"))
+            return _build(mujoco.MjSpec.from_string(ET.tostring(whole, encoding="unicode")), part)
         except ValueError as error:
             said = " ".join(str(error).split())
     refuse(path, f"MuJoCo's compiler refuses it: {said}", _mend(said))
@@ -115,7 +201,43 @@ def _mend(said: str) -> str:
 # --- files whose meshes are elsewhere
 
 
-def _refuse_urdf(path: Path, root: ET.Element) -> None:
+class Follows(NamedTuple):
+    """The joint that another follows, and the coefficients of the polynomial by which it does."""
+
+    joint: str
+    law: tuple[float, ...]
+    zero: float = 0.0
+    """Coordinate of the follower at which the polynomial counts from 0, and that of the leader."""
+    of: float = 0.0
+
+    def value(self, leader: float) -> float:
+        """Coordinate of the follower."""
+        return self.zero + sum(c * (leader - self.of) ** k for k, c in enumerate(self.law))
+
+
+def _mimics(root: ET.Element) -> dict[str, Follows]:
+    """The joints of a URDF file that mimic another."""
+    out = {}
+    for joint in root.findall("joint"):
+        if (mimic := joint.find("mimic")) is not None:
+            law = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
+            out[str(joint.get("name"))] = Follows(str(mimic.get("joint")), law)
+    return out
+
+
+def _couplings(model: Any) -> dict[str, Follows]:
+    """The joints of an MJCF file that an equality constraint couples to another."""
+    kind, out = int(_mujoco().mjtEq.mjEQ_JOINT), {}
+    for i in range(model.neq):
+        first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        if int(model.eq_type[i]) == kind and second >= 0:
+            zeros = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second))
+            law = tuple(float(c) for c in model.eq_data[i][:5])
+            out[model.joint(first).name] = Follows(model.joint(second).name, law, *zeros)
+    return out
+
+
+def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
     """What MuJoCo would say in its own words, or not at all."""
     links = {str(link.get("name")): link for link in root.findall("link")}
     parents: dict[str, str] = {}
@@ -128,11 +250,16 @@ def _refuse_urdf(path: Path, root: ET.Element) -> None:
         if child in parents:
             refuse(path, f"link {child!r} hangs on two joints", "a machine here is a tree: cut the loop at one of them")
         parents[child] = parent
-        if kind in ("floating", "planar"):
+        held = part.holds(str(name))
+        if kind == "planar" or (kind == "floating" and not held):
             refuse(path, f"joint {name!r} is {kind}", "fix the base, or model the joint as slides and hinges")
-        if joint.find("mimic") is not None:
-            refuse(path, f"joint {name!r} mimics another", "free it of the other: couplings are no tree")
-        if kind != "fixed" and links[child].find("inertial") is None and not _carries(child, root):
+        if (mimic := joint.find("mimic")) is not None:
+            leader = str(mimic.get("joint"))
+            if not (held and part.holds(leader)):
+                mend = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
+                refuse(path, f"joint {name!r} mimics another", mend)
+            joint.remove(mimic)
+        if kind != "fixed" and not held and links[child].find("inertial") is None and not _carries(child, root):
             mend = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
             refuse(path, f"link {child!r} moves and has no <inertial>", mend)
     if parents and not set(links) - set(parents):
@@ -222,14 +349,17 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
 # --- what has no place here
 
 
-def _refuse_all(path: Path, model: Any) -> None:
-    for found, mend in _obstacles(model):
+def _refuse_all(path: Path, model: Any, part: Part) -> None:
+    for found, mend in _obstacles(model, part):
         refuse(path, found, mend)
 
 
-def _obstacles(model: Any) -> Iterator[tuple[str, str]]:
+def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
     """What stands in the way, by name, with the mend."""
+    held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
     for j in range(model.njnt):
+        if held[j]:
+            continue
         name, kind = model.joint(j).name or f"number {j + 1}", int(model.jnt_type[j])
         if kind == _FREE:
             yield f"joint {name!r} is free", "the base is fixed here: take the free joint out"
@@ -239,12 +369,19 @@ def _obstacles(model: Any) -> Iterator[tuple[str, str]]:
             yield f"the spring of joint {name!r} is not linear", "leave the linear part; diagnose finds what is missing"
     if model.njnt == 0:
         yield "nothing moves: it has no joint", "give the bodies hinges or slides"
-    if model.neq:
-        yield f"it has {model.neq} equality constraints", "a loop or coupling is no tree: take <equality> out"
-    if model.ntendon:
-        yield f"it has {model.ntendon} tendons", "put their springs and motors on joints, and take <tendon> out"
+    elif all(held):
+        yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
+    if closed := list(_closed(model, held)):
+        lines = list(dict.fromkeys(name for names in closed for name in names))
+        mend = "a loop or coupling is no tree: take <equality> out"
+        mend += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
+        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), mend
+    loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
+    if loose:
+        yield f"it has {len(loose)} tendons", "put their springs and motors on joints, and take <tendon> out"
     for i in range(model.nu):
-        yield from _actuator(model, i)
+        if _moves(model, i, held):
+            yield from _actuator(model, i)
     if model.opt.density or model.opt.viscosity:
         yield "bodies move in a fluid", "set density and viscosity to 0; diagnose finds drag"
     if np.any(model.body_gravcomp):
@@ -252,6 +389,55 @@ def _obstacles(model: Any) -> Iterator[tuple[str, str]]:
         yield f"body {name!r} has gravcomp", "log the torque that compensates its weight as an input, and take it out"
     if getattr(model, "nflex", 0):
         yield "it has flexible bodies", "bodies are rigid here: take them out"
+
+
+def _closed(model: Any, held: list[bool]) -> Iterator[list[str]]:
+    """The joints that move of each equality constraint that is not between parts that are held against each other."""
+    mujoco = _mujoco()
+    parents = [int(model.body_parentid[i]) for i in range(model.nbody)]
+    moving = [
+        [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) == i and not held[j]] for i in range(model.nbody)
+    ]
+
+    def above(body: int) -> set[int]:
+        joints: set[int] = set()
+        while body > 0:
+            joints |= set(moving[body])
+            body = parents[body]
+        return joints
+
+    for i in range(model.neq):
+        kind, ends = int(model.eq_type[i]), (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
+        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+            free = {j for j in ends if j >= 0 and not held[j]}
+        elif kind in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
+            sites = int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE)
+            one, two = (int(model.site_bodyid[end]) if sites else end for end in ends)
+            free = above(one) ^ above(two)
+        else:
+            yield []
+            continue
+        if free:
+            yield [model.joint(j).name for j in sorted(free)]
+
+
+def _still(model: Any, tendon: int, held: list[bool]) -> bool:
+    """True for a tendon that runs over joints alone, all of them held."""
+    first, count, kind = (
+        int(model.tendon_adr[tendon]),
+        int(model.tendon_num[tendon]),
+        int(_mujoco().mjtWrap.mjWRAP_JOINT),
+    )
+    wraps = range(first, first + count)
+    return all(int(model.wrap_type[k]) == kind and held[int(model.wrap_objid[k])] for k in wraps)
+
+
+def _moves(model: Any, actuator: int, held: list[bool]) -> bool:
+    """True for an actuator that drives something that moves."""
+    kinds, acts, end = _mujoco().mjtTrn, int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
+    if acts in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
+        return not held[end]
+    return not (acts == int(kinds.mjTRN_TENDON) and _still(model, end, held))
 
 
 def _any(model: Any, field: str, i: int) -> bool:
@@ -335,8 +521,11 @@ def _joint(model: Any, j: int) -> Joint:
     )
 
 
-def _motors(model: Any) -> Iterator[Motor]:
+def _motors(model: Any, part: Part) -> Iterator[Motor]:
+    held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
     for i in range(model.nu):
+        if not _moves(model, i, held):
+            continue
         gain = float(model.actuator_gainprm[i][0]) * float(model.actuator_gear[i][0])
         yield Motor(model.actuator(i).name or f"u{i + 1}", int(model.actuator_trnid[i][0]), gain)
 

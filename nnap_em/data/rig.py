@@ -175,7 +175,7 @@ def write_rig(rig: Rig, path: Path) -> None:
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
     told = [f"{key} = {value}    # {rig.unit(key)}" for key, value in parameters.items()]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
-    lines += [f"file = {toml_text(unpacked(rig.machine).file)}"] if rig.machine else told
+    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else told
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
     lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
@@ -193,6 +193,14 @@ def write_rig(rig: Rig, path: Path) -> None:
     lines += [f"{name} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
     lines += _limits(rig.limits)
     replace_text(path, "\n".join(lines) + "\n")
+
+
+def _part(rig: Rig) -> list[str]:
+    """The joints of the file that move, and those that are held."""
+    joints, locked = unpacked(rig.machine).part or (None, ())
+    lines = [f"joints = [{', '.join(map(toml_text, joints))}]    # those that move"] if joints else []
+    values = ", ".join(f"{toml_text(name)} = {value!r}" for name, value in locked)
+    return [*lines, f"locked = {{ {values} }}    # rad or m"] if locked else lines
 
 
 def toml_text(text: str) -> str:

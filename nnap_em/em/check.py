@@ -17,7 +17,7 @@ from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .build import LAG, NO_MACHINE, Scales, loads, measure_scales, reading_noise
+from .build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
 from .felt import felt, sentences
 from .identify import begin
 from .scale import untold
@@ -26,6 +26,8 @@ from .stops import at_stops
 OK, LOOK, BAD = "ok", "look", "bad"
 SEQUENCES, SECONDS = 6, 1.0
 """How much is smoothed with the first model: a wrong one loses a hidden joint later on."""
+POSES = 256
+"""Rows of the logs, evenly over them, in which the loads of joints are taken."""
 _WIDTH = 1.0  # s, of the readings that must tell the state
 
 
@@ -170,7 +172,7 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[Finding]
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[Finding]:
     """The inputs against gravity and inertia of the declared bodies."""
-    mass, gravity = loads(system)
+    mass, gravity = _loads_along(rig, system, data)
     needed = gravity + mass * scales.acceleration
     inputs = np.moveaxis(np.asarray(data.u), -1, 0)
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
@@ -193,6 +195,32 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
             f"kept as declared is {told}, and all else is relative to that"
         )
         yield Finding(_mark(True, False), "scale", text)
+
+
+def _loads_along(
+    rig: Rig, system: AbstractSystem, data: Dataset
+) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Mean inertia and largest gravity of every joint in the poses of the logs [kg m^2 and N m, or kg and N].
+
+    A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
+    """
+    y, valid = np.asarray(data.y), np.asarray(data.valid)
+    read = [(i, rig.measured.index(name)) for i, name in enumerate(system.coordinates) if name in rig.measured]
+    seen = y[..., [column for _, column in read]][valid]
+    seen = seen[np.isfinite(seen).all(axis=1)]
+    seen = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else np.zeros((POSES, len(read)))
+    turn = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.coordinates)))
+    q = np.where(system.angles, turn, 0.0)
+    q[:, [joint for joint, _ in read]] = seen
+    mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
+    return np.mean(mass, axis=0), np.percentile(np.abs(gravity), 99, axis=0)
+
+
+@eqx.filter_jit
+def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, Array]:
+    """Inertia and gravity of every joint in some poses."""
+    still = jnp.zeros(q.shape[1])
+    return jax.vmap(lambda q: (jnp.diag(system.mass(q)), system.bias(q, still)))(q)
 
 
 def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[Finding]:

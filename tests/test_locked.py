@@ -1,0 +1,249 @@
+"""A part of a machine file: joints that are held, against MuJoCo's own model of the whole with those joints held."""
+
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from machines import arm
+
+from nnap_em.data.mjcf import MachineError, Part, read_machine
+from nnap_em.data.rig import RigError, RigWarning, read_rig, write_rig
+from nnap_em.em.build import build_system
+from nnap_em.systems import specs
+
+ROOT = Path(__file__).resolve().parents[1]
+
+GRIPPER = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="base" pos="0 0 .2"><joint name="yaw" axis="0 0 1"/>
+      <inertial pos=".02 0 .1" mass="2" diaginertia=".02 .03 .01"/>
+      <body name="link" pos=".1 0 .3" euler=".3 -.2 .5"><joint name="elbow" axis="0 1 .2" pos="0 .02 .01" ref=".1"/>
+        <inertial pos=".1 .02 0" mass="1.2" fullinertia=".01 .02 .015 .001 .002 -.001"/>
+        <body name="hand" pos=".3 0 0" quat=".8 .2 -.1 .3">
+          <joint name="slide" type="slide" axis="1 1 0"/><joint name="wrist" axis="1 0 .3" pos=".01 0 0"/>
+          <joint name="tool" axis="0 1 0" pos="0 0 .03"/>
+          <inertial pos="0 .01 .03" mass=".5" diaginertia=".002 .001 .001"/>
+          <body name="left" pos="0 .02 .05"><joint name="finger1" type="slide" axis="0 1 0"/>
+            <inertial pos="0 0 .02" mass=".1" diaginertia="1e-4 1e-4 1e-4"/></body>
+          <body name="right" pos="0 -.02 .05"><joint name="finger2" type="slide" axis="0 -1 0"/>
+            <inertial pos="0 0 .02" mass=".1" diaginertia="1e-4 1e-4 1e-4"/><site name="tip" pos="0 .01 .04"/></body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="split"><joint joint="finger1" coef=".5"/><joint joint="finger2" coef=".5"/></fixed></tendon>
+  <equality><joint joint1="finger2" joint2="finger1" polycoef=".001 1 0 0 0"/></equality>
+  <actuator><motor name="t1" joint="yaw" gear="2"/><position name="grip" tendon="split" kp="10"/>
+    <motor name="t2" joint="wrist" gear="3"/></actuator>
+</mujoco>
+"""
+"""Fingers that follow each other, driven by a servo over a tendon; a hand with three joints."""
+
+URDF = """
+<robot name="gripper">
+  <link name="base"/>
+  <link name="arm"><inertial><origin xyz=".1 0 .02" rpy=".1 .2 .3"/><mass value="1.5"/>
+    <inertia ixx=".01" iyy=".02" izz=".015" ixy=".001" ixz="0" iyz=".002"/></inertial></link>
+  <link name="hand"><inertial><origin xyz=".02 0 0"/><mass value=".4"/>
+    <inertia ixx=".001" iyy=".001" izz=".002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="flange"/>
+  <link name="left"><inertial><origin xyz="0 .01 0"/><mass value=".1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="right"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+    <origin xyz="0 0 .3" rpy=".2 0 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="wrist" type="continuous"><parent link="arm"/><child link="flange"/><axis xyz="1 0 0"/>
+    <origin xyz=".3 0 0" rpy="0 .4 0"/></joint>
+  <joint name="mount" type="fixed"><parent link="flange"/><child link="hand"/><origin xyz=".05 0 0"/></joint>
+  <joint name="finger1" type="prismatic"><parent link="hand"/><child link="left"/><axis xyz="0 1 0"/>
+    <origin xyz=".05 .01 0" rpy="0 0 .3"/><limit lower="0" upper=".04" effort="1" velocity="1"/></joint>
+  <joint name="finger2" type="prismatic"><parent link="hand"/><child link="right"/><axis xyz="0 -1 0"/>
+    <origin xyz=".05 -.01 0"/><limit lower="0" upper=".04" effort="1" velocity="1"/>
+    <mimic joint="finger1" multiplier="1.5" offset=".002"/></joint>
+</robot>
+"""
+"""A finger of no weight that mimics the other."""
+
+
+def _rig(folder: Path, machine: str, model: str, name: str = "machine.xml", measured: str = "") -> Path:
+    (folder / name).write_text(machine)
+    (folder / "rig.toml").write_text(
+        f'format = 1\nname = "part"\n[model]\ntype = "mjcf"\nfile = "{name}"\nfriction = "unknown"\n{model}\n'
+        "[input]\ncolumns = []\njoints = []\n"
+        '[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n'
+        f'[measurement]\ncolumns = ["{measured}"]\n'
+    )
+    return folder / "rig.toml"
+
+
+def _whole(machine: str) -> mujoco.MjModel:
+    """MuJoCo's model with every joint; what mimics is free, and a finger without weight weighs 1e-14 kg."""
+    bound = '<compiler boundmass="1e-14" boundinertia="1e-14" fusestatic="false"'
+    text = re.sub(r"<mimic[^>]*/>", "", machine)
+    text = text.replace('<robot name="gripper">', f'<robot name="gripper"><mujoco>{bound}/></mujoco>')
+    return mujoco.MjModel.from_xml_string(text)
+
+
+CASES = {
+    "a chain, two joints in the middle": (
+        arm(5),
+        "locked = { joint2 = 0.7, joint4 = -1.1 }",
+        {"joint2": 0.7, "joint4": -1.1},
+    ),
+    "a chain, its base and its end": (
+        arm(4),
+        'joints = ["joint2", "joint3"]\nlocked = { joint4 = 0.4 }',
+        {"joint1": 0.0, "joint4": 0.4},
+    ),
+    "a tree": (
+        (ROOT / "tests/machines/branch.xml").read_text(),
+        "locked = { left = -0.6, trunk_x = 0.2 }",
+        {"left": -0.6, "trunk_x": 0.2},
+    ),
+    "a gripper": (GRIPPER, "locked = { finger1 = 0.02, finger2 = 0.021 }", {"finger1": 0.02, "finger2": 0.021}),
+    "a gripper that follows": (
+        GRIPPER,
+        'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }',
+        {"finger1": 0.02, "finger2": 0.021, "elbow": 0.1, "slide": 0.0, "tool": 0.0},
+    ),
+    "a hand held between and behind": (
+        GRIPPER,
+        "locked = { finger1 = 0.0, finger2 = 0.0, tool = 0.9, slide = 0.05 }",
+        {"finger1": 0.0, "finger2": 0.0, "tool": 0.9, "slide": 0.05},
+    ),
+    "a hand turned about its middle joint": (
+        GRIPPER,
+        "locked = { finger1 = 0.0, finger2 = 0.0, wrist = 0.9, elbow = 0.0 }",
+        {"finger1": 0.0, "finger2": 0.0, "wrist": 0.9, "elbow": 0.0},
+    ),
+    "a URDF gripper that mimics": (
+        URDF,
+        'joints = ["shoulder", "wrist"]\nlocked = { finger1 = 0.02 }',
+        {"finger1": 0.02, "finger2": 0.032},
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*has no mass:nnap_em.data.rig.RigWarning")
+@pytest.mark.filterwarnings("ignore:.*are left out, as friction is learned:nnap_em.data.rig.RigWarning")
+@pytest.mark.parametrize(("machine", "line", "held"), CASES.values(), ids=CASES)
+def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, held, tmp_path):
+    model = _whole(machine)
+    names = [model.joint(j).name for j in range(model.njnt)]
+    free = [j for j, name in enumerate(names) if name not in held]
+    system = build_system(read_rig(_rig(tmp_path, machine, line, measured=names[free[0]]), specs))
+    assert system.coordinates == tuple(names[j] for j in free)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[free] = rng.uniform(-3.0, 3.0, model.nv), rng.uniform(-3.0, 3.0, len(free))
+        data.qpos[[names.index(name) for name in held]] = list(held.values())
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
+        q, v = jnp.asarray(data.qpos[free]), jnp.asarray(data.qvel[free])
+        np.testing.assert_allclose(system.mass(q), mass[np.ix_(free, free)], atol=1e-10, rtol=1e-10)
+        bias = (data.qfrc_bias - data.qfrc_spring)[free]
+        np.testing.assert_allclose(system.bias(q, v), bias, atol=1e-10, rtol=1e-10)
+
+
+def test_motors_and_sites_of_a_part_are_those_of_the_file(tmp_path):
+    """A motor of a joint that is held goes; a site of a body that joins another stands where it stood."""
+    (tmp_path / "gripper.xml").write_text(GRIPPER)
+    part = Part(("yaw", "wrist"), {"finger1": 0.02})
+    machine = read_machine(tmp_path / "gripper.xml", part)
+    assert [(motor.name, motor.joint, motor.gear) for motor in machine.motors] == [("t1", 0, 2.0), ("t2", 1, 3.0)]
+    assert [body.name for body in machine.bodies] == ["base", "hand"]
+    assert sum(body.mass for body in machine.bodies) == pytest.approx(3.9, rel=1e-12)
+    (tip,) = machine.spots
+    model = _whole(GRIPPER)
+    data = mujoco.MjData(model)
+    data.qpos[[model.joint("finger1").id, model.joint("finger2").id]] = 0.02, 0.021
+    mujoco.mj_kinematics(model, data)
+    hand = model.body("hand").id
+    way = data.xmat[hand].reshape(3, 3).T @ (data.site_xpos[0] - data.xpos[hand])
+    assert machine.bodies[tip.body].name == "hand"
+    np.testing.assert_allclose(tip.place, way, atol=1e-12)
+
+
+def test_a_loop_that_held_joints_close_is_no_obstacle(tmp_path):
+    """A connection of two bodies that hold still against each other."""
+    loop = GRIPPER.replace("</equality>", '<connect body1="left" body2="right" anchor="0 0 0"/></equality>')
+    (tmp_path / "loop.xml").write_text(loop)
+    part = Part(None, {"finger1": 0.0, "finger2": 0.001})
+    assert [joint.name for joint in read_machine(tmp_path / "loop.xml", part).joints][-1] == "tool"
+    open_loop = GRIPPER.replace("</equality>", '<connect body1="link" body2="right" anchor="0 0 0"/></equality>')
+    (tmp_path / "loop.xml").write_text(open_loop)
+    said = (
+        r"1 equality constraints on joints that move; .* \[model\] locked = \{ slide = 0.0, wrist = 0.0, tool = 0.0 \}"
+    )
+    with pytest.raises(MachineError, match=said):
+        read_machine(tmp_path / "loop.xml", part)
+
+
+@pytest.mark.filterwarnings("ignore:.*are left out, as friction is learned:nnap_em.data.rig.RigWarning")
+def test_a_free_base_that_is_held_is_no_joint(tmp_path):
+    """The same machine as without its free joint: the base stands where the file has it."""
+    free = GRIPPER.replace('<joint name="yaw" axis="0 0 1"/>', "<freejoint/>")
+    fixed = GRIPPER.replace('<joint name="yaw" axis="0 0 1"/>', "").replace("<motor", "<!--<motor", 1)
+    fixed = fixed.replace('gear="2"/>', 'gear="2"/>-->')
+    machines = []
+    for text in (free.replace('<motor name="t1" joint="yaw" gear="2"/>', ""), fixed):
+        (tmp_path / "m.xml").write_text(text)
+        machines.append(read_machine(tmp_path / "m.xml", Part(("elbow", "wrist"))))
+    held, without = machines
+    assert held.joints == tuple(joint._replace(body=joint.body - 1) for joint in without.joints)
+    assert held.motors == without.motors
+    assert held.bodies[0].place == pytest.approx((0.1, 0.0, 0.5))  # the base joined the world, its place with it
+    assert held.bodies[0].mass == without.bodies[1].mass
+
+
+def test_a_link_without_mass_joins_the_one_that_carries_it(tmp_path):
+    path = _rig(tmp_path, URDF, "locked = { finger1 = 0.01, finger2 = 0.01 }", "g.urdf", "wrist")
+    with pytest.warns(RigWarning, match=r"body 'right' hangs on the locked joint 'finger2' and has no mass"):
+        read_rig(path, specs)
+
+
+BAD = {
+    "an unknown joint is held": (GRIPPER, "locked = { elbo = 0.0 }", r"locked names 'elbo', .*did you mean 'elbow'"),
+    "an unknown joint moves": (GRIPPER, 'joints = ["yow"]', r"joints names 'yow', .*did you mean 'yaw'"),
+    "a coupling stays": (GRIPPER, "locked = { finger2 = 0.0 }", r"equality .* \[model\] locked = \{ finger1 = 0.0 \}"),
+    "a coupling of the whole": (GRIPPER, "", r"equality .* \[model\] locked = \{ finger1 = 0.0, finger2 = 0.0 \}"),
+    "a mimic stays": (
+        URDF,
+        "locked = { finger2 = 0.0 }",
+        r"'finger2' mimics .* locked = \{ finger1 = 0.0, finger2 = 0.0 \}",
+    ),
+    "both": (
+        GRIPPER,
+        'joints = ["yaw"]\nlocked = { yaw = 0.0 }',
+        r"\[model.locked\] yaw: it is among the joints that move",
+    ),
+    "no number": (GRIPPER, 'locked = { yaw = "up" }', r"\[model.locked\] yaw: found 'up'; write a finite number"),
+    "no names": (GRIPPER, "joints = []", r"\[model\] joints: found \[\]; write the names of the joints that move"),
+    "nothing moves": (arm(1), "locked = { joint1 = 0.0 }", "every joint is held; leave some out"),
+    "no mass moves": (
+        re.sub("<mimic[^>]*/>", "", URDF).replace('mass value=".1"', 'mass value="0"'),
+        'joints = ["shoulder", "finger1"]',
+        r"body 'left' moves and has no mass; .* locked = \{ finger1 = 0.0 \}",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore::nnap_em.data.rig.RigWarning")
+@pytest.mark.parametrize(("machine", "line", "said"), BAD.values(), ids=BAD)
+def test_what_cannot_be_held_is_refused_with_the_line_to_add(machine, line, said, tmp_path):
+    with pytest.raises(RigError, match=said):
+        read_rig(_rig(tmp_path, machine, line, measured="yaw"), specs)
+
+
+def test_a_written_rig_holds_the_same_joints(tmp_path):
+    path = _rig(tmp_path, GRIPPER, 'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }', measured="yaw")
+    rig = read_rig(path, specs)
+    write_rig(rig, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == rig

@@ -14,7 +14,8 @@ from ..data.formats import read_table
 from ..data.machine import unpacked
 from ..em.identify import Identified, friction_table, nodes_between, parameter_table
 from ..em.store import model_file, read
-from ..model.law import PARAMETERS, UNITS, fit_law
+from ..model.friction import FrictionNetwork
+from ..model.law import CALLED, UNITS, fit_law
 from .findings import covariance, estimates
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, words
@@ -239,14 +240,15 @@ def _visited(fitted: Identified, file: Path | None) -> tuple[Float[np.ndarray, "
         if len(rows) == dof:
             load = [row["load"] or [np.nan, np.nan] for row in rows]
             return np.asarray([row["velocity"] for row in rows], float), np.asarray(load, float)
-    if not fitted.rig.friction:
+    network = fitted.model.unknown
+    if not isinstance(network, FrictionNetwork):
         return unknown, unknown
     ending = {"before": "_before", "after": "_after"}.get(file.stem, "") if file else ""
     if file is not None and (table := file.with_name(f"friction{ending}.csv")).exists():
         joint, velocity = read_table(table, ("joint", "velocity")).T
         ends = [velocity[joint == j] for j in range(1, dof + 1)]
         return np.asarray([[v.min(), v.max()] for v in ends]), unknown
-    speed = np.asarray(fitted.model.unknown.speed)
+    speed = np.asarray(network.speed)
     return np.stack([-speed, speed], axis=1), unknown
 
 
@@ -311,11 +313,11 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
 def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) -> tuple[Number, ...]:
     """Stribeck numbers of one joint, their p-values corrected among each other."""
     found = fit_law(velocity, torque, cov)
-    value, std = np.full((2, count, len(PARAMETERS)), np.nan)
+    value, std = np.full((2, count, len(CALLED)), np.nan)
     value[list(places)], std[list(places)] = found.value, found.std
     rows = [
         number(name, unit, value[:, i], std[:, i])
-        for i, (name, unit) in enumerate(zip(PARAMETERS, UNITS[angle], strict=True))
+        for i, (name, unit) in enumerate(zip(CALLED, UNITS[angle], strict=True))
     ]
     tests = corrected_tests([row.test for row in rows if row.test is not None])
     return tuple(row._replace(test=test) for row, test in zip(rows, tests, strict=True))

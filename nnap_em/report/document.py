@@ -51,7 +51,7 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
 
 
 def visited(fitted: Identified, velocity: Float[np.ndarray, "sample dof"], train: Logs) -> list[dict[str, Any]]:
-    """Ranges that hold 99 of 100 rows, for every joint: of its velocity, and of the torque of its drive, if it has one."""
+    """Range of velocity of every joint, and of the torque of its drive if it has one, that holds 99 of 100 rows."""
     system, u = fitted.model.system, np.asarray(train.data.u)[np.asarray(train.data.valid)]
     load = {joint: gear * u[:, i] for i, (joint, gear) in enumerate(zip(system.joints, system.gears, strict=True))}
     ends = lambda values: np.percentile(values, INNER).tolist()  # noqa: E731

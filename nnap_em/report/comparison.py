@@ -181,6 +181,6 @@ def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _picture(comparison: Comparison, curve: Curve) -> Picture:
-    caption = "With 90 % bands, on the velocities that all fits visited; dashed: the pooled curve."
+    caption = "With 90 % bands, on the velocities that all fits visited; below, the same minus the pooled curve."
     title = f"{curve.name[0].upper()}{curve.name[1:]}"
     return picture("found", title, caption, comparison_figure(comparison, curve))

@@ -149,9 +149,7 @@ class Comparison(NamedTuple):
             told += [f"the {curve.name}{parts}"] * curve.changed
         told += [number.name for number in self.numbers if number.changed]
         rest = tests - len(told)
-        others = (
-            f"{rest} other quantit{'y' if rest == 1 else 'ies'} did not" if rest else "no other quantity was tested"
-        )
+        others = f"{_counted(rest, 'other ')} did not" if rest else "no other quantity was tested"
         text = f"{listed(told)} changed {between}; {others}."
         return text[0].upper() + text[1:]
 
@@ -159,8 +157,8 @@ class Comparison(NamedTuple):
         return "\n  ".join(["Comparison", self.verdict, *self.differences, *self.warnings])
 
 
-def _counted(quantities: int) -> str:
-    return f"{quantities} quantity" if quantities == 1 else f"{quantities} quantities"
+def _counted(quantities: int, kind: str = "") -> str:
+    return f"{quantities} {kind}{'quantity' if quantities == 1 else 'quantities'}"
 
 
 def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Comparison:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .design.experiment import Design, design_experiment
     from .design.limits import DesignError
+    from .diagnose.compare import CompareError, Comparison, compare
     from .diagnose.findings import findings
     from .diagnose.loop import close_the_loop
     from .diagnose.outcome import Closed
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 __all__ = [
     "AbstractSystem",
     "Closed",
+    "CompareError",
+    "Comparison",
     "DataError",
     "DataWarning",
     "Dataset",
@@ -64,6 +67,7 @@ __all__ = [
     "all_devices",
     "check",
     "close_the_loop",
+    "compare",
     "design_experiment",
     "examples",
     "export",
@@ -94,6 +98,7 @@ _homes = {
     "data.logs": ("DataWarning", "Logs", "read_logs"),
     "design.experiment": ("Design", "design_experiment"),
     "design.limits": ("DesignError",),
+    "diagnose.compare": ("CompareError", "Comparison", "compare"),
     "diagnose.findings": ("findings",),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),

@@ -87,7 +87,7 @@ def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys, time
 from nnap_em.commands import cli
-for command in ("", "simulate", "init", "check", "identify", "diagnose", "predict", "smooth", "export"):
+for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])
     except SystemExit as stop:
@@ -194,6 +194,10 @@ def test_identify_writes_whole_results(bench, fit):
     np.testing.assert_allclose(reading["std"], 1e-3, rtol=0.2)
     assert set(report["noise"]["process_per_step"]) == {"x", "dx"}
     assert report["friction_law"][0]["joint"] == 1
+    pushes = np.concatenate([_read(bench / "train" / name)["u"] for name in _files(bench / "train")])
+    curve, visited = _read(fit / "friction.csv"), report["visited"][0]
+    np.testing.assert_allclose(visited["velocity"], curve["velocity"][[0, -1]], rtol=1e-9)
+    np.testing.assert_allclose(visited["load"], np.percentile(pushes, [0.5, 99.5]), rtol=1e-6)
     assert report["versions"]["jax"] == jax.__version__
     assert report["verdict"] == f"Fitted the friction of 1 joint to 4 sequences in {EPOCHS} epochs."
     html = (fit / "report.html").read_text()

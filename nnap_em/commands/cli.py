@@ -25,6 +25,7 @@ examples:
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em design found --out next                   the inputs to play next, so that what is open is answered
+  nnap-em compare monday friday --out changed       what changed between fits of one machine, and what did not
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
   nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
@@ -97,6 +98,17 @@ FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inpu
 (what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
 where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, apart (laws
 that the logs cannot tell apart), or all.
+"""
+_COMPARE = """\
+examples:
+  nnap-em compare monday friday
+  nnap-em compare january february march --out year
+  nnap-em compare unit7/model.npz unit8/model.npz --out units
+
+Each FIT is the output of identify or diagnose for the same machine: other logs, another day, another unit.  Prints
+every estimated number of all fits with its standard deviation, a pooled value, and a p-value: the chance of such a
+difference where nothing changed.  Friction curves are compared on the velocities that all fits visited.  OUT gets
+compare.html (read this one) and compare.json.
 """
 _PREDICT = """\
 examples:
@@ -213,6 +225,10 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
         fits.add_argument("--profile", action="store_true", help="print a table of the programs that were compiled")
+
+    compare = command("compare", "say what changed between fits of one machine", _COMPARE)
+    compare.add_argument("fits", metavar="FIT", nargs="+", type=Path, help="model.npz, or the folder that holds it")
+    compare.add_argument("--out", metavar="OUT", type=Path, help="folder for the page and the numbers")
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)

@@ -19,6 +19,7 @@ from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..design.limits import DesignError
+from ..diagnose.compare import CompareError
 from ..em.build import build_system, measure_scales
 from ..em.check import BAD, torques
 from ..em.loop import FitError
@@ -38,9 +39,8 @@ class Halted(RuntimeError):
     """A file could not be written: the message names it, and says what is kept and how to go on."""
 
 
-MISTAKES = (RigError, DataError, StoreError, FitError, DesignError, ExportError, Halted)
+MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
-MODEL, AFTER = "model.npz", "after.npz"
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
 TRACED = "traced"
@@ -127,13 +127,6 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
         elif finding.subject in ("scale", "range"):
             warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)
-
-
-def model_file(path: Path) -> Path:
-    """The model that is meant by a file, or by the folder of an identification or of a diagnosis."""
-    if not path.is_dir():
-        return path
-    return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
 
 
 def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:

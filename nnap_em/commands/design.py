@@ -13,10 +13,10 @@ from ..design.experiment import design_experiment
 from ..design.limits import DesignError
 from ..design.rivals import Law, open_pairs, rivals
 from ..em.identify import Identified
-from ..em.store import Stored, fingerprint, read
+from ..em.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
 from ..systems import specs
-from .common import Bench, Say, model_file, read_training, resumable
+from .common import Bench, Say, read_training, resumable
 
 
 def run(args: argparse.Namespace, say: Say) -> None:

@@ -2,10 +2,10 @@
 
 import argparse
 
-from ..em.store import load
+from ..em.store import load, model_file
 from ..portable.export import export
 from ..portable.mjcf import write_mjcf
-from .common import Say, model_file
+from .common import Say
 
 
 def run(args: argparse.Namespace, say: Say) -> None:

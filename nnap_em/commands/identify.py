@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from ..data.rig import Rig
 from ..em.identify import MakeSmoother, Watch, identify
 from ..em.loop import EMState
-from ..em.store import fingerprint, save
+from ..em.store import MODEL, fingerprint, save
 from ..report.identification import write_identification
 from .cli import SMOOTHERS
-from .common import MODEL, Say, read_bench, resumable, warn_of_torques
+from .common import Say, read_bench, resumable, warn_of_torques
 
 
 def run(args: argparse.Namespace, say: Say) -> None:

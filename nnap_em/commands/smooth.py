@@ -6,8 +6,8 @@ import numpy as np
 
 from ..data.logs import read_logs
 from ..em.predict import smoothed_states
-from ..em.store import load
-from .common import Say, model_file, write_states
+from ..em.store import load, model_file
+from .common import Say, write_states
 
 
 def run(args: argparse.Namespace, say: Say) -> None:

@@ -169,6 +169,14 @@ def _drawn(weights: Weights, unknown, w, hessian, count: int, key: PRNGKeyArray)
     return (jac @ jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, unit, lower=False)).T
 
 
+def nodes_between(
+    low: Float[np.ndarray, " dof"], high: Float[np.ndarray, " dof"], count: int
+) -> Float[np.ndarray, "dof node"]:
+    """Velocities from `low` to `high` of each joint, dense near rest, where friction bends."""
+    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
+    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), count))).T
+
+
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
     """The learned map at `velocity` [rad/s], its covariance linearised in the weights (Laplace)."""
     weights = fitted.m_step.weights(fitted.model)

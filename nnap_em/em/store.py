@@ -43,6 +43,10 @@ LATER = ("/unsaid", "/m_step/rough")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 
+MODEL, AFTER = "model.npz", "after.npz"
+"""Files of an identification and of a diagnosis."""
+
+
 class Stored(NamedTuple):
     """What a file holds."""
 
@@ -51,6 +55,13 @@ class Stored(NamedTuple):
     """Of the training data; empty if it was not given."""
     notes: dict[str, Any]
     """Whatever the writer wished to keep, as JSON."""
+
+
+def model_file(path: Path) -> Path:
+    """The model that is meant by a file, or by the folder of an identification or of a diagnosis."""
+    if not path.is_dir():
+        return path
+    return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
 
 
 def fingerprint(data: Dataset) -> str:

@@ -39,6 +39,9 @@ class StribeckLaw(eqx.Module):
 PARAMETERS = ("coulomb", "breakaway", "stribeck", "viscous", "smooth", "offset")
 """The five of StribeckLaw, and a constant torque: half the difference of the Coulomb levels of both directions."""
 
+CALLED = ("Coulomb", "breakaway", "Stribeck velocity", "viscous", "sign smoothed over", "constant")
+"""Words for PARAMETERS."""
+
 UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: ("N", "N", "m/s", "N s/m", "m/s", "N")}
 """Units of PARAMETERS, by whether the coordinate is an angle."""
 
@@ -152,11 +155,10 @@ def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> l
 
 
 def _terms(value: Float[np.ndarray, " param"], std: Float[np.ndarray, " param"], units: tuple[str, ...]) -> list[str]:
-    words = ("Coulomb", "breakaway", "Stribeck velocity", "viscous", "sign smoothed over", "constant")
     open_ = (std > value) & (np.asarray(PARAMETERS) != "offset")
     return [
         f"{word} not determined" if o else f"{word} {v:.3g} ± {s:.1g} {unit}"
-        for word, v, s, unit, o in zip(words, value, std, units, open_, strict=True)
+        for word, v, s, unit, o in zip(CALLED, value, std, units, open_, strict=True)
     ]
 
 

@@ -20,7 +20,7 @@ from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.files import replace_text
-from .document import errors, noise, parameters, predictions, shared
+from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
@@ -52,8 +52,9 @@ def write_diagnosis(
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
     lacked = left["after"].without_effects() if found else left["before"]
     told = {name: tests(each, names) for name, each in left.items()}
-    visited = _visited(left["before"], len(names.rates))
-    tables = {n: friction_table(f, jnp.asarray(visited)) for n, f in sides.items() if closed.before.rig.friction}
+    velocities = _velocities(left["before"], len(names.rates))
+    nodes = visited_nodes(velocities)
+    tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if closed.before.rig.friction}
     for name, table in tables.items():
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
     figures = [
@@ -70,7 +71,8 @@ def write_diagnosis(
         "interventions": [_touch(touch, train.files) for touch in closed.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
-        "friction_change": friction_change(closed, visited),
+        "visited": visited(closed.before, velocities, train),
+        "friction_change": friction_change(closed, nodes),
         "tests": {name: [t._asdict() for t in each] for name, each in told.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
@@ -191,7 +193,7 @@ def _place(key: Key) -> dict[str, Any]:
     return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs)}
 
 
-def _visited(found: Residual, dof: int) -> Float[np.ndarray, "dof node"]:
-    """Velocities of each joint that the paths visit, dense near rest."""
+def _velocities(found: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
+    """Velocities on the paths that took part."""
     inside = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
-    return visited_nodes(found.state[inside][:, dof : 2 * dof])
+    return found.state[inside][:, dof : 2 * dof]

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from .. import __version__
 from ..data.logs import Logs
@@ -15,6 +16,7 @@ from ..em.felt import felt, sentences
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
+from .tables import INNER
 
 NO_TEST = "no test sequences (FOLDER/test/*.csv), so no prediction error"
 
@@ -46,6 +48,17 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
     """What no fit and no filter saw of the logs."""
     parts = (("train", train), ("test", test))
     return [{"part": part, **entry._asdict()} for part, logs in parts if logs for entry in logs.masked]
+
+
+def visited(fitted: Identified, velocity: Float[np.ndarray, "sample dof"], train: Logs) -> list[dict[str, Any]]:
+    """Range of velocity of every joint, and of the torque of its drive if it has one, that holds 99 of 100 rows."""
+    system, u = fitted.model.system, np.asarray(train.data.u)[np.asarray(train.data.valid)]
+    load = {joint: gear * u[:, i] for i, (joint, gear) in enumerate(zip(system.joints, system.gears, strict=True))}
+    ends = lambda values: np.percentile(values, INNER).tolist()  # noqa: E731
+    return [
+        {"joint": j, "velocity": ends(velocity[:, j - 1]), "load": ends(load[j]) if j in load else None}
+        for j in range(1, len(system.rates) + 1)
+    ]
 
 
 def parameters(fitted: Identified) -> dict[str, Any]:

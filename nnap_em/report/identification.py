@@ -16,7 +16,7 @@ from ..em.identify import FrictionTable, Identified, friction_table
 from ..em.predict import smooth
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
-from .document import errors, friction_law, noise, parameters, predictions, shared
+from .document import errors, friction_law, noise, parameters, predictions, shared, visited
 from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, page, picture
@@ -39,13 +39,14 @@ def write_identification(
 ) -> None:
     """Write the report of a fit whose model is model.npz in `out`; `began` is `time.perf_counter()` at the start."""
     figures: list[Picture] = []
-    names, laws = names_of(fitted), None
+    names, laws, ranges = names_of(fitted), None, None
     if fitted.rig.friction:
-        visited = _velocities(fitted, train, epochs)
-        table = friction_table(fitted, jnp.asarray(visited_nodes(visited)))
+        velocities = _velocities(fitted, train, epochs)
+        ranges = visited(fitted, velocities, train)
+        table = friction_table(fitted, jnp.asarray(visited_nodes(velocities)))
         laws = friction_law(fitted, table)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
-        figures.append(_draw(out / "friction.png", fitted, table, visited))
+        figures.append(_draw(out / "friction.png", fitted, table, velocities))
     sides = {"fit": fitted}
     error = errors(predictions(sides, test), sides, test) if test else None
     if error:
@@ -62,6 +63,7 @@ def write_identification(
         "log_likelihood": fitted.state.loglik.tolist(),
         "epochs": each,
         "left_out": each[-1]["left_out"],
+        "visited": ranges,
         "smoother": smoother,
         "model": "model.npz",
     }

@@ -10,7 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.formats import write_csv
+from ..em.identify import nodes_between
 from ..storage.files import replace_text
+
+INNER = (0.5, 99.5)
+"""Percentiles of the rows between which a range counts as visited."""
 
 
 def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], str] = str) -> None:
@@ -30,9 +34,8 @@ def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], st
 
 def visited_nodes(velocity: Float[np.ndarray, "sample dof"]) -> Float[np.ndarray, "dof node"]:
     """Velocities from the 0.5th to the 99.5th percentile of each joint, dense near rest, where friction bends."""
-    low, high = np.percentile(velocity, [0.5, 99.5], axis=0)
-    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
-    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), 101))).T
+    low, high = np.percentile(velocity, INNER, axis=0)
+    return nodes_between(low, high, 101)
 
 
 def write_friction(path: Path, velocity, torque, std) -> None:

@@ -1,0 +1,16 @@
+"""nnap-em compare: fits of one machine side by side."""
+
+import argparse
+
+from ..diagnose.compare import compare
+from ..report.comparison import table, write_comparison
+from .common import Say
+
+
+def run(args: argparse.Namespace, say: Say) -> None:
+    """Print the table; write the page where it is asked for."""
+    comparison = compare(*args.fits)
+    print(table(comparison))
+    if args.out is not None:
+        write_comparison(args.out, comparison)
+        say(f"wrote {args.out / 'compare.html'} and compare.json")

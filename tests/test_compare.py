@@ -1,0 +1,335 @@
+"""Fits side by side: a change that was made is named and nothing else, and alarms are as frequent as the level says."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+import pytest
+import scipy.stats
+
+from nnap_em import CompareError, compare
+from nnap_em.commands import cli
+from nnap_em.data.rig import Declared
+from nnap_em.diagnose.compare import CHANGED, LEAST_SHARED, Comparison, corrected_tests, number, shared
+from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.pooling import LEAST_VARIANCE, joint_test, pool
+from nnap_em.effects.base import one
+from nnap_em.effects.friction import LoadFriction
+from nnap_em.em.identify import Identified, identify
+from nnap_em.em.store import save
+from nnap_em.model.simulate import declared, examples, sweep_experiment
+from nnap_em.report.comparison import describe, rows, table
+
+SEQUENCES, STEPS, EPOCHS = 8, 150, 9
+GROWN = 0.15
+"""Share by which the Coulomb friction grew."""
+
+
+class Fits(NamedTuple):
+    """Folders of fits."""
+
+    first: Path
+    """One half of a data set."""
+    second: Path
+    """The other half."""
+    grown: Path
+    """Of the same slide when its Coulomb friction had grown."""
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory) -> Fits:
+    """A slide whose mass is known to 10 %, fitted three times."""
+    root, (truth, sweep) = tmp_path_factory.mktemp("compare"), examples["slide"]()
+    rig = dataclasses.replace(declared("slide", truth), parameters={"m": Declared(1.0, 0.1)})
+    more = GROWN * truth.unknown.coulomb
+    levels = truth.unknown.coulomb + more, truth.unknown.breakaway + more
+    grown = eqx.tree_at(lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, levels)
+    whole = sweep_experiment(truth, sweep, 2 * SEQUENCES, STEPS, key=jax.random.key(0)).data
+    later = sweep_experiment(grown, sweep, SEQUENCES, STEPS, key=jax.random.key(1)).data
+    parts = {
+        "first": (whole, slice(SEQUENCES)),
+        "second": (whole, slice(SEQUENCES, None)),
+        "grown": (later, slice(None)),
+    }
+    for i, (name, (data, cut)) in enumerate(parts.items()):
+        fitted = identify(rig, jax.tree.map(lambda a, cut=cut: a[cut], data), key=jax.random.key(0), epochs=EPOCHS)
+        save(root / name / "model.npz", fitted, fingerprint=f"logs {i}")
+    return Fits(*(root / name for name in parts))
+
+
+@pytest.fixture(scope="module")
+def unchanged(fits) -> Comparison:
+    return compare(fits.first, fits.second)
+
+
+@pytest.fixture(scope="module")
+def changed(fits) -> Comparison:
+    return compare(fits.first, str(fits.grown / "model.npz"))
+
+
+def test_nothing_changed_between_two_halves_of_a_data_set(unchanged):
+    assert unchanged.names == ("first", "second")
+    assert unchanged.changed == unchanged.differences == unchanged.warnings == ()
+    assert unchanged.verdict == (
+        "Nothing changed between first and second beyond the stated errors: 2 quantities tested at 1%."
+    )
+
+
+def test_friction_that_grew_is_named_and_nothing_else(changed):
+    assert changed.changed == ("friction of joint 1",)
+    assert changed.curves[0].parts[0].name == "Coulomb"
+    assert changed.verdict.startswith("The friction of joint 1 (Coulomb")
+    assert changed.verdict.endswith("changed between first and grown; 1 other quantity did not.")
+    coulomb = changed.curves[0].law[0]
+    grew, std = coulomb.value[1] - coulomb.value[0], math.hypot(*coulomb.std)
+    assert grew == pytest.approx(GROWN, abs=3 * std)
+
+
+def test_a_curve_is_compared_on_the_velocities_that_all_visited(changed):
+    curve, visited = changed.curves[0], np.stack([fit.velocity[0] for fit in changed.fits])
+    np.testing.assert_allclose(curve.velocity[[0, -1]], [visited[:, 0].max(), visited[:, 1].min()], rtol=1e-9)
+    assert curve.torque.shape == curve.std.shape == (2, len(curve.velocity))
+
+
+# --- statistics against closed forms
+
+
+def _curve_like(rng, nodes: int, fits: int) -> np.ndarray:
+    """Covariances of smooth curves, all but singular, of another length and size for each fit."""
+    x = np.linspace(-1, 1, nodes)
+    kernel = lambda length: np.exp(-((x[:, None] - x) ** 2) / length**2)  # noqa: E731
+    scale = np.exp(rng.normal(0, 0.3, (fits, nodes)))
+    return np.stack([np.outer(s, s) * (kernel(0.1 + 0.1 * i) + 1e-10 * np.eye(nodes)) for i, s in enumerate(scale)])
+
+
+@pytest.mark.parametrize("fits, draws", [(2, 2000), (3, 800)])
+def test_alarms_are_as_frequent_as_the_level_says(fits, draws):
+    """Draws from stated posteriors of one machine: two curves and two numbers, at the level and at a coarser one."""
+    rng = np.random.default_rng(fits)
+    covs = [_curve_like(rng, 15, fits), _curve_like(rng, 9, fits), *rng.uniform(0.5, 2, (2, fits, 1, 1))]
+    roots = [np.linalg.cholesky(cov) for cov in covs]
+    alone, together = np.zeros((draws, len(covs))), np.zeros(draws)
+    for i in range(draws):
+        tests = [
+            joint_test(np.einsum("fab,fb->fa", root, rng.standard_normal(root.shape[:2])), cov)
+            for root, cov in zip(roots, covs, strict=True)
+        ]
+        alone[i] = [test.p_alone for test in tests]
+        together[i] = min(test.p_value for test in corrected_tests(tests))
+    for level in (CHANGED, 0.1):
+        # Holm's level for independent tests of true hypotheses: 1 - (1 - level / n)^n
+        wanted = 1 - (1 - level / len(covs)) ** len(covs)
+        assert np.mean(together < level) == pytest.approx(wanted, abs=4 * math.sqrt(wanted / draws))
+        np.testing.assert_allclose(np.mean(alone < level, axis=0), level, atol=4 * math.sqrt(level / draws))
+
+
+def test_the_joint_test_is_hotellings_and_cochrans():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(3, 4, 4))
+    cov, value = root @ root.swapaxes(1, 2) + np.eye(4), rng.normal(size=(3, 4))
+    apart, both = value[0] - value[1], cov[0] + cov[1]
+    test = joint_test(value[:2], cov[:2])
+    np.testing.assert_allclose(test.statistic, apart @ np.linalg.solve(both, apart), rtol=1e-9)
+    weight = np.linalg.inv(cov)
+    mean = np.linalg.solve(weight.sum(0), np.einsum("fab,fb->a", weight, value))
+    q = np.einsum("fa,fab,fb", value - mean, weight, value - mean)
+    test = joint_test(value, cov)
+    np.testing.assert_allclose((test.statistic, test.freedom), (q, 8), rtol=1e-9)
+    assert test.p_alone == pytest.approx(scipy.stats.chi2.sf(q, 8))
+
+
+@pytest.mark.parametrize("share, freedom", [(0.99, 1), (1.01, 2)])
+def test_contrasts_that_only_the_network_knows_are_left_out(share, freedom):
+    """Two numbers of correlation c have directions of variance 1 - c and 1 + c."""
+    near = 1 - share * LEAST_VARIANCE
+    cov = np.stack([[[1.0, near], [near, 1.0]]] * 2)
+    assert joint_test(np.zeros((2, 2)), cov).freedom == freedom
+
+
+@pytest.mark.parametrize("share, changes", [(0.999, True), (1.001, False)])
+def test_a_quantity_changes_at_the_level(share, changes):
+    apart = math.sqrt(2) * scipy.stats.norm.isf(0.5 * share * CHANGED)
+    assert number("m", "kg", np.asarray([5.0, 5.0 + apart]), np.ones(2)).changed is changes
+
+
+def test_between_two_runs_the_spread_has_a_closed_form():
+    """tau^2 = (gap^2 - s_1^2 - s_2^2) / 2, and none where the stated errors explain the gap."""
+    std = np.asarray([[0.3, 0.3], [0.4, 0.4]])
+    value = np.asarray([[1.0, 1.0], [6.0, 1.49]])
+    found = pool(value, std)
+    between = np.asarray([(5**2 - 0.3**2 - 0.4**2) / 2, 0.0])
+    weight = 1 / (std**2 + between)
+    np.testing.assert_allclose(found.between**2, between, rtol=1e-12)
+    np.testing.assert_allclose(found.value, np.sum(weight * value, axis=0) / weight.sum(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found.std, weight.sum(axis=0) ** -0.5, rtol=1e-12)
+
+
+def test_runs_that_are_equally_sure_are_pooled_to_their_mean():
+    rng = np.random.default_rng(5)
+    value = rng.normal(2.0, 3.0, (7, 4))
+    found = pool(value, np.full((7, 4), 0.5))
+    variance = value.var(axis=0, ddof=1)
+    np.testing.assert_allclose(found.value, value.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found.between**2, variance - 0.25, rtol=1e-12)
+    np.testing.assert_allclose(found.std**2, variance / 7, rtol=1e-12)
+
+
+def test_a_prior_that_all_runs_share_counts_once():
+    """Runs that tell nothing leave the prior; those that tell something its precision and theirs."""
+    same = np.full((3, 1), 2.0)
+    np.testing.assert_allclose(pool(same, np.full((3, 1), 0.4), 0.4).std, 0.4, rtol=1e-6)
+    told = 1 / math.sqrt(1 / 0.4**2 + 1 / 0.2**2)
+    np.testing.assert_allclose(pool(same, np.full((3, 1), told), 0.4).std, (1 / 0.16 + 3 / 0.04) ** -0.5, rtol=1e-9)
+
+
+# --- what else a reader is told
+
+
+def _with_effect(fitted: Identified, mu: float) -> Identified:
+    """The fit with friction that grows with the load, known to .01."""
+    law = one(lambda mu: LoadFriction(mu, jnp.asarray(0.02), names=("u", "dx"), joint=1), mu, 0.05, 0.5)
+    grown = Hypothesis(fitted.model, fitted.m_step, ()).plus(law.start, law)
+    hessian = jax.scipy.linalg.block_diag(fitted.state.hessian, jnp.asarray([[(0.5 / 0.01) ** 2]]))
+    state = fitted.state._replace(best=grown.model, hessian=hessian)
+    return fitted._replace(state=state, m_step=grown.m_step)
+
+
+def test_effects_are_compared_and_those_of_one_fit_are_a_difference(unchanged):
+    first, second = (fit.fitted for fit in unchanged.fits)
+    found = compare(_with_effect(first, 0.1), second, names=("may", "june"))
+    assert found.differences == ("load friction of u and dx at joint 1 is in may, not in june",)
+    assert found.numbers[-1].test is None and not found.changed
+    name = "mu of load friction of u and dx at joint 1"
+    for value, news in ((0.11, ()), (0.2, (name,))):  # known to .01 each
+        found = compare(_with_effect(first, 0.1), _with_effect(second, value), names=("may", "june"))
+        assert (found.differences, found.changed) == ((), news)
+        np.testing.assert_allclose(found.numbers[-1].std, 0.01, rtol=1e-6)
+
+
+def test_a_parameter_that_one_fit_keeps_is_a_difference(unchanged):
+    first, second = (fit.fitted for fit in unchanged.fits)
+    without = {"m": Declared(1.0, 0.0)}
+    prior = second.m_step.prior
+    empty = dataclasses.replace(prior, names=(), mean=prior.mean[:0], std=prior.std[:0])
+    kept = second._replace(
+        rig=dataclasses.replace(second.rig, parameters=without),
+        m_step=eqx.tree_at(lambda m: m.prior, second.m_step, empty),
+        state=second.state._replace(hessian=second.state.hessian[:-1, :-1]),
+    )
+    found = compare(first, kept, names=("a", "b"))
+    assert found.differences == ("m is estimated in a, kept as declared in b",)
+
+
+@pytest.mark.parametrize("inside, warned", [(0.99, True), (1.01, False)])
+@pytest.mark.parametrize("kind", ["velocity", "load"])
+def test_ranges_that_hardly_overlap_are_warned_of(fits, tmp_path, kind, inside, warned):
+    ranges = {"velocity": [-1.0, 1.0], "load": [-4.0, 4.0]}
+    for name, factor in (("first", 1.0), ("grown", LEAST_SHARED * inside)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
+        row = {part: [factor * end if part == kind else end for end in ends] for part, ends in ranges.items()}
+        (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"joint": 1} | row]}))
+    found = compare(tmp_path / "first", tmp_path / "grown")
+    assert len(found.warnings) == warned
+    if warned:
+        first, other = ("-1 to 1", "-0.495 to 0.495 m/s") if kind == "velocity" else ("-4 to 4", "-1.98 to 1.98 N")
+        assert f"joint 1: the {kind} ranges of first {first} and grown {other} share 50%" in found.warnings[0]
+    low, high = found.curves[0].velocity[[0, -1]]
+    assert high == -low == pytest.approx(LEAST_SHARED * inside if kind == "velocity" else 1.0)
+
+
+def test_ranges_that_are_not_known_are_not_warned_of():
+    assert shared(np.asarray([np.nan, np.nan]), np.asarray([0.0, 1.0])) == 1.0
+    assert shared(np.asarray([2.0, 3.0]), np.asarray([0.0, 1.0])) == 0.0
+
+
+def test_fits_without_a_common_velocity_have_no_curve(fits, tmp_path):
+    for name, ends in (("first", [-1.0, -0.5]), ("grown", [0.5, 1.0])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
+        (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"velocity": ends, "load": None}]}))
+    found = compare(tmp_path / "first", tmp_path / "grown")
+    assert found.curves == () and "its friction is not compared" in found.warnings[0]
+
+
+def test_fits_of_the_same_logs_are_warned_of(unchanged, tmp_path):
+    for name, fit in zip("ab", unchanged.fits, strict=True):
+        save(tmp_path / f"{name}.npz", fit.fitted, fingerprint="same")
+    assert compare(tmp_path / "a.npz", tmp_path / "b.npz").warnings == (
+        "a and b are of the same logs: their errors are not independent",
+    )
+
+
+# --- mistakes
+
+OTHER = {
+    "system": (lambda rig: dataclasses.replace(rig, system="sled"), "a is of system slide and b of sled"),
+    "parameter": (lambda rig: dataclasses.replace(rig, parameters={}), "a declares m and b does not"),
+}
+
+
+@pytest.mark.parametrize("change, reason", OTHER.values(), ids=OTHER)
+def test_other_machines_are_refused(unchanged, change, reason):
+    first, second = (fit.fitted for fit in unchanged.fits)
+    with pytest.raises(CompareError, match=f"{reason}; compare fits of one machine"):
+        compare(first, second._replace(rig=change(second.rig)), names=("a", "b"))
+
+
+def test_another_trusted_number_is_refused(unchanged):
+    mass = lambda m: {"parameters": {"m": Declared(m, 0.0)}}  # noqa: E731
+    pair = (
+        fit.fitted._replace(rig=dataclasses.replace(fit.fitted.rig, **mass(m)))
+        for fit, m in zip(unchanged.fits, (1.0, 1.2), strict=True)
+    )
+    with pytest.raises(CompareError, match=r"the trusted m is 1 in a and 1\.2 in b; .*uncertain in both"):
+        compare(*pair, names=("a", "b"))
+
+
+def test_names_are_one_for_each_fit(fits):
+    with pytest.raises(CompareError, match="names a for 2 fits; give each fit a name of its own"):
+        compare(fits.first, fits.second, names=("a",))
+
+
+def _run(*argv) -> int:
+    return cli.main([str(word) for word in argv])
+
+
+def test_the_command_refuses_in_one_line(fits, tmp_path, capsys):
+    text = tmp_path / "log.csv"
+    text.write_text("time,u\n")
+    for argv, reason in (
+        ((fits.first,), "1 fit is given; give two or more, of one machine"),
+        ((fits.first, fits.first / "model.npz"), "are the same fit; give each fit once"),
+        ((fits.first, text), "no model, or damaged"),
+        ((fits.first, tmp_path), "cannot be read"),
+    ):
+        assert _run("compare", *argv, "--out", tmp_path / "out") == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.startswith("nnap-em: error: ") and said.err.count("\n") == 1
+        assert reason in said.err
+        assert not (tmp_path / "out").exists()
+
+
+def test_the_command_prints_a_table_and_writes_a_page(fits, changed, tmp_path, capsys):
+    assert _run("compare", fits.first, fits.grown, "--out", tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert said.out == table(changed) + "\n"
+    lines = said.out.splitlines()
+    assert lines[0] == changed.verdict
+    curve = next(line for line in lines if line.startswith("friction of joint 1,"))
+    mass = next(line for line in lines if line.startswith("m [kg]"))
+    assert curve.endswith("CHANGED") and mass.endswith("no change seen")
+    document = json.loads((tmp_path / "out/compare.json").read_text(), parse_constant=pytest.fail)
+    assert document == json.loads(json.dumps(describe(changed)))
+    assert document["changed"] == ["friction of joint 1"]
+    np.testing.assert_array_equal(document["friction"][0]["fits"]["grown"]["cov"], changed.curves[0].cov[1])
+    html = (tmp_path / "out/compare.html").read_text()
+    assert changed.verdict in html and html.count("<figure>") == 1
+    assert all(row["name"] in html for row in rows(changed))

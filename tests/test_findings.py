@@ -139,6 +139,9 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
     doubtful = doubtful._replace(steps=(*doubtful.steps[:-1], doubtful.steps[-1]._replace(suspects=suspects)))
     write_diagnosis(tmp_path, doubtful, [], logs, None, seed=0, began=0.0, say=lambda text: None)
     report, html = json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
+    joints = report["visited"]
+    assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
+    assert all(row["velocity"][0] < row["velocity"][1] for row in joints)
     assert report["effects"] == [] and report["disagreements"][0]["files"] == ["b.csv"]
     assert [(rival["name"], rival["joint"]) for rival in report["cannot_tell"]] == [
         ("dead_zone", 2),

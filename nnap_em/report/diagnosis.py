@@ -71,7 +71,7 @@ def write_diagnosis(
         "interventions": [_touch(touch, train.files) for touch in closed.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
-        "visited": visited(closed.before, velocities, train),
+        "visited": visited(closed.before, velocities, train) if closed.before.rig.friction else None,
         "friction_change": friction_change(closed, nodes),
         "tests": {name: [t._asdict() for t in each] for name, each in told.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},

@@ -11,8 +11,8 @@ export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-# Types and documentation side by side; what each says stays together.
-MAKEFLAGS += --jobs=2 --output-sync
+# Lint and documentation side by side.
+MAKEFLAGS += --jobs=2
 
 .PHONY: demo test check lint docs matrix clean
 

@@ -26,7 +26,7 @@ test: lint docs
 check: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/pyright & types=$$!; $(BIN)/pytest $(PYTEST_FLAGS) -q -m "not slow and not large" && wait $$types
+	$(BIN)/pyright & types=$$!; $(BIN)/pytest $(PYTEST_FLAGS) --durations 3 -m "not slow and not large" && wait $$types
 
 lint: .venv/.test
 	$(BIN)/ruff check

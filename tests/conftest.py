@@ -1,4 +1,3 @@
-import gc
 import os
 import signal
 from pathlib import Path
@@ -15,8 +14,6 @@ import pytest
 from costs import Costs
 
 ROOT = Path(__file__).resolve().parents[1]
-
-gc.set_threshold(50_000, 20, 50)  # tracing makes many objects, and few of them are litter
 
 # a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
 signal.signal(signal.SIGINT, signal.default_int_handler)

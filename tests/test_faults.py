@@ -60,7 +60,7 @@ def _told(said: str) -> str:
 
 
 class Killed(BaseException):
-    """What SIGKILL leaves on the disk: no command catches it."""
+    """State of the disk after SIGKILL: no command catches it."""
 
 
 def _denied(*_):

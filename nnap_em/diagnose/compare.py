@@ -53,7 +53,7 @@ class Fit(NamedTuple):
     load: Float[np.ndarray, "dof 2"]
     """Lowest and highest torque of the drive [N m]; NaN where it is not known or nothing drives the joint."""
     fingerprint: str = ""
-    """Of its logs; empty where it is not known."""
+    """Fingerprint of its logs; empty where it is not known."""
 
 
 class Number(NamedTuple):
@@ -88,7 +88,7 @@ class Curve(NamedTuple):
     cov: Float[np.ndarray, "fit node node"]
     """[N^2 m^2]"""
     units: tuple[str, str]
-    """Of velocity and torque."""
+    """Units of velocity and torque."""
     pooled: Pooled
     test: JointTest
     law: tuple[Number, ...]
@@ -128,7 +128,7 @@ class Comparison(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the fits."""
+        """Names of the fits."""
         return tuple(fit.name for fit in self.fits)
 
     @property

@@ -25,7 +25,7 @@ class Suspect(NamedTuple):
 
     key: Key
     share: float
-    """Of the squared multi-step error, before any refit."""
+    """Share of the squared multi-step error, before any refit [0 to 1]."""
     chance: float
     """Largest share of any candidate whose columns are shifted in time."""
 

@@ -7,7 +7,7 @@ from ..diagnose.compare import Comparison, Curve
 from .style import BLUE, GREEN, PURPLE, TRUTH, VERMILION, band, head, limits, styled, symbol
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, "#56B4E9", "#E69F00")
-"""Of the fits, in their order; more fits than colours begin again."""
+"""Colours of the fits, in their order; more fits than colours begin again."""
 
 
 @styled

@@ -40,7 +40,7 @@ class Fits(NamedTuple):
     second: Path
     """The other half."""
     grown: Path
-    """Of the same slide when its Coulomb friction had grown."""
+    """Fit of the same slide when its Coulomb friction had grown."""
 
 
 @pytest.fixture(scope="module")

@@ -134,7 +134,7 @@ def test_a_joint_that_stands_still_is_not_stuck():
 
 
 def test_standing_still_tells_no_noise():
-    """Of a column that stands most of the time, the noise is that of the rest; it was 0, and all rows were tried."""
+    """The noise of a column that stands most of the time is that of the rest; it was 0, and all rows were tried."""
     moving = _motion(0, 1.0)["theta1"]
     assert noise(np.append(np.full(900, moving[0]), moving)) == pytest.approx(noise(moving), rel=0.02)
     still = 1.5e-3 * np.round(np.append(np.zeros(1200), 0.03 * np.sin(0.05 * np.arange(60))) / 1.5e-3)

@@ -190,10 +190,10 @@ class ShareRule(ErrorRule):
     matters: float = eqx.field(static=True, default=0.1)
     """Share of the declared model's error that a later law must remove as well: what chance can of the whole."""
     hint: float = eqx.field(static=True, default=0.075)
-    """Share of the squared error from which on a law is a suspect, half of `least`: on two real rigs as recorded, with
-    17 and 20 recordings, the best of 600 candidates removed .02 and .04."""
+    """Share of the squared error from which on a law is a suspect, half of `least`: on two real rigs as recorded the
+    best of 600 candidates removed .02 and .07."""
     above: float = eqx.field(static=True, default=2.0)
-    """Multiple of the chance level that a suspect must reach: the best of two placebos is as large once in three."""
+    """Multiple of the chance level that a suspect must reach: chance alone beats two placebos once in three."""
 
     def screen(self, question: Question, candidates: Sequence[Candidate]) -> Screen:
         """By shares of the multi-step error."""

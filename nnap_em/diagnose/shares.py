@@ -156,7 +156,7 @@ def removed(
 
 
 SHIFTS = 2
-"""Placebos of which the largest share counts: of three to five on eleven data sets the first two held the largest."""
+"""Placebos of which the largest share counts: each takes another screen of all candidates."""
 SHIFTABLE = 8
 """Starts of a sequence below which a shift would leave its columns where they are."""
 

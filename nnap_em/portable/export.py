@@ -118,9 +118,9 @@ def predictor(fitted: Identified) -> str:
         return show(x, _row(model, u), force), jax.jacfwd(show)(x, _row(model, u), force)
 
     functions = [
-        _unrolled("rate", rate, x=x, u=u, force=force, z=z),
-        _unrolled("reading", reading, x=x, u=u, z=z),
-        _unrolled("shown", shown, x=x, u=u, force=force, z=z),
+        unrolled("rate", rate, x=x, u=u, force=force, z=z),
+        unrolled("reading", reading, x=x, u=u, z=z),
+        unrolled("shown", shown, x=x, u=u, force=force, z=z),
     ]
     weights, bank = fitted.m_step.weights(model), fitted.bank.padded(len(_states(model)))
     numbers = {
@@ -141,7 +141,7 @@ def predictor(fitted: Identified) -> str:
         "spread": _spread(fitted, weights),
         "parameters": z,
     }
-    fields = "\n".join(f"    {name}={_literal(value)}," for name, value in numbers.items())
+    fields = "\n".join(f"    {name}={literal(value)}," for name, value in numbers.items())
     body = Path(portable.__file__).read_text(encoding="utf-8").partition('"""\n')[2]
     title = f'"""Predictor of {json.dumps(rig.name)[1:-1]} ({rig.system}), written by nnap_em {__version__}.'.replace(
         "\\", "/"
@@ -160,7 +160,7 @@ def predictor(fitted: Identified) -> str:
     )
 
 
-def _unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments: Array) -> Source:
+def unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments: Array) -> Source:
     """`function` in NumPy, compared with JAX at four random places about `arguments`.
 
     Raises ExportError where there is no such source, or where its numbers are others.
@@ -216,7 +216,8 @@ def _spread(fitted: Identified, weights: Weights) -> Float[np.ndarray, "phi rank
     return left[:, kept] * size[kept]
 
 
-def _literal(value: Any) -> str:
+def literal(value: Any) -> str:
+    """A number, text, tuple or array as Python source."""
     if isinstance(value, jax.Array | np.ndarray):
         return f"np.array({np.asarray(value).tolist()!r}).reshape({np.shape(value)!r})".replace("inf", "np.inf")
     return repr(value)

@@ -1,129 +1,209 @@
-"""What was identified, written back as MJCF: bodies, springs, and friction as far as MuJoCo has a place for it."""
+"""An identified machine written back as MJCF: bodies, friction, and every law that MuJoCo has a place for."""
 
+import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
-from jaxtyping import Float
 
 from .. import __version__
 from ..data.machine import Joint, Machine
-from ..effects.position import TorsionalSpring
-from ..em.identify import Identified, friction_table
+from ..effects import AbstractEffect
+from ..em.identify import Identified
 from ..model import hooks
+from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_text
 from ..systems.bodies import numbers
 from ..systems.tree import Tree
+from .actuator import actuator
 from .export import ExportError
+from .friction import SHARE, FrictionForm, friction_forms
+from .homes import file_springs, placed
+from .sheet import Bristle, Contact, Drive, JointSheet, SensorSheet, Sheet
 
-SHARE = 0.1
-"""Share of a learned curve beyond which what Coulomb and viscous friction miss of it is told."""
+STEP = 5e-4
+"""Longest time step of a written file [s]."""
+SHORTEST = 5e-5
+"""Shortest time step of a written file [s]."""
+STIFF = 1.5
+"""Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
+SOFT = 1e-4
+"""Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
+ROOM = 10
+"""Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step."""
+MASSLESS = 1e-9
+"""Mass of the body that carries a rotor [kg], whose inertia is the armature of its joint."""
 
 
-class Friction(NamedTuple):
-    """Coulomb and viscous friction nearest to a learned curve."""
+class Motor(NamedTuple):
+    """An actuator of the written file."""
 
-    dry: float
-    """[N m or N]"""
-    damping: float
-    """[N m s/rad or N s/m]"""
-    left: float
-    """Root mean square of what they miss, over that of the curve."""
+    name: str
+    joint: int
+    """Counted from 0."""
+    gear: float
+    unit: float
+    """Command of the fit for a unit of the control."""
 
 
-def write_mjcf(fitted: Identified, out: Path) -> list[str]:
+def write_mjcf(fitted: Identified, out: Path, *, alone: bool = False) -> list[str]:
     """Write the identified machine to the file `out`, and return what MuJoCo has no place for, a sentence each.
 
-    Raises ExportError where the machine did not come from a file.
+    Laws without a place go to a Python module beside it, `OUT_actuator.py`.
+
+    Raises ExportError where the machine did not come from a file; with `alone`, before anything is written, where a law
+    has no place in MuJoCo.
     """
-    system = fitted.model.system
-    if not isinstance(system, Tree):
-        found = f"the machine {fitted.rig.system!r} is built in, and has no file to be written back to"
-        raise ExportError(f'{found}; declare it by type = "mjcf" and its file')
-    true = hooks.machine(fitted.model.effects, system, jnp.zeros(()))
-    assert isinstance(true, Tree)
-    curves = _curves(fitted)
-    springs, left = _springs(fitted)
-    for name, curve in zip(true.coordinates, curves, strict=True):
-        if curve.left > SHARE:
-            said = f"friction of {name}: Coulomb and viscous miss {100 * curve.left:.0f} % of the learned curve"
-            left.append(f"{said} (a Stribeck dip, or other friction in either direction)")
-    machine = _with_springs(true.machine, true, springs)
-    root = _model(machine, true, curves)
+    return write_model(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
+
+
+def write_model(
+    fitted: Identified, model: StateSpaceModel, forms: Sequence[FrictionForm], out: Path, *, alone: bool = False
+) -> list[str]:
+    """`write_mjcf` for a model and friction near those of a fit."""
+    system = as_it_is(model)
+    sheet, homeless = placed(sheet_of(fitted, model, system, forms), model.effects)
+    sheet = with_dips(sheet)
+    if alone and homeless:
+        effect, reason = homeless[0]
+        raise ExportError(
+            f"{_named(effect)} has no place in MuJoCo ({reason}); leave out --alone to have {beside(out).name} play it, "
+            "or diagnose again without this law"
+        )
+    left = [
+        f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve"
+        for name, form in zip(system.coordinates, forms, strict=True)
+        if form.missed > SHARE
+    ]
+    acting = actuator(fitted, model, homeless, motors_of(fitted, system)) if homeless else None
+    left += [
+        f"{_named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
+        for effect, reason in homeless
+    ]
+    root = _model(sheet, motors_of(fitted, system))
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
-    said = f" Written by nnap_em {__version__} from {machine.file}.  No shapes.  Not in here:{notes} "
+    said = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
     root.insert(0, ET.Comment(said.replace("--", "- -")))
     ET.indent(root)
+    if acting and acting.plays:
+        replace_text(beside(out), acting.text)
     replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
     return left
 
 
-def coulomb_viscous(
-    v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], std: Float[np.ndarray, " node"]
-) -> Friction:
-    """The two numbers that come nearest to a curve of friction torque, where it is known best, and never push."""
-    weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
-    basis = np.stack([np.sign(v), v], axis=1) * weight[:, None]
-    found, _ = scipy.optimize.nnls(basis, -torque * weight)
-    missed = torque + np.stack([np.sign(v), v], axis=1) @ found
-    share = np.sqrt(np.average(missed**2, weights=weight) / max(np.average(torque**2, weights=weight), 1e-300))
-    return Friction(float(found[0]), float(found[1]), float(share))
+def beside(out: Path) -> Path:
+    """The Python module beside a written file."""
+    return out.with_name(f"{out.stem.replace('-', '_')}_actuator.py")
 
 
-def _curves(fitted: Identified) -> list[Friction]:
-    """Of every joint; the file's where none is learned."""
-    system = fitted.model.system
-    assert isinstance(system, Tree)
-    if not fitted.rig.friction:
-        return [Friction(joint.dry, joint.damping, 0.0) for joint in system.machine.joints]
-    nodes = np.asarray(fitted.m_step.weights(fitted.model).nodes)
-    even = np.linspace(-1.0, 1.0, 80)[None] * np.max(np.abs(nodes), axis=1)[:, None]  # nodes crowd about rest
-    table = friction_table(fitted, jnp.asarray(even))
-    joints = zip(*map(np.asarray, (table.velocity, table.torque, table.std)), strict=True)
-    return [coulomb_viscous(*joint) for joint in joints]
+def as_it_is(model: StateSpaceModel) -> Tree:
+    """The machine with all that is estimated of its bodies.
+
+    Raises ExportError where it did not come from a file.
+    """
+    system = model.system
+    if not isinstance(system, Tree):
+        reason = f"the machine {type(system).__name__.lower()!r} is built in, and has no file to be written back to"
+        raise ExportError(f'{reason}; declare it by type = "mjcf" and its file')
+    true = hooks.machine(model.effects, system, jnp.zeros(()))
+    assert isinstance(true, Tree)
+    return true
 
 
-def _springs(fitted: Identified) -> tuple[dict[int, tuple[float, float]], list[str]]:
-    """Stiffness and rest of the springs that were found, by joint; and what of the effects has no place."""
-    springs, left = {}, []
-    for effect in fitted.model.effects:
-        if isinstance(effect, TorsionalSpring):
-            found = effect.values()
-            springs[effect.joint - 1] = (float(found["k"]), float(found["theta0"]))
-        elif not _is_body(fitted, effect):
-            at = f" at joint {effect.joint}" if effect.joint else ""
-            values = ", ".join(f"{name} = {float(value):.4g}" for name, value in effect.values().items())
-            left.append(f"{effect.name}{at}: {values or 'a learned function'}")
-    return springs, left
+def sheet_of(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> Sheet:
+    """The sheet of a machine before its laws."""
+    noise = np.exp(0.5 * np.asarray(model.log_r))
+    sensors = {name: SensorSheet(noise=float(std)) for name, std in zip(fitted.rig.measured, noise, strict=True)}
+    joints = tuple(JointSheet(form=form) for form in forms)
+    drives = {joint: Drive() for joint in system.joints}
+    return file_springs(Sheet(system, system.machine.gravity, model.dt, joints, drives, sensors))
 
 
-def _is_body(fitted: Identified, effect) -> bool:
-    """Whether an effect is a change of a body for good, which the numbers of the bodies hold."""
-    return (effect.name, effect.joint) in fitted.model.system.variations
+def with_dips(sheet: Sheet) -> Sheet:
+    """The sheet with a stiff bristle at every joint whose friction dips: MuJoCo has a dip only there."""
+    inertia = 1 / _mobility(sheet.system)
+    for number, joint in enumerate(sheet.joints, 1):
+        form = joint.form
+        if joint.bristle is None and form.breakaway > form.coulomb:
+            soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * sheet.dt)
+            stiffness = min(soft, STIFF * _level(form) / (form.fastest * STEP))
+            bristle = Bristle(stiffness, float(np.sqrt(stiffness * inertia[number - 1])))
+            sheet = sheet.with_joint(number, bristle=bristle)
+    return sheet
 
 
-def _with_springs(machine: Machine, system: Tree, found: dict[int, tuple[float, float]]) -> Machine:
-    """Two springs on a joint are one."""
-    joints = []
-    for j, joint in enumerate(machine.joints):
-        own = float(system.values.get(f"{joint.name}.stiffness", joint.stiffness))
-        more, rest = found.get(j, (0.0, joint.rest))
-        both = own + more
-        rest = (own * joint.rest + more * rest) / both if both else joint.rest
-        armature = float(system.values.get(f"{joint.name}.armature", joint.armature))
-        joints.append(joint._replace(stiffness=both, rest=rest, armature=armature))
-    return machine._replace(joints=tuple(joints))
+def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
+    """Actuators of the file, then those of joints that the rig drives without one."""
+    machine = system.machine
+    inputs = dict(zip(system.joints, system.gears or (1.0,) * len(system.joints), strict=True))
+    motors = [
+        Motor(motor.name, motor.joint, motor.gear, motor.gear / inputs.get(motor.joint + 1, motor.gear))
+        for motor in machine.motors
+    ]
+    there = {motor.joint + 1 for motor in motors}
+    columns = zip(fitted.rig.input_columns, system.joints, strict=True)
+    return motors + [Motor(name, joint - 1, inputs[joint], 1.0) for name, joint in columns if joint not in there]
 
 
-def _model(machine: Machine, system: Tree, curves: list[Friction]) -> ET.Element:
+def _named(effect: AbstractEffect) -> str:
+    at = f" at joint {effect.joint}" if effect.joint else f" of {effect.channel}" if effect.channel else ""
+    values = ", ".join(f"{name} = {float(value):.4g}" for name, value in effect.values().items())
+    return f"{effect.name}{at}{': ' + values if values else ''}"
+
+
+# --- XML
+
+
+def _model(sheet: Sheet, motors: Sequence[Motor]) -> ET.Element:
+    machine = sheet.system.machine
     root = ET.Element("mujoco", model=Path(machine.file).stem)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    ET.SubElement(root, "option", gravity=_text(*machine.gravity))
+    step = sheet.dt / math.ceil(sheet.dt / _longest_step(sheet) - 1e-9)
+    ET.SubElement(root, "option", timestep=_text(step), integrator="RK4", gravity=_text(*sheet.gravity))
     world = ET.SubElement(root, "worldbody")
-    places: list[ET.Element] = []
+    mobility = _mobility(sheet.system)
+    places = _bodies(world, sheet, mobility)
+    tendons = ET.Element("tendon")
+    for j, joint in enumerate(sheet.joints):
+        if joint.rotor is not None:
+            _rotor(world, tendons, machine.joints[j].name, joint, mobility[j])
+    if len(tendons):
+        root.append(tendons)
+    actuators = ET.SubElement(root, "actuator")
+    for motor in motors:
+        _motor(actuators, sheet, motor, step)
+    for j, joint in enumerate(sheet.joints):
+        _passive(actuators, machine.joints[j].name, joint)
+    _sensors(ET.SubElement(root, "sensor"), sheet, places, world, step)
+    return root
+
+
+def _longest_step(sheet: Sheet) -> float:
+    """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
+    rates = [
+        own.bristle.stiffness * own.form.fastest / _level(own.form)
+        for own in sheet.joints
+        if own.bristle is not None and _bristled(own)
+    ]
+    return max(min([STEP, *(STIFF / rate for rate in rates)]), SHORTEST)
+
+
+def _level(form: FrictionForm) -> float:
+    """Coulomb torque of a bristle, which may not vanish."""
+    return max(form.coulomb, 1e-2 * form.breakaway)
+
+
+def _mobility(system: Tree) -> np.ndarray:
+    """Acceleration of every joint per force at it, with all joints as declared: MuJoCo scales contacts by it."""
+    still = jnp.asarray([joint.zero for joint in system.machine.joints], float)
+    return np.diagonal(np.linalg.inv(np.asarray(system.mass(still))))
+
+
+def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.Element]:
+    machine, places = sheet.system.machine, []
     for i, body in enumerate(machine.bodies):
         own = ET.SubElement(
             places[body.parent] if body.parent >= 0 else world,
@@ -133,47 +213,171 @@ def _model(machine: Machine, system: Tree, curves: list[Friction]) -> ET.Element
             xyaxes=_text(*(row[0] for row in body.turn), *(row[1] for row in body.turn)),
         )
         places.append(own)
-        for joint, curve in zip(machine.joints, curves, strict=True):
+        for j, joint in enumerate(machine.joints):
             if joint.body == i:
-                ET.SubElement(own, "joint", _joint(joint, curve))
-        mass, centre, inertia = numbers(body, system.values)
+                ET.SubElement(own, "joint", _joint(sheet, joint, sheet.joints[j], mobility[j]))
+        mass, centre, inertia = numbers(body, sheet.system.values)
         if float(mass) > 0:
             full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
             ET.SubElement(own, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
         for spot in machine.spots:
             if spot.body == i:
                 ET.SubElement(own, "site", name=spot.name, pos=_text(*spot.place))
-    motors = ET.SubElement(root, "actuator")
-    for motor in machine.motors:
-        joint = machine.joints[motor.joint].name
-        ET.SubElement(motors, "motor", name=motor.name, joint=joint, gear=_text(motor.gear))
-    sensors = ET.SubElement(root, "sensor")
-    for gauge in machine.gauges:
-        kind = "jointvel" if gauge.rate else "jointpos"
-        ET.SubElement(sensors, kind, name=gauge.name, joint=machine.joints[gauge.joint].name)
-    for name, sense in {one.name.rpartition(".")[0]: one for one in machine.senses}.items():
-        axes = _text(*(row[0] for row in sense.turn), *(row[1] for row in sense.turn))
-        where = places[sense.body] if sense.body >= 0 else world
-        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sense.place), xyaxes=axes)
-        at = {"objtype": "site", "objname": f"{name}_site"} if sense.kind == "framepos" else {"site": f"{name}_site"}
-        ET.SubElement(sensors, sense.kind, {"name": name, **at})
-    return root
+    return places
 
 
-def _joint(joint: Joint, curve: Friction) -> dict[str, str]:
-    """Its attributes, those aside that are MuJoCo's own."""
+def _joint(sheet: Sheet, joint: Joint, own: JointSheet, mobility: float) -> dict[str, str]:
+    """Attributes of a joint, those aside that are MuJoCo's own."""
+    viscous, bristled = own.form.viscous + own.viscous, _bristled(own)
     given = {
         "name": joint.name,
         "type": "slide" if joint.slide else "hinge",
         "axis": _text(*joint.axis),
         "pos": _text(*joint.anchor),
-        "armature": _text(joint.armature),
-        "damping": _text(curve.damping),
-        "frictionloss": _text(curve.dry),
+        "armature": _text(sheet.system.values.get(f"{joint.name}.armature", joint.armature)),
+        "damping": _text(viscous, own.drag) if own.drag else _text(viscous),
+        "frictionloss": _text(0.0 if bristled else own.form.coulomb),
     }
     given |= {"ref": _text(joint.zero)} if joint.zero else {}
-    given |= {"stiffness": _text(joint.stiffness), "springref": _text(joint.rest)} if joint.stiffness else {}
+    given |= _spring(own)
+    if own.stop is not None:
+        return given | {"range": _text(own.stop.low, own.stop.high)} | _contact(own.stop, mobility, "limit")
     return given | ({"range": _text(*joint.range)} if joint.range else {})
+
+
+def _spring(own: JointSheet) -> dict[str, str]:
+    """Stiffness and rest of a pull; a constant that has no rest goes to `_passive`."""
+    rest = _rest(own)
+    if not any(own.pull[1:]):
+        return {}
+    _, b, c, d = own.pull
+    slopes = -(b + rest * (2 * c + 3 * d * rest)), -(c + 3 * d * rest), -d
+    return {"stiffness": _text(*(slopes if c or d else slopes[:1])), "springref": _text(rest)}
+
+
+def _rest(own: JointSheet) -> float:
+    """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
+    a, b, c, d = own.pull
+    roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
+    real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])
+    return float(min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0))
+
+
+def _contact(contact: Contact, mobility: float, of: str) -> dict[str, str]:
+    """Solver parameters of a limit that is a spring and a damper."""
+    return {
+        f"solref{of}": _text(-contact.stiffness * mobility, -contact.damping * mobility),
+        f"solimp{of}": _text(SOFT, SOFT, 1.0, 0.5, 1.0),
+    }
+
+
+def _rotor(world: ET.Element, tendons: ET.Element, name: str, own: JointSheet, mobility: float) -> None:
+    """The motor as a wheel of its own, joined to its joint by a tendon."""
+    rotor = own.rotor
+    assert rotor is not None
+    body = ET.SubElement(world, "body", name=f"{name}_rotor")
+    ET.SubElement(body, "joint", name=f"{name}_rotor", type="hinge", axis="0 0 1", armature=_text(rotor.inertia))
+    tiny = _text(MASSLESS)
+    ET.SubElement(body, "inertial", pos="0 0 0", mass=tiny, diaginertia=f"{tiny} {tiny} {tiny}")
+    given = {"name": f"{name}_transmission"}
+    if rotor.play is None:
+        given |= {"stiffness": _text(rotor.stiffness), "damping": _text(rotor.damping), "springlength": "0"}
+    else:
+        given |= {"range": _text(rotor.play.low, rotor.play.high)}
+        given |= _contact(rotor.play, mobility + 1 / (rotor.inertia + MASSLESS), "limit")
+    tendon = ET.SubElement(tendons, "fixed", given)
+    ET.SubElement(tendon, "joint", joint=f"{name}_rotor", coef="1")
+    ET.SubElement(tendon, "joint", joint=name, coef="-1")
+
+
+def _motor(actuators: ET.Element, sheet: Sheet, motor: Motor, step: float) -> None:
+    name, joint = sheet.system.machine.joints[motor.joint].name, sheet.joints[motor.joint]
+    given = {"name": motor.name, "joint": f"{name}_rotor" if joint.rotor else name, "gear": _text(motor.gear)}
+    drive = sheet.drives.get(motor.joint + 1, Drive())
+    more = _drive(drive, abs(motor.unit), step)
+    ET.SubElement(actuators, "general" if {"gainprm", "dyntype"} & set(more) else "motor", given | more)
+
+
+def _drive(drive: Drive, unit: float, step: float) -> dict[str, str]:
+    """Attributes of the way from a control to a force; the state of a lag is held over a step, half a step late."""
+    more = {}
+    if math.isfinite(drive.before):
+        more["ctrlrange"] = _text(-drive.before / unit, drive.before / unit)
+    if math.isfinite(drive.after):
+        more["forcerange"] = _text(-drive.after / unit, drive.after / unit)
+    if drive.delay > 0:
+        more |= _late(drive.delay, step)
+    if drive.lag:
+        more |= {"dyntype": "filterexact", "dynprm": _text(max(drive.lag - 0.5 * step, 0.05 * step))}
+    if drive.gain != 1:
+        more["gainprm"] = _text(drive.gain)
+    return more
+
+
+def _late(delay: float, step: float) -> dict[str, str]:
+    """Attributes of a delay, interpolated between steps; MuJoCo's shortest is one step."""
+    late = max(delay + 0.5 * step, step)  # interpolation begins to rise half a step early, on average
+    return {"delay": _text(late), "nsample": str(ROOM * (math.ceil(delay / step) + 1)), "interp": "linear"}
+
+
+def _passive(actuators: ET.Element, name: str, own: JointSheet) -> None:
+    """Torques of a joint that MuJoCo has as those of a passive motor: cogging, a bristle, a constant."""
+    still = {"joint": name, "input": "none", "motorconst": "0", "resistance": "1"}
+
+    def add(what: str, **given: str) -> None:
+        ET.SubElement(actuators, "dcmotor", {"name": f"{name}_{what}", **still, **given})
+
+    for i, (amplitude, k, phase) in enumerate(own.tones, 1):  # poles are whole numbers: k is a gear
+        add(f"cogging{i}", gear=_text(k), cogging=_text(amplitude / k, 1.0, phase))
+    constant = own.form.offset + _unheld(own)
+    if constant:
+        add("offset", cogging=_text(constant, 0.0, 0.5 * math.pi))
+    if _bristled(own):
+        form, bristle = own.form, own.bristle
+        assert bristle is not None
+        add("bristle", lugre=_text(*bristle, _level(form), form.breakaway, form.stribeck))
+
+
+def _unheld(own: JointSheet) -> float:
+    """Constant pull that no rest holds."""
+    a, b, c, d = own.pull
+    rest = _rest(own)
+    return a + rest * (b + rest * (c + rest * d)) if abs(a) > 0 else 0.0
+
+
+def _bristled(own: JointSheet) -> bool:
+    return own.bristle is not None and own.form.breakaway > 0
+
+
+def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], world: ET.Element, step: float) -> None:
+    machine = sheet.system.machine
+    named = {gauge.name for gauge in machine.gauges}
+    for gauge in machine.gauges:
+        kind = "jointvel" if gauge.rate else "jointpos"
+        given = {"name": gauge.name, "joint": machine.joints[gauge.joint].name}
+        ET.SubElement(sensors, kind, given | _reading(sheet.sensors.get(gauge.name), step))
+    dof = len(machine.joints)
+    for name, sensor in sheet.sensors.items():
+        if name in named or name not in machine.states:
+            continue
+        place = machine.states.index(name)
+        kind = "jointvel" if place >= dof else "jointpos"
+        given = {"name": name, "joint": machine.joints[place % dof].name}
+        ET.SubElement(sensors, kind, given | _reading(sensor, step))
+    for name, sense in {one.name.rpartition(".")[0]: one for one in machine.senses}.items():
+        axes = _text(*(row[0] for row in sense.turn), *(row[1] for row in sense.turn))
+        where = places[sense.body] if sense.body >= 0 else world
+        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sense.place), xyaxes=axes)
+        at = {"objtype": "site", "objname": f"{name}_site"} if sense.kind == "framepos" else {"site": f"{name}_site"}
+        reading = next((sheet.sensors[f"{name}.{x}"] for x in "xyz" if f"{name}.{x}" in sheet.sensors), None)
+        ET.SubElement(sensors, sense.kind, {"name": name, **at, **_reading(reading, step)})
+
+
+def _reading(sensor: SensorSheet | None, step: float) -> dict[str, str]:
+    """Noise and delay of a sensor."""
+    if sensor is None:
+        return {}
+    return {"noise": _text(sensor.noise)} | (_late(sensor.delay, step) if sensor.delay > 0 else {})
 
 
 def _text(*values) -> str:

@@ -1,0 +1,236 @@
+"""The table from a law to its place in MuJoCo: one entry a law, each a function from a sheet to a sheet."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..effects import AbstractEffect
+from ..systems.frames import laid
+from .sheet import Bristle, Contact, Rotor, Sheet, added, spring
+
+
+class NoHome(Exception):
+    """A law that no element of MuJoCo holds: the message is the reason."""
+
+
+Home = Callable[[Sheet, Any], Sheet]
+
+
+class Placed(NamedTuple):
+    """A sheet with all laws that MuJoCo holds, and those that it does not hold with the reason, in the order of the model."""
+
+    sheet: Sheet
+    homeless: tuple[tuple[AbstractEffect, str], ...]
+
+
+def placed(sheet: Sheet, effects: Sequence[AbstractEffect]) -> Placed:
+    """The sheet with laws added.
+
+    A law of the command without a place acts before all that the file does with it, so that laws of the command which come
+    before it have none either; delays may change places with it.
+    """
+    homeless = []
+    for place, effect in enumerate(effects):
+        follower = _follower(effects, place)
+        try:
+            if follower is not None:
+                raise NoHome(f"it acts before {follower.name}, which has no place")
+            sheet = _home(effect)(sheet, effect)
+        except NoHome as reason:
+            homeless.append((effect, str(reason)))
+    return Placed(sheet, tuple(homeless))
+
+
+def _home(effect: AbstractEffect) -> Home:
+    if effect.name not in HOMES:
+        raise NoHome(REASONS.get(effect.name, "no element of MuJoCo has this form"))
+    return HOMES[effect.name]
+
+
+def of_command(effect: AbstractEffect) -> bool:
+    """True for a law of what reaches a joint of the command."""
+    return type(effect).input is not AbstractEffect.input
+
+
+def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect | None:
+    """The law without a place before which a law of the command has to act."""
+    first = effects[place]
+    if not of_command(first) or first.name not in HOMES or first.name == "input_delay":
+        return None
+    after = (effect for effect in effects[place + 1 :] if of_command(effect) and effect.joint == first.joint)
+    return next((effect for effect in after if effect.name not in HOMES), None)
+
+
+# --- forces at a joint
+
+
+def _spring(sheet: Sheet, effect: Any) -> Sheet:
+    pull = tuple(map(float, (effect.moment, -effect.slope, -effect.square, -effect.cube)))
+    return sheet.with_joint(effect.joint, pull=added(sheet.joint(effect.joint).pull, pull))
+
+
+def _offset(sheet: Sheet, effect: Any) -> Sheet:
+    constant = float(effect.value), 0.0, 0.0, 0.0
+    return sheet.with_joint(effect.joint, pull=added(sheet.joint(effect.joint).pull, constant))
+
+
+def _cogging(sheet: Sheet, effect: Any) -> Sheet:
+    k, pairs = float(effect.k), ((effect.sine, effect.cosine), (effect.sine2, effect.cosine2))
+    tones = [
+        (math.hypot(sine, cosine), turn * k, math.atan2(cosine, sine)) for turn, (sine, cosine) in enumerate(pairs, 1)
+    ]
+    tones = [tone for tone in tones if tone[0] > 0]
+    return sheet.with_joint(effect.joint, tones=(*sheet.joint(effect.joint).tones, *tones))
+
+
+def _stop(sheet: Sheet, effect: Any) -> Sheet:
+    if sheet.joint(effect.joint).stop is not None:
+        raise NoHome("a joint has one range")
+    numbers = effect.lower, effect.upper, np.exp(effect.stiffness), np.exp(effect.damping)
+    return sheet.with_joint(effect.joint, stop=Contact(*map(float, numbers)))
+
+
+def _back_emf(sheet: Sheet, effect: Any) -> Sheet:
+    return sheet.with_joint(effect.joint, viscous=sheet.joint(effect.joint).viscous + float(effect.b))
+
+
+def _drag(sheet: Sheet, effect: Any) -> Sheet:
+    if effect.joint is None:
+        raise NoHome("the drag of one point is no drag of a body")
+    return sheet.with_joint(effect.joint, drag=sheet.joint(effect.joint).drag + float(effect.c))
+
+
+def _bristle(sheet: Sheet, effect: Any) -> Sheet:
+    return sheet.with_joint(
+        effect.joint, bristle=Bristle(float(np.exp(effect.log_sigma)), max(float(effect.damping), 0.0))
+    )
+
+
+# --- bodies and base
+
+
+def _in_bodies(sheet: Sheet, effect: Any) -> Sheet:
+    """The numbers of the bodies are those of the machine with its payload."""
+    if (effect.name, effect.joint) not in sheet.system.variations:
+        raise NoHome("the machine does not vary so")
+    return sheet
+
+
+def _tilt(sheet: Sheet, effect: Any) -> Sheet:
+    frames, machine = laid(sheet.system.text).frames, sheet.system.machine
+    if frames[0].slide or any(frame.before < 0 for frame in frames[1:]):
+        raise NoHome("the first joint does not carry the whole machine")
+    axis, angle = np.asarray(frames[0].turn)[:, 2], -float(effect.angle)
+    cross = np.cross(np.eye(3), axis)
+    turn = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    first = machine.joints[0]
+    stiffness = float(sheet.system.values.get(f"{first.name}.stiffness", first.stiffness))
+    moved = stiffness * -float(effect.angle), 0.0, 0.0, 0.0  # the law turns the spring of the file, too
+    x, y, z = map(float, turn @ np.asarray(sheet.gravity))
+    return sheet.with_joint(1, pull=added(sheet.joint(1).pull, moved))._replace(gravity=(x, y, z))
+
+
+# --- between command and torque
+
+
+def _gain(sheet: Sheet, effect: Any) -> Sheet:
+    drive, gain = sheet.drives[effect.joint], 1 + float(effect.excess)
+    return sheet.with_drive(effect.joint, gain=drive.gain * gain, after=drive.after * abs(gain))
+
+
+def _saturation(sheet: Sheet, effect: Any) -> Sheet:
+    drive, limit = sheet.drives[effect.joint], float(effect.limit)
+    if drive.lag:
+        return sheet.with_drive(effect.joint, after=min(drive.after, limit))
+    return sheet.with_drive(effect.joint, before=min(drive.before, limit / abs(drive.gain)))
+
+
+def _delay(sheet: Sheet, effect: Any) -> Sheet:
+    return sheet.with_drive(effect.joint, delay=sheet.drives[effect.joint].delay + max(float(effect.delay), 0.0))
+
+
+def _lag(sheet: Sheet, effect: Any) -> Sheet:
+    drive = sheet.drives[effect.joint]
+    if drive.lag or math.isfinite(drive.after):
+        raise NoHome("an actuator has one state, and no limit before it but that of the command")
+    return sheet.with_drive(effect.joint, lag=max(float(effect.tau), 0.05 * sheet.dt))
+
+
+def _flexibility(sheet: Sheet, effect: Any) -> Sheet:
+    inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
+    return _with_rotor(sheet, effect.joint, Rotor(inertia, k, damping))
+
+
+def _backlash(sheet: Sheet, effect: Any) -> Sheet:
+    inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
+    half = 0.5 * max(float(effect.gap), 1e-9)
+    return _with_rotor(sheet, effect.joint, Rotor(inertia, play=Contact(-half, half, k, damping)))
+
+
+def _with_rotor(sheet: Sheet, joint: int, rotor: Rotor) -> Sheet:
+    if sheet.joint(joint).rotor is not None:
+        raise NoHome("a joint has one motor")
+    return sheet.with_joint(joint, rotor=rotor)
+
+
+# --- readings
+
+
+def _sensor_delay(sheet: Sheet, effect: Any) -> Sheet:
+    return sheet.with_sensors(effect.channel, delay=max(float(effect.delay), 0.0))
+
+
+def _quantisation(sheet: Sheet, effect: Any) -> Sheet:
+    """The model holds the rounding as noise; the fitted noise of the reading has it already."""
+    return sheet
+
+
+HOMES: Mapping[str, Home] = {
+    "torsional_spring": _spring,
+    "torque_offset": _offset,
+    "cogging": _cogging,
+    "hard_stop": _stop,
+    "motor_back_emf": _back_emf,
+    "air_drag": _drag,
+    "presliding_friction": _bristle,
+    "payload": _in_bodies,
+    "link_inertia": _in_bodies,
+    "link_length": _in_bodies,
+    "center_of_mass": _in_bodies,
+    "base_tilt": _tilt,
+    "motor_gain": _gain,
+    "saturation": _saturation,
+    "input_delay": _delay,
+    "actuator_lag": _lag,
+    "joint_flexibility": _flexibility,
+    "backlash": _backlash,
+    "sensor_delay": _sensor_delay,
+    "sensor_quantization": _quantisation,
+}
+"""Functions that add a law to a sheet, by its name in the catalogue."""
+
+REASONS: Mapping[str, str] = {
+    "dead_zone": "an actuator is linear between its limits",
+    "one_sided_loss": "an actuator has one gain for both directions",
+    "position_dependent_friction": "friction of a joint does not depend on its position",
+    "friction_drift": "friction of a joint does not depend on time",
+    "load_friction": "friction of a joint does not depend on the torque through it",
+    "unknown_function": "a learned function has no element",
+    "periodic_force": "no element depends on time",
+    "eddy_brake": "damping of a joint does not depend on its position",
+    "payload_step": "bodies keep their mass",
+    "base_vibration": "the base of a fixed machine does not move",
+    "sensor_bias": "a sensor has no offset",
+    "sensor_scale": "a sensor has no scale",
+}
+"""Why the others have no place, by name."""
+
+
+def file_springs(sheet: Sheet) -> Sheet:
+    """The sheet with the springs of the file."""
+    for number, joint in enumerate(sheet.system.machine.joints, 1):
+        stiffness = float(sheet.system.values.get(f"{joint.name}.stiffness", joint.stiffness))
+        sheet = sheet.with_joint(number, pull=added(sheet.joint(number).pull, spring(stiffness, joint.rest)))
+    return sheet

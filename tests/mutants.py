@@ -1099,9 +1099,9 @@ MUTANTS = (
     ),
     Mutant(
         "friction written back with the other sign",
-        "portable/mjcf.py",
-        "nnls(basis, -torque * weight)",
-        "nnls(basis, torque * weight)",
+        "portable/friction.py",
+        "-torque * weight)",
+        "torque * weight)",
         "test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve",
     ),
     Mutant(

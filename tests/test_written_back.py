@@ -24,7 +24,8 @@ from nnap_em.em.identify import Identified, begin
 from nnap_em.em.store import load, save
 from nnap_em.model.simulate import declared, paper_model
 from nnap_em.portable.export import ExportError, export
-from nnap_em.portable.mjcf import coulomb_viscous, write_mjcf
+from nnap_em.portable.friction import friction_form
+from nnap_em.portable.mjcf import write_mjcf
 from nnap_em.systems import specs
 
 MACHINES = Path(machine_files.__file__).parent / "machines"
@@ -133,22 +134,28 @@ def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_tol
     spring = TorsionalSpring.of(0.8, 0.4, 0.0, 0.0, joint=2)
     effects = (spring, Payload(jnp.asarray(0.1), joint=2), Cogging.of(0.1, 0.0, 6.0, joint=1))
     fitted = _begun(effects, parameters={"cart.mass": Declared(1.3, 0.1), "rail.armature": Declared(0.2, 0.1)})
-    told = write_mjcf(fitted, tmp_path / "out.xml")
-    assert any(line.startswith("cogging at joint 1: amplitude = 0.1") for line in told)
+    assert write_mjcf(fitted, tmp_path / "out.xml") == []
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     assert model.body("pole").mass[0] == pytest.approx(0.3)
     assert model.body("cart").mass[0] == pytest.approx(1.3)
-    np.testing.assert_allclose([model.jnt_stiffness[1], model.qpos_spring[1]], [0.8, 0.5])
+    np.testing.assert_allclose([np.ravel(model.jnt_stiffness[1])[0], model.qpos_spring[1]], [0.8, 0.5])
     assert model.dof_armature[0] == pytest.approx(0.2)
     assert "cogging" in (tmp_path / "out.xml").read_text()
 
 
 def test_coulomb_and_viscous_friction_are_read_off_a_curve():
-    v = np.linspace(-2.0, 2.0, 80)
-    dry, damping, left = coulomb_viscous(v, -0.3 * np.sign(v) - 0.2 * v, np.full(80, 0.01))
-    np.testing.assert_allclose([dry, damping, left], [0.3, 0.2, 0.0], atol=1e-9)
-    dry, damping, left = coulomb_viscous(v, 0.1 * v, np.full(80, 0.01))
-    assert (dry, damping) == (0.0, 0.0) and left == pytest.approx(1.0)  # friction never pushes
+    v, std = np.linspace(-2.0, 2.0, 80), np.full(80, 0.01)
+    form = friction_form(v, -0.3 * np.sign(v) - 0.2 * v, std)
+    np.testing.assert_allclose([form.coulomb, form.viscous, form.offset, form.missed], [0.3, 0.2, 0.0, 0.0], atol=1e-6)
+    form = friction_form(v, 0.1 * v, std)
+    assert (form.coulomb, form.viscous) == (0.0, 0.0) and form.missed == pytest.approx(1.0)  # friction never pushes
+
+
+def test_a_dip_and_a_constant_are_read_off_a_curve():
+    v = np.linspace(-2.0, 2.0, 160)
+    level = 0.3 + 0.2 * np.exp(-((v / 0.15) ** 2))
+    form = friction_form(v, 0.05 - level * np.tanh(v / 0.02) - 0.2 * v, np.full(160, 0.001))
+    np.testing.assert_allclose(form[:6], [0.3, 0.5, 0.15, 0.2, 0.05, 0.02], rtol=0.01)
 
 
 def test_a_built_in_machine_has_no_file(tmp_path):

@@ -128,7 +128,9 @@ _EXPORT = """\
 examples:
   nnap-em export fit --out exported
   nnap-em export found/after.npz --out exported
-  nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, springs, friction
+  nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
+  nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
+  nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
 
 OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
 python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
@@ -248,6 +250,11 @@ def parser() -> argparse.ArgumentParser:
     export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
     export.add_argument("--out", metavar="OUT", type=Path, help="folder for the files")
     export.add_argument("--mjcf", metavar="FILE", type=Path, help="write a machine that came from a file back as MJCF")
+    export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
+    export.add_argument("--urdf", metavar="FILE", type=Path, help="write such a machine as URDF")
+    export.add_argument("--c", metavar="FILE", type=Path, help="write friction and feed-forward torque as C99")
+    export.add_argument("--draws", type=_count, metavar="N", help="write N draws of the posterior to OUT instead")
+    export.add_argument("--seed", type=_natural, default=0, help="of the draws (0)")
     return top
 
 
@@ -257,8 +264,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
         arguments.error("--particles goes with --smoother particle")
-    if args.command == "export" and args.out is None and args.mjcf is None:
-        arguments.error("say where to: --out OUT, --mjcf FILE, or both")
+    if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c)):
+        arguments.error("say where to: --out OUT, --mjcf FILE, --urdf FILE or --c FILE")
+    if args.command == "export" and args.draws and args.out is None:
+        arguments.error("--draws goes with --out OUT, the folder for the files")
     try:
         # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -379,7 +379,7 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
     loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
     if loose:
         yield f"it has {len(loose)} tendons", "put their springs and motors on joints, and take <tendon> out"
-    for i in range(model.nu):
+    for i in range(getattr(model, "nactuator", model.nu)):
         if _moves(model, i, held):
             yield from _actuator(model, i)
     if model.opt.density or model.opt.viscosity:
@@ -523,7 +523,7 @@ def _joint(model: Any, j: int) -> Joint:
 
 def _motors(model: Any, part: Part) -> Iterator[Motor]:
     held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
-    for i in range(model.nu):
+    for i in range(getattr(model, "nactuator", model.nu)):
         if not _moves(model, i, held):
             continue
         gain = float(model.actuator_gainprm[i][0]) * float(model.actuator_gear[i][0])

@@ -34,7 +34,7 @@ SOFT = 1e-4
 """Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
 ROOM = 10
 """Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step."""
-MASSLESS = 1e-9
+MASSLESS = 1e-12
 """Mass of the body that carries a rotor [kg], whose inertia is the armature of its joint."""
 
 
@@ -70,7 +70,7 @@ def write_model(
     if alone and homeless:
         effect, reason = homeless[0]
         raise ExportError(
-            f"{_named(effect)} has no place in MuJoCo ({reason}); leave out --alone to have {beside(out).name} play it, "
+            f"{named(effect)} has no place in MuJoCo ({reason}); leave out --alone to have {beside(out).name} play it, "
             "or diagnose again without this law"
         )
     left = [
@@ -80,7 +80,7 @@ def write_model(
     ]
     acting = actuator(fitted, model, homeless, motors_of(fitted, system)) if homeless else None
     left += [
-        f"{_named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
+        f"{named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
         for effect, reason in homeless
     ]
     root = _model(sheet, motors_of(fitted, system))
@@ -148,7 +148,8 @@ def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
     return motors + [Motor(name, joint - 1, inputs[joint], 1.0) for name, joint in columns if joint not in there]
 
 
-def _named(effect: AbstractEffect) -> str:
+def named(effect: AbstractEffect) -> str:
+    """A law with its place and its numbers."""
     at = f" at joint {effect.joint}" if effect.joint else f" of {effect.channel}" if effect.channel else ""
     values = ", ".join(f"{name} = {float(value):.4g}" for name, value in effect.values().items())
     return f"{effect.name}{at}{': ' + values if values else ''}"

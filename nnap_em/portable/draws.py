@@ -1,0 +1,64 @@
+"""Machines drawn from the posterior of a fit: a table of their numbers, and a file for a simulator each."""
+
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from ..data.formats import write_csv
+from ..em.identify import Identified, friction_table
+from ..em.predict import drawn_paths
+from ..systems.tree import Tree
+from .friction import FrictionForm, declared_friction, even_nodes, friction_form
+from .mjcf import write_model
+
+TABLE = "draws.csv"
+
+
+def write_draws(fitted: Identified, out: Path, count: int, *, key: PRNGKeyArray) -> None:
+    """Write `count` draws of the posterior to the folder `out`: draws.csv, and draw_000.xml, ... for a machine of a file.
+
+    A row of draws.csv has friction per joint (`JOINT.coulomb`, `.breakaway`, `.stribeck`, `.viscous`, `.offset`), the
+    estimated parameters of the machine, and those of every effect (`EFFECT.JOINT.NAME`), in SI units.
+    """
+    paths = drawn_paths(fitted, count, key=key)
+    columns: dict[str, list[float]] = {}
+    width = len(str(count - 1))
+    for i in range(count):
+        drawn = paths.prior.write(paths.model, paths.parameters[i])
+        if isinstance(drawn.system, Tree):
+            drawn = _physical(drawn, paths.model)
+        forms = _forms(fitted, np.asarray(paths.tables[i]))
+        row: dict[str, float] = {"draw": i}
+        for name, form in zip(drawn.system.coordinates, forms, strict=True):
+            row |= {f"{name}.{what}": getattr(form, what) for what in FrictionForm._fields[:5]}
+        row |= {name: float(drawn.system.parameter(name)) for name in paths.prior.declared}
+        for effect in drawn.effects:
+            at = effect.joint or effect.channel or "all"
+            row |= {f"{effect.name}.{at}.{name}": float(value) for name, value in effect.values().items()}
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
+        if isinstance(drawn.system, Tree):
+            write_model(fitted, drawn, forms, out / f"draw_{i:0{width}d}.xml")
+    write_csv(out / TABLE, {name: np.asarray(values, float) for name, values in columns.items()})
+
+
+def _physical(drawn, model):
+    """A draw whose bodies can be, on the way from those of the fit."""
+    return dataclasses.replace(drawn, system=drawn.system.reached_from(model.system))
+
+
+def _forms(fitted: Identified, table: np.ndarray) -> list[FrictionForm]:
+    """Friction of one draw: the learned curve with a deviation at the nodes."""
+    if not fitted.rig.friction:
+        return declared_friction(fitted.model.system)
+    velocity = even_nodes(fitted)
+    learned = friction_table(fitted, jnp.asarray(velocity))
+    nodes = np.asarray(fitted.m_step.weights(fitted.model).nodes)
+    out = []
+    for j, v in enumerate(velocity):
+        torque = np.asarray(learned.torque[j]) + np.interp(v, nodes[j], table[j])
+        out.append(friction_form(v, torque, np.asarray(learned.std[j])))
+    return out

@@ -1,0 +1,145 @@
+"""An identified machine written as URDF: masses, centres, inertias, damping and friction of its joints."""
+
+import math
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from .. import __version__
+from ..data.machine import Joint
+from ..em.identify import Identified
+from ..storage.files import replace_text
+from ..systems.bodies import numbers
+from ..systems.tree import Tree
+from .friction import SHARE, friction_forms
+from .homes import placed
+from .mjcf import MASSLESS, as_it_is, named, sheet_of
+from .sheet import Drive, JointSheet, Sheet
+
+HELD = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
+"""Laws that URDF holds, by name: in the numbers of the bodies and in the damping."""
+FAR = 1e9
+"""Limit of a slide without stops, of an effort or a rate without limit: URDF requires one."""
+
+
+def write_urdf(fitted: Identified, out: Path) -> list[str]:
+    """Write the identified machine to a URDF file, and return what URDF has no place for, a sentence each.
+
+    Raises ExportError where the machine did not come from a file.
+    """
+    system = as_it_is(fitted.model)
+    forms = friction_forms(fitted)
+    sheet, _ = placed(sheet_of(fitted, fitted.model, system, forms), fitted.model.effects)
+    left = [named(effect) for effect in fitted.model.effects if effect.name not in HELD]
+    for joint, form in zip(system.machine.joints, forms, strict=True):
+        form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > SHARE
+        left += [f"friction of {joint.name} beside Coulomb and viscous"] if form_misses else []
+        left += [f"the spring of {joint.name}"] if joint.stiffness else []
+        left += [f"the armature of {joint.name}"] if _armature(system, joint) else []
+    root = ET.Element("robot", name=Path(system.machine.file).stem)
+    root.append(ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} "))
+    ET.SubElement(root, "link", name=_base(system))
+    frames: list[tuple[str, np.ndarray]] = []
+    for i, body in enumerate(system.machine.bodies):
+        parent, pose = frames[body.parent] if body.parent >= 0 else (_base(system), np.eye(4))
+        frames.append(_body(root, sheet, i, parent, pose @ _pose(body.turn, body.place)))
+    ET.indent(root)
+    replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
+    return left
+
+
+def _base(system: Tree) -> str:
+    names = {body.name for body in system.machine.bodies}
+    return next(name for name in ("base", "base_link", "world", "nnap_base") if name not in names)
+
+
+def _armature(system: Tree, joint: Joint) -> float:
+    return float(system.values.get(f"{joint.name}.armature", joint.armature))
+
+
+def _body(root: ET.Element, sheet: Sheet, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
+    """Links and joints of one body at `pose` in the frame of its parent link; its link, and its frame in there."""
+    machine = sheet.system.machine
+    body = machine.bodies[i]
+    own = [j for j, joint in enumerate(machine.joints) if joint.body == i]
+    for k, j in enumerate(own):
+        joint, last = machine.joints[j], j == own[-1]
+        link = body.name if last else f"{body.name}_{k + 1}"
+        anchor = _pose(np.eye(3), joint.anchor)
+        element = ET.SubElement(root, "joint", name=joint.name, type=_kind(joint))
+        _origin(element, pose @ anchor @ _moved(joint, -joint.zero))
+        ET.SubElement(element, "parent", link=parent)
+        ET.SubElement(element, "child", link=link)
+        ET.SubElement(element, "axis", xyz=_text(*joint.axis))
+        _limits(element, joint, sheet.drives.get(j + 1, Drive()))
+        _dynamics(element, sheet.joints[j])
+        parent, pose = link, np.linalg.inv(anchor)
+        if not last:
+            _inertial(ET.SubElement(root, "link", name=link), MASSLESS, np.zeros(3), MASSLESS * np.eye(3))
+    if not own:
+        element = ET.SubElement(root, "joint", name=f"{body.name}_mount", type="fixed")
+        _origin(element, pose)
+        ET.SubElement(element, "parent", link=parent)
+        ET.SubElement(element, "child", link=body.name)
+        pose = np.eye(4)
+    link = ET.SubElement(root, "link", name=body.name)
+    mass, centre, inertia = numbers(body, sheet.system.values)
+    if float(mass) > 0:
+        place = pose @ np.array([*map(float, centre), 1.0])
+        _inertial(link, float(mass), place[:3], np.array([[float(x) for x in row] for row in inertia]))
+    return body.name, pose
+
+
+def _kind(joint: Joint) -> str:
+    return "prismatic" if joint.slide else "revolute" if joint.range else "continuous"
+
+
+def _limits(element: ET.Element, joint: Joint, drive: Drive) -> None:
+    if not (joint.range or joint.slide):
+        return
+    low, high = joint.range or (-FAR, FAR)
+    effort = drive.before if math.isfinite(drive.before) else FAR
+    ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(FAR))
+
+
+def _dynamics(element: ET.Element, own: JointSheet) -> None:
+    viscous = own.form.viscous + own.viscous
+    ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(own.form.coulomb))
+
+
+def _inertial(link: ET.Element, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_text(*centre), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=_text(mass))
+    axes = [(a, b) for a in range(3) for b in range(a, 3)]
+    ET.SubElement(inertial, "inertia", {f"i{'xyz'[a]}{'xyz'[b]}": _text(inertia[a, b]) for a, b in axes})
+
+
+def _origin(element: ET.Element, pose: np.ndarray) -> None:
+    turn = pose[:3, :3]
+    pitch = math.atan2(-turn[2, 0], math.hypot(turn[0, 0], turn[1, 0]))
+    if math.hypot(turn[0, 0], turn[1, 0]) > 1e-9:
+        roll, yaw = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
+    else:  # straight up or down: roll and yaw turn about one axis
+        roll, yaw = 0.0, math.atan2(-turn[0, 1], turn[1, 1])
+    ET.SubElement(element, "origin", xyz=_text(*pose[:3, 3]), rpy=_text(roll, pitch, yaw))
+
+
+def _pose(turn, place) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = turn, place
+    return out
+
+
+def _moved(joint: Joint, by: float) -> np.ndarray:
+    """Motion of a joint by an angle or a distance, in its frame."""
+    axis = np.asarray(joint.axis, float)
+    if joint.slide:
+        return _pose(np.eye(3), by * axis)
+    cross = np.cross(np.eye(3), axis)
+    return _pose(np.eye(3) + math.sin(by) * cross + (1 - math.cos(by)) * cross @ cross, np.zeros(3))
+
+
+def _text(*values: float) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -8,6 +8,7 @@ import pytest
 
 SECONDS = {
     "test_design.py": 130,
+    "test_played.py": 120,
     "test_sensors.py": 100,
     "test_parallel.py": 100,
     "test_loop.py": 100,

@@ -69,7 +69,9 @@ def actuator(
     fields = "\n".join(f"    {name}={literal(value)}," for name, value in numbers.items())
     body = Path(acting.__file__).read_text(encoding="utf-8").partition('"""\n')[2]
     names = ", ".join(dict.fromkeys(effect.name for effect in laws))
-    title = f'"""Laws of {system.machine.file} that MuJoCo has no element for: {names}.  Written by nnap_em {__version__}.'
+    title = (
+        f'"""Laws of {system.machine.file} that MuJoCo has no element for: {names}.  Written by nnap_em {__version__}.'
+    )
     usage = """
 
 It needs NumPy only:

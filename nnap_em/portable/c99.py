@@ -108,7 +108,9 @@ def function(source: Source) -> str:
     lines = [f"void {source.name}({', '.join(arrays)}, double tau[{len(results)}])", "{"]
     whole = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
-        lines += [f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", whole)]
+        lines += [
+            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", whole)
+        ]
         lines += [f"    (void){name};"]
     whole_numbers: set[str] = set()
     for line in source.lines:

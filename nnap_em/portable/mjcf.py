@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
-from ..data.machine import Joint, Machine
+from ..data.machine import Joint
 from ..effects import AbstractEffect
 from ..em.identify import Identified
 from ..model import hooks
@@ -359,7 +359,7 @@ def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], wo
         ET.SubElement(sensors, kind, given | _reading(sheet.sensors.get(gauge.name), step))
     dof = len(machine.joints)
     for name, sensor in sheet.sensors.items():
-        if name in named or name not in machine.states:
+        if name in named or name not in machine.states or not sensor.delay:
             continue
         place = machine.states.index(name)
         kind = "jointvel" if place >= dof else "jointpos"

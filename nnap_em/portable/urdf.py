@@ -38,7 +38,9 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
         left += [f"the spring of {joint.name}"] if joint.stiffness else []
         left += [f"the armature of {joint.name}"] if _armature(system, joint) else []
     root = ET.Element("robot", name=Path(system.machine.file).stem)
-    root.append(ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} "))
+    root.append(
+        ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} ")
+    )
     ET.SubElement(root, "link", name=_base(system))
     frames: list[tuple[str, np.ndarray]] = []
     for i, body in enumerate(system.machine.bodies):

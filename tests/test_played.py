@@ -1,0 +1,262 @@
+"""Laws of the catalogue played by MuJoCo from the written file, beside the library."""
+
+import ctypes
+import dataclasses
+import importlib.util
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from helpers import optimised
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.mjcf import MachineError, read_machine
+from nnap_em.data.rig import read_rig
+from nnap_em.effects import catalogue
+from nnap_em.effects.function import Axis, InputAxis, UnknownFunction
+from nnap_em.effects.periodic import PeriodicForce
+from nnap_em.em.identify import Identified, begin
+from nnap_em.portable.c99 import torques, write_c
+from nnap_em.portable.draws import write_draws
+from nnap_em.portable.export import ExportError
+from nnap_em.portable.homes import HOMES, REASONS
+from nnap_em.portable.mjcf import beside, write_mjcf
+from nnap_em.portable.urdf import write_urdf
+from nnap_em.systems import specs
+
+a, c = jnp.asarray, catalogue
+CART = """<mujoco model="two"><compiler angle="radian"/><worldbody>
+<body name="cart"><joint name="rail" type="slide" axis="1 0 0"/>
+<inertial pos="0 0 0" mass="1" diaginertia="0.002 0.002 0.002"/>
+<body name="pole"><joint name="pole" axis="0 1 0"/>
+<inertial pos="0 0 -0.25" mass="0.5" diaginertia="0.005 0.005 0.0001"/><site name="hand" pos="0 0 -0.4"/></body></body>
+</worldbody><actuator><motor name="push" joint="rail"/><motor name="turn" joint="pole" gear="2"/></actuator></mujoco>"""
+ARM = CART.replace('name="rail" type="slide" axis="1 0 0"', 'name="rail" axis="0 1 0"')
+RIG = """format = 1
+name = "two"
+[model]
+type = "mjcf"
+file = "two.xml"
+friction = "none"
+[input]
+columns = ["push", "turn"]
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["rail", "pole"]
+"""
+ROWS, X0 = 150, np.array([0.0, 0.3, 0.0, 0.0])
+
+
+def _fit(folder: Path, effects=(), xml: str = CART, more: str = "") -> tuple[Identified, Dataset]:
+    (folder / "two.xml").write_text(xml)
+    (folder / "rig.toml").write_text(RIG + more)
+    rig, rng, t = read_rig(folder / "rig.toml", specs), np.random.default_rng(0), 0.01 * np.arange(ROWS)
+    tones = [np.sin(2 * np.pi * rng.uniform(0.3, 1.8, (4, 1)) * t + rng.uniform(0, 6.28, (4, 1))) for _ in range(2)]
+    u = np.stack([size * 1.5 * tone.mean(axis=0) for size, tone in zip((6.0, 0.4), tones, strict=True)], axis=-1)
+    data = Dataset(t[None], u[None], np.stack([np.sin(3 * t), np.cos(2 * t)], -1)[None], np.ones((1, ROWS), bool))
+    fitted = begin(rig, data, key=jax.random.key(0), effects=effects)
+    return fitted._replace(state=fitted.state._replace(hessian=jnp.eye(fitted.state.hessian.shape[0]))), data
+
+
+def _library(fitted: Identified, data: Dataset) -> np.ndarray:
+    """Coordinates of the library's own motion, integrated finely."""
+    model = dataclasses.replace(fitted.model, substeps=40)
+    x = jnp.concatenate([a(X0), jnp.zeros(model.log_q.shape[0] - 4)])
+    with optimised():
+        step = lambda x, u: (model.transition(x, u), x)  # noqa: E731
+        return np.asarray(jax.lax.scan(step, x, model.inputs(jax.tree.map(lambda v: a(v[0]), data)))[1])[:, :2]
+
+
+def _module(path: Path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _played(path: Path, data: Dataset, laws=None) -> np.ndarray:
+    """Coordinates of MuJoCo's motion."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    state, out = mujoco.MjData(model), []
+    places = [int(model.joint(name).qposadr[0]) for name in ("rail", "pole")]
+    state.qpos[places] = X0[:2]
+    for name, at in zip(("rail", "pole"), places, strict=True):
+        if any(model.joint(j).name == f"{name}_rotor" for j in range(model.njnt)):
+            state.joint(f"{name}_rotor").qpos[:] = state.qpos[at]
+    actuator = laws.Actuator(model, laws.LAWS) if laws else None
+    mujoco.set_mjcb_control(actuator)
+    try:
+        for u in data.u[0]:
+            out.append(state.qpos[places].copy())
+            (actuator.command if actuator else state.ctrl)[:] = u
+            mujoco.mj_step(model, state, round(0.01 / model.opt.timestep))
+    finally:
+        mujoco.set_mjcb_control(None)
+    return np.array(out)
+
+
+HOUSED = {
+    "torsional_spring": (c["torsional_spring"].of(0.8, 0.3, 0.1, 0.2, joint=2), 1e-6),
+    "torque_offset": (c["torque_offset"](a(0.3), joint=2), 1e-6),
+    "cogging": (c["cogging"].of(0.2, 0.1, 5.97, 6.0, 0.05, 0.03, joint=2), 1e-6),
+    "motor_back_emf": (c["motor_back_emf"](a(0.5), joint=1), 1e-6),
+    "air_drag": (c["air_drag"](a(0.7), joint=1), 1e-6),
+    "payload": (c["payload"](a(0.2), joint=2), 1e-6),
+    "base_tilt": (c["base_tilt"](a(0.1)), 1e-6),
+    "motor_gain": (c["motor_gain"](a(0.1), joint=1), 1e-6),
+    "saturation": (c["saturation"](a(3.0), joint=1), 1e-6),
+    "input_delay": (c["input_delay"](a(0.0234), joint=1), 0.01),
+    "actuator_lag": (c["actuator_lag"](a(0.03), joint=2), 0.01),
+    "joint_flexibility": (c["joint_flexibility"].of(*np.log([40.0, 0.01, 0.1]), joint=2), 1e-5),
+    "backlash": (c["backlash"].of(0.08, *np.log([0.01, 0.25, 60.0]), joint=2), 0.01),
+    "hard_stop": (c["hard_stop"].of(0.3, -0.4, *np.log([30.0, 0.6]), 1.0, 0.0, joint=2), 0.03),
+}
+"""Laws that the file holds, and the largest difference of the motion, over what the law does.
+
+A stop of MuJoCo only pushes, that of the catalogue also holds a joint back which leaves it: hence the wider bound.
+"""
+
+
+@pytest.mark.parametrize("name", HOUSED)
+def test_a_law_in_the_file_moves_as_in_the_library(tmp_path, name):
+    effect, bound = HOUSED[name]
+    xml = ARM if name == "base_tilt" else CART
+    (fitted, data), (bare, _) = _fit(tmp_path, (effect,), xml), _fit(tmp_path, (), xml)
+    assert write_mjcf(fitted, tmp_path / "out.xml", alone=True) == []
+    with_law, without = _library(fitted, data), _library(bare, data)
+    off = np.linalg.norm(_played(tmp_path / "out.xml", data) - with_law)
+    assert off < bound * np.linalg.norm(with_law - without)
+
+
+HOMELESS = {
+    "dead_zone": (c["dead_zone"](a(0.8), joint=1),),
+    "one_sided_loss": (c["one_sided_loss"](a(0.3), -1, "push", joint=1),),
+    "in a chain": (
+        c["saturation"](a(4.0), joint=1), c["dead_zone"](a(0.8), joint=1), c["motor_gain"](a(-0.1), joint=1)
+    ),
+    "eddy_brake": (c["eddy_brake"](a(0.05), a(0.02), joint=2),),
+    "load_friction": (c["load_friction"](a(0.1), a(0.1), names=("push", "drail"), joint=1),),
+    "unknown_function": (
+        UnknownFunction(a(0.2 * np.sin(np.arange(20.0))), (Axis(("pole",), -2.0, 2.0, False, 20),), joint=2),
+    ),
+    "of an input": (
+        UnknownFunction(a(0.2 * np.sin(np.arange(9.0))), (InputAxis(("push",), -8.0, 8.0, False, 9, index=0),), joint=1),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOMELESS)
+def test_a_law_in_the_module_moves_as_in_the_library(tmp_path, name):
+    (fitted, data), (bare, _) = _fit(tmp_path, HOMELESS[name]), _fit(tmp_path)
+    assert write_mjcf(fitted, tmp_path / "out.xml")
+    with_law, without = _library(fitted, data), _library(bare, data)
+    off = np.linalg.norm(_played(tmp_path / "out.xml", data, _module(beside(tmp_path / "out.xml"))) - with_law)
+    assert off < 1e-6 * np.linalg.norm(with_law - without)
+
+
+def test_a_force_of_time_and_sensors_of_the_module_are_those_of_the_library(tmp_path):
+    force = PeriodicForce(a([0.3, 0.1]), a([0.0, 0.2]), a(1.3), harmonics=2, joint=1)
+    effects = force, c["sensor_bias"](a(0.02), channel="rail"), c["sensor_scale"](a(0.1), channel="pole")
+    fitted, _ = _fit(tmp_path, effects)
+    write_mjcf(fitted, tmp_path / "out.xml")
+    laws = _module(beside(tmp_path / "out.xml"))
+    actuator = laws.Actuator(mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), laws.LAWS)
+    found = actuator.torque(np.zeros(2), np.zeros(2), np.zeros(2), 0.37)
+    np.testing.assert_allclose(found, [float(force.waveform(a(1.3 * 0.37))), 0.0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(actuator.reading(np.array([0.5, 0.4])), [0.52, 0.44], rtol=1e-12)
+
+
+def test_every_law_of_the_catalogue_has_a_home_or_a_reason():
+    assert set(HOMES) | set(REASONS) == set(catalogue) and not set(HOMES) & set(REASONS)
+
+
+def test_a_law_without_a_home_is_refused_where_the_file_stands_alone(tmp_path):
+    fitted, _ = _fit(tmp_path, HOMELESS["dead_zone"])
+    with pytest.raises(ExportError, match="dead_zone at joint 1.*; leave out --alone"):
+        write_mjcf(fitted, tmp_path / "out.xml", alone=True)
+    assert not (tmp_path / "out.xml").exists()
+
+
+def test_a_file_with_passive_motors_is_not_read_as_if_it_had_none(tmp_path):
+    fitted, _ = _fit(tmp_path, (HOUSED["cogging"][0],))
+    write_mjcf(fitted, tmp_path / "out.xml")
+    with pytest.raises(MachineError, match="pole_cogging1"):
+        read_machine(tmp_path / "out.xml")
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_compiled_c_gives_the_torques_of_the_library(tmp_path):
+    position = c["position_dependent_friction"].of(0.3, 0.2, 2.0, joint=2)
+    laws = (HOUSED["payload"][0], HOUSED["cogging"][0], position, *HOMELESS["load_friction"])
+    fitted, _ = _fit(tmp_path, (*laws, *HOMELESS["unknown_function"], *HOMELESS["dead_zone"]))
+    assert write_c(fitted, tmp_path / "arm.c") == ["dead_zone at joint 1"]
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "arm.c", "-o", "arm.so", "-lm"]
+    subprocess.run(["gcc", *flags], cwd=tmp_path, check=True)
+    compiled, model = ctypes.CDLL(str(tmp_path / "arm.so")), torques(fitted)
+    rng, array = np.random.default_rng(0), lambda values: (ctypes.c_double * len(values))(*values)
+    for _ in range(20):
+        q, v, acceleration = rng.normal(size=(3, 2))
+        out = array([0.0, 0.0])
+        compiled.arm_feedforward(array(q), array(v), array(acceleration), array([0.3]), out)
+        np.testing.assert_allclose(
+            out, model.feedforward(a(q), a(v), a(acceleration), a([0.3]))[0], rtol=1e-9, atol=1e-9
+        )
+        compiled.arm_friction(array(v), out)
+        np.testing.assert_allclose(out, fitted.model.unknown(a(v)), rtol=1e-9, atol=1e-9)
+
+
+def test_the_feed_forward_torque_gives_its_acceleration(tmp_path):
+    fitted, _ = _fit(tmp_path, (HOUSED["payload"][0], HOUSED["cogging"][0], *HOMELESS["eddy_brake"]))
+    q, v, wanted = np.random.default_rng(1).normal(size=(3, 2))
+    tau = torques(fitted).feedforward(a(q), a(v), a(wanted), jnp.zeros(1))[0] / a(
+        [1.0, 2.0]
+    )  # the second has a gear of 2
+    model = fitted.model
+    u = jax.tree.map(
+        lambda x: x[0], model.inputs(Dataset(np.zeros(1), np.asarray(tau)[None], np.zeros((1, 2)), np.ones(1, bool)))
+    )
+    np.testing.assert_allclose(model.rate(a([*q, *v]), u, jnp.zeros(2))[2:4], wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("file", ["branch.xml", "arm.urdf"])
+def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file):
+    path = Path(__file__).parent / "machines" / file
+    machine = read_machine(path)
+    (tmp_path / file).write_text(path.read_text())
+    text = RIG.replace("two.xml", file).replace('["rail", "pole"]', f'["{machine.joints[0].name}"]')
+    (tmp_path / "rig.toml").write_text(text.replace('columns = ["push", "turn"]', 'columns = ["u"]\njoints = [1]'))
+    rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
+    logs = Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
+    fitted = begin(rig, logs, key=jax.random.key(0))
+    write_urdf(fitted, tmp_path / "out.urdf")
+    again, model = read_machine(tmp_path / "out.urdf"), mujoco.MjModel.from_xml_path(str(tmp_path / "out.urdf"))
+    rubs = [[(joint.damping, joint.dry) for joint in one.joints] for one in (machine, again)]
+    np.testing.assert_allclose(*rubs, atol=1e-9)
+    assert sum(body.mass for body in again.bodies) == pytest.approx(sum(body.mass for body in machine.bodies), abs=1e-9)
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, model.nv)):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        own = np.diag([joint.armature for joint in machine.joints])
+        np.testing.assert_allclose(mass, fitted.model.system.mass(a(q)) - own, atol=1e-9)
+
+
+def test_draws_have_the_spread_of_the_posterior(tmp_path):
+    fitted, _ = _fit(tmp_path, more="[model.uncertain]\npole.mass = { std = 0.02 }\n")
+    write_draws(fitted, tmp_path / "ranges", 64, key=jax.random.key(0))
+    mass = np.genfromtxt(tmp_path / "ranges" / "draws.csv", delimiter=",", names=True, deletechars="")["pole.mass"]
+    assert abs(mass.mean() - 0.5) < 4 * 0.02 / 8  # the curvature is that of the prior
+    assert abs(mass.std() / 0.02 - 1) < 4 / np.sqrt(128)
+    for i in (0, 63):
+        model = mujoco.MjModel.from_xml_path(str(tmp_path / "ranges" / f"draw_{i:02d}.xml"))
+        assert model.body("pole").mass[0] == pytest.approx(mass[i], rel=1e-6)

@@ -149,7 +149,9 @@ HOMELESS = {
         UnknownFunction(a(0.2 * np.sin(np.arange(20.0))), (Axis(("pole",), -2.0, 2.0, False, 20),), joint=2),
     ),
     "of an input": (
-        UnknownFunction(a(0.2 * np.sin(np.arange(9.0))), (InputAxis(("push",), -8.0, 8.0, False, 9, index=0),), joint=1),
+        UnknownFunction(
+            a(0.2 * np.sin(np.arange(9.0))), (InputAxis(("push",), -8.0, 8.0, False, 9, index=0),), joint=1
+        ),
     ),
 }  # fmt: skip
 
@@ -181,7 +183,7 @@ def test_every_law_of_the_catalogue_has_a_home_or_a_reason():
 
 def test_a_law_without_a_home_is_refused_where_the_file_stands_alone(tmp_path):
     fitted, _ = _fit(tmp_path, HOMELESS["dead_zone"])
-    with pytest.raises(ExportError, match="dead_zone at joint 1.*; leave out --alone"):
+    with pytest.raises(ExportError, match=r"dead_zone at joint 1.*; leave out --alone"):
         write_mjcf(fitted, tmp_path / "out.xml", alone=True)
     assert not (tmp_path / "out.xml").exists()
 

@@ -67,7 +67,7 @@ class Actuator:
             at = model.actuator_ctrladr[i]
             force = data.actuator_force[model.actuator_outadr[i]]
             if not model.actuator_actnum[i] and not model.actuator_delay[i]:
-                limits = model.actuator_ctrlrange[at] if model.actuator_ctrllimited[at] else (-np.inf, np.inf)
-                force = model.actuator_gainprm[i, 0] * np.clip(data.ctrl[at], *limits)
+                low, high = model.actuator_ctrlrange[at] if model.actuator_ctrllimited[at] else (-np.inf, np.inf)
+                force = model.actuator_gainprm[i, 0] * np.clip(data.ctrl[at], low, high)
             out[place] += model.actuator_gear[i, 0] * force
         return out

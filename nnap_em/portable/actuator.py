@@ -13,6 +13,7 @@ from ..effects.base import Scene
 from ..em.identify import Identified
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
+from ..systems.tree import Tree
 from . import acting
 from .export import literal, unrolled
 from .homes import of_command
@@ -36,6 +37,7 @@ def actuator(
     Raises ExportError where NumPy cannot follow a law.
     """
     rig, system = fitted.rig, model.system
+    assert isinstance(system, Tree)
     laws = tuple(effect for effect, _ in homeless if _momentary(effect, model.dt))
     dof, driven = len(system.coordinates), [motor for motor in motors if motor.joint + 1 in system.joints]
 

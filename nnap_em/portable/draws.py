@@ -18,7 +18,7 @@ TABLE = "draws.csv"
 
 
 def write_draws(fitted: Identified, out: Path, count: int, *, key: PRNGKeyArray) -> None:
-    """Write `count` draws of the posterior to the folder `out`: draws.csv, and draw_000.xml, ... for a machine of a file.
+    """Write `count` draws of the posterior to the folder `out`: draws.csv, and draw_00.xml, ... for one of a file.
 
     A row of draws.csv has friction per joint (`JOINT.coulomb`, `.breakaway`, `.stribeck`, `.viscous`, `.offset`), the
     estimated parameters of the machine, and those of every effect (`EFFECT.JOINT.NAME`), in SI units.

@@ -24,7 +24,6 @@ DIPS = tuple(np.geomspace(0.01, 0.5, 12))
 """Stribeck velocities that are tried, as shares of the largest velocity."""
 NODES = 160
 """Velocities at which a learned curve is read."""
-Nodes = Float[np.ndarray, " node"]
 
 
 class FrictionForm(NamedTuple):
@@ -63,8 +62,8 @@ def friction_form(
 ) -> FrictionForm:
     """Form nearest to a curve of friction torque [N m] over velocity [rad/s] of standard deviation `std` [N m].
 
-    Weighted least squares with coefficients that never push, for a grid of dips and smooth signs. A dip or a constant is
-    kept only where it explains more than `SIMPLER` of the curve, and more than a part of what the curve may be wrong.
+    Weighted least squares with coefficients that never push, for a grid of dips and smooth signs. A dip or a constant
+    is kept only where it explains more than `SIMPLER` of the curve, and more than a part of its uncertainty.
     """
     top = float(np.max(np.abs(v)))
     weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
@@ -110,7 +109,14 @@ def _sign(v: Float[np.ndarray, " node"], smooth: float) -> Float[np.ndarray, " n
     return np.tanh(v / smooth) if smooth else np.sign(v)
 
 
-def _fit(v: Nodes, torque: Nodes, weight: Nodes, smooth: float, dip: float, constant: bool) -> FrictionForm:
+def _fit(
+    v: Float[np.ndarray, " node"],
+    torque: Float[np.ndarray, " node"],
+    weight: Float[np.ndarray, " node"],
+    smooth: float,
+    dip: float,
+    constant: bool,
+) -> FrictionForm:
     """Coefficients of one place of the grid."""
     sign = _sign(v, smooth)
     columns = [sign, v]
@@ -126,7 +132,14 @@ def _fit(v: Nodes, torque: Nodes, weight: Nodes, smooth: float, dip: float, cons
     return FrictionForm(*map(float, (found[0], breakaway, dip or 1.0, found[1], offset, smooth, top, share)))
 
 
-def _finer(v: Nodes, torque: Nodes, weight: Nodes, form: FrictionForm, constant: bool, dips: bool) -> FrictionForm:
+def _finer(
+    v: Float[np.ndarray, " node"],
+    torque: Float[np.ndarray, " node"],
+    weight: Float[np.ndarray, " node"],
+    form: FrictionForm,
+    constant: bool,
+    dips: bool,
+) -> FrictionForm:
     """Form between the places of the grid."""
     start = np.log([max(form.smooth, 1e-4 * form.fastest), form.stribeck][: 1 + dips])
 

@@ -19,7 +19,7 @@ Home = Callable[[Sheet, Any], Sheet]
 
 
 class Placed(NamedTuple):
-    """A sheet with all laws that MuJoCo holds, and those that it does not hold with the reason, in the order of the model."""
+    """A sheet with all laws that MuJoCo holds, and the others with the reason, in the order of the model."""
 
     sheet: Sheet
     homeless: tuple[tuple[AbstractEffect, str], ...]
@@ -28,8 +28,8 @@ class Placed(NamedTuple):
 def placed(sheet: Sheet, effects: Sequence[AbstractEffect]) -> Placed:
     """The sheet with laws added.
 
-    A law of the command without a place acts before all that the file does with it, so that laws of the command which come
-    before it have none either; delays may change places with it.
+    A law of the command without a place acts before all that the file does with it, so that laws of the command
+    which come before it have none either; delays may change places with it.
     """
     homeless = []
     for place, effect in enumerate(effects):
@@ -67,7 +67,7 @@ def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect |
 
 
 def _spring(sheet: Sheet, effect: Any) -> Sheet:
-    pull = tuple(map(float, (effect.moment, -effect.slope, -effect.square, -effect.cube)))
+    pull = float(effect.moment), -float(effect.slope), -float(effect.square), -float(effect.cube)
     return sheet.with_joint(effect.joint, pull=added(sheet.joint(effect.joint).pull, pull))
 
 

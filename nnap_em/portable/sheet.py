@@ -36,7 +36,7 @@ class Contact(NamedTuple):
 
 
 class Rotor(NamedTuple):
-    """A motor of its own inertia, joined to its joint by a spring and damper, or by a contact on either side of a play."""
+    """A motor of its own inertia, joined to its joint by a spring and damper, or by contacts about a play."""
 
     inertia: float
     """[kg m^2 or kg]"""

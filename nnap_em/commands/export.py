@@ -8,7 +8,7 @@ from ..em.store import load, model_file
 from ..portable.c99 import write_c
 from ..portable.draws import TABLE, write_draws
 from ..portable.export import export
-from ..portable.mjcf import beside, write_mjcf
+from ..portable.mjcf import write_mjcf
 from ..portable.urdf import write_urdf
 from .common import Say
 
@@ -19,7 +19,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
     if args.mjcf is not None:
         for line in write_mjcf(fitted, args.mjcf, alone=args.alone):
             say(f"{args.mjcf} has no place for {line}")
-        say(f"wrote {args.mjcf}; laws in {beside(args.mjcf).name}, where it is named above")
+        say(f"wrote {args.mjcf}")
     if args.urdf is not None:
         for line in write_urdf(fitted, args.urdf):
             say(f"{args.urdf} has no place for {line}")

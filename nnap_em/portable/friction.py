@@ -71,7 +71,7 @@ def friction_form(
     fits: dict[tuple[bool, bool], FrictionForm] = {}
     for smooth, dip, constant in itertools.product([top * share for share in SMOOTH], dips, (False, True)):
         form = _fit(v, torque, weight, smooth, dip, constant)
-        kind = constant, dip > 0
+        kind = constant, bool(dip > 0)
         if kind not in fits or form.missed < fits[kind].missed:
             fits[kind] = form
     fits = {kind: _finer(v, torque, weight, form, *kind) for kind, form in fits.items()}

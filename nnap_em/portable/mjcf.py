@@ -57,6 +57,7 @@ def write_mjcf(fitted: Identified, out: Path, *, alone: bool = False) -> list[st
     Raises ExportError where the machine did not come from a file; with `alone`, before anything is written, where a law
     has no place in MuJoCo.
     """
+    as_it_is(fitted.model)
     return write_model(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
 
 

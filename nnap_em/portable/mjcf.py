@@ -57,7 +57,7 @@ def write_mjcf(fitted: Identified, out: Path, *, alone: bool = False) -> list[st
     Raises ExportError where the machine did not come from a file; with `alone`, before anything is written, where a law
     has no place in MuJoCo.
     """
-    as_it_is(fitted.model)
+    as_it_is(fitted, fitted.model)
     return write_model(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
 
 
@@ -65,7 +65,7 @@ def write_model(
     fitted: Identified, model: StateSpaceModel, forms: Sequence[FrictionForm], out: Path, *, alone: bool = False
 ) -> list[str]:
     """`write_mjcf` for a model and friction near those of a fit."""
-    system = as_it_is(model)
+    system = as_it_is(fitted, model)
     sheet, homeless = placed(sheet_of(fitted, model, system, forms), model.effects)
     sheet = with_dips(sheet)
     if alone and homeless:
@@ -100,14 +100,14 @@ def beside(out: Path) -> Path:
     return out.with_name(f"{out.stem.replace('-', '_')}_actuator.py")
 
 
-def as_it_is(model: StateSpaceModel) -> Tree:
+def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
     """The machine with all that is estimated of its bodies.
 
     Raises ExportError where it did not come from a file.
     """
     system = model.system
     if not isinstance(system, Tree):
-        reason = f"the machine {type(system).__name__.lower()!r} is built in, and has no file to be written back to"
+        reason = f"the machine {fitted.rig.system!r} is built in, and has no file to be written back to"
         raise ExportError(f'{reason}; declare it by type = "mjcf" and its file')
     true = hooks.machine(model.effects, system, jnp.zeros(()))
     assert isinstance(true, Tree)

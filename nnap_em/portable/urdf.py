@@ -28,7 +28,7 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
 
     Raises ExportError where the machine did not come from a file.
     """
-    system = as_it_is(fitted.model)
+    system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
     sheet, _ = placed(sheet_of(fitted, fitted.model, system, forms), fitted.model.effects)
     left = [named(effect) for effect in fitted.model.effects if effect.name not in HELD]

@@ -1,0 +1,85 @@
+"""The two figures of `measured_loop.py`: the force that the model lacks, and how far predictions are off."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO, head, styled
+
+
+class Lack(NamedTuple):
+    """Torque that a model lacks at one joint, and laws that may explain it, by sample."""
+
+    title: str
+    angle: Float[Any, " sample"]
+    """[rad]"""
+    torque: Float[Any, " sample"]
+    """[N m]"""
+    found: Float[Any, " sample"] | None = None
+    """Torque of the laws that the search found [N m]; None: it found none."""
+    true: Float[Any, " sample"] | None = None
+    """Torque of the law that was taken out of the log [N m]."""
+
+
+BINS = 24
+FEWEST = 20
+"""Samples of a bin whose mean is drawn."""
+
+
+@styled
+def finding_figure(lacks: Sequence[Lack], joint: int) -> Figure:
+    """The missing torque against the angle, a panel for each log; samples, and means over bins of the angle.
+
+    Every torque is drawn without its mean: a constant is part of the learned friction.
+    """
+    figure = Figure(figsize=(3.7 * len(lacks) + 0.3, 3.7), layout="constrained")
+    axes = figure.subplots(1, len(lacks), sharey=True, squeeze=False)[0]
+    for ax, lack in zip(axes, lacks, strict=True):
+        _lack(ax, lack)
+        ax.set(title=lack.title, xlabel=f"angle of joint {joint} [rad]")
+    reach = 1.6 * max(np.percentile(np.abs(lack.torque - lack.torque.mean()), 97) for lack in lacks)
+    axes[0].set(ylabel="torque that the model lacks [N m]", ylim=(-reach, reach))
+    head(figure, f"What the model of the machine lacks at joint {joint}", list(axes))
+    return figure
+
+
+def _lack(ax: Axes, lack: Lack) -> None:
+    torque = lack.torque - np.mean(lack.torque)
+    ax.plot(lack.angle, torque, ".", color=READING, ms=1.6, mew=0, alpha=0.5, label="each sample", rasterized=True)
+    ax.plot(*_means(lack.angle, torque), "o", color=BEFORE, ms=4, label="their mean", zorder=3)
+    if lack.found is not None:
+        ax.plot(*_means(lack.angle, lack.found), color=AFTER, lw=2.2, label="law that was found", zorder=4)
+    if lack.true is not None:
+        dashes = (0, (4, 2))
+        ax.plot(*_means(lack.angle, lack.true), color=TRUTH, ls=dashes, lw=1.4, label="law taken out", zorder=5)
+    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+
+
+def _means(angle: Float[Any, " sample"], torque: Float[Any, " sample"]) -> tuple[list[float], list[float]]:
+    """Centres of bins of the angle, and the mean torque in each, without the mean of all."""
+    edges = np.linspace(*np.percentile(angle, (0.5, 99.5)), BINS + 1)
+    place = np.digitize(angle, edges) - 1
+    filled = [b for b in range(BINS) if np.count_nonzero(place == b) >= FEWEST]
+    centres = [float(np.mean(angle[place == b])) for b in filled]
+    return centres, [float(np.mean(torque[place == b]) - np.mean(torque)) for b in filled]
+
+
+@styled
+def errors_figure(horizons: Sequence[float], errors: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """Root mean square prediction errors by horizon, `errors[model][column]`; the last model is the goal."""
+    looks = ({"color": BEFORE, "marker": "s"}, {"color": AFTER, "marker": "o"}, {"color": TRUTH, "ls": (0, (4, 2))})
+    columns = [name for name in next(iter(errors.values())) if name.startswith("theta")]
+    figure = Figure(figsize=(3.7 * len(columns) + 0.3, 3.5), layout="constrained")
+    axes = figure.subplots(1, len(columns), squeeze=False)[0]
+    for ax, column in zip(axes, columns, strict=True):
+        for (label, values), look in zip(errors.items(), looks, strict=True):
+            ax.plot(horizons, values[column], label=label, ms=4, **look)
+        ax.set(title=f"joint {column.removeprefix('theta')}", xlabel="time predicted ahead [s]", xlim=(0, None))
+        ax.set_ylim(0, None)
+    axes[0].set_ylabel("root mean square error [rad]")
+    head(figure, "How far predictions of unseen recordings are off", list(axes))
+    return figure

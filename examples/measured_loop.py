@@ -94,8 +94,14 @@ def diagnosed(source: list[Path], out: Path, law: str | None) -> Diagnosed:
     ):
         if status := nnap_em([*command]):
             raise SystemExit(status)
-    report = json.loads((found / "report.json").read_text())
-    return Diagnosed(folder, report, load(found / "before.npz"), load(found / "after.npz"))
+    return read(out)
+
+
+def read(out: Path) -> Diagnosed:
+    """What `diagnosed` wrote into a folder."""
+    report = json.loads((out / "found" / "report.json").read_text())
+    models = (load(out / "found" / f"{name}.npz") for name in ("before", "after"))
+    return Diagnosed(out / "data", report, *models)
 
 
 def errors(fitted: Identified, folder: Path) -> dict[str, list[float]]:

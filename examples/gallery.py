@@ -8,6 +8,7 @@ A run leaves its arrays in `out/gallery/NAME.npz` and is not repeated where they
 """
 
 import argparse
+import shutil
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -191,6 +192,7 @@ def arrays(name: str, out: Path) -> Arrays:
     """What a run found, from its file where there is one."""
     file = out / f"{name}.npz"
     if not file.exists():
+        shutil.rmtree(out / name, ignore_errors=True)  # of a run that was stopped
         told = PICTURES[name].run(out / name)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(file, **told)

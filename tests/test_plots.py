@@ -6,8 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.effects.base import Curve
 from nnap_em.em.identify import FrictionTable
+from nnap_em.em.predict import Prediction
+from nnap_em.report.diagnosis import _prediction_pictures
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure
 from nnap_em.report.friction_plots import friction_figure
@@ -70,6 +74,20 @@ def drawn(request):
         "friction": friction_figure({"before": table, "after": table}, names, visited),
         "prediction": prediction_figure(found.t[0], found.state[0], names, both, 1.0),
     }
+
+
+def test_the_longest_test_sequences_are_those_to_choose_from():
+    """Of seven, the five longest, longest first."""
+    found, names = _found(1), _names(1)
+    length = np.asarray([50, 200, 60, 70, 80, 90, 40, 100])
+    valid = np.arange(ROWS) < length[:, None]
+    data = Dataset(found.t, found.u, found.state, valid)
+    files = tuple(f"{n}.csv" for n in length)
+    prediction = Prediction(jnp.asarray(found.state), jnp.ones_like(found.state), jnp.asarray(valid))
+    pictures = _prediction_pictures({"before": prediction}, names, Logs(files, data, ()))
+    assert [picture.choice for picture in pictures] == ["200.csv", "100.csv", "90.csv", "80.csv", "70.csv"]
+    (alone,) = _prediction_pictures({"before": prediction}, names, Logs(files[:1], Dataset(*(a[:1] for a in data)), ()))
+    assert alone.choice == ""
 
 
 def test_every_figure_can_be_read_whatever_the_number_of_joints(drawn):

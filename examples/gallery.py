@@ -54,15 +54,15 @@ def _band(ax: Axes, x: Any, mean: Any, std: Any, colour: str, label: str) -> Non
 
 
 def friction(figure: Figure, d: Arrays, ink: Ink) -> None:
-    """Two joints side by side."""
+    """Two joints side by side, about rest."""
     axes = figure.subplots(1, 2)
     for joint, ax in enumerate(axes, 1):
-        mine, true = d["found_joint"] == joint, d["true_joint"] == joint
+        mine, true = (
+            (d[f"{side}_joint"] == joint) & (np.abs(d[f"{side}_velocity"]) < 4.0) for side in ("found", "true")
+        )
         v = d["found_velocity"][mine]
         _band(ax, v, d["found_torque"][mine], d["found_torque_std"][mine], ink.learned, "learned")
-        at = d["true_velocity"][true]
-        inside = (at >= v.min()) & (at <= v.max())
-        ax.plot(at[inside], d["true_torque"][true][inside], color=ink.truth, label="true", **TRUE)
+        ax.plot(d["true_velocity"][true], d["true_torque"][true], color=ink.truth, label="true", **TRUE)
         ax.set(title=f"joint {joint}, {'read' if joint == 1 else 'not read'}", xlabel="velocity [rad/s]")
     axes[0].set_ylabel("friction [N m]")
     axes[0].legend()

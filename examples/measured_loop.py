@@ -1,7 +1,7 @@
 """A real acrobot, from public logs to a finding: as it was recorded, and with one effect more than its log says.
 
 Eight swing-ups of a double pendulum are downloaded (14 MB, kept in the user's cache), brought to one grid by
-`nnap-em import`, and diagnosed twice by `nnap-em diagnose`.  The second time a law is taken out of the torque log:
+`nnap-em import`, and diagnosed twice by `nnap-em diagnose`.  For the second time a law is taken out of the torque log:
 where the motor gave u, the log says u minus the torque of the law.  For a reader of that log the machine has the law in
 addition, with parameters that are known exactly; everything else stays real.  Written into `out/measured_loop/`: the
 logs, both reports, `finding.png` and `errors.png`.
@@ -13,8 +13,11 @@ logs, both reports, `finding.png` and `errors.png`.
 
 import argparse
 import json
+import os
 import shutil
+import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,15 +25,14 @@ import jax
 import numpy as np
 import plant
 from measured_figures import Lack, errors_figure, finding_figure
-from recordings import RecordingError, recordings
+from recordings import RecordingError, beginning, recordings, write
 
 from nnap_em import Identified, horizon_errors, load, predict, read_logs
 from nnap_em.commands.cli import main as nnap_em
+from nnap_em.commands.common import set_up
 from nnap_em.residual.residual import residual
 
 RIG = Path(__file__).resolve().parent / "machines" / "dfki_acrobot.toml"
-SECONDS = 5.0
-"""Of each recording that are used: most of them balance upright afterwards, and show little."""
 TEST = 2
 """Last recordings, which no fit sees."""
 LAWS: dict[str, dict[str, Any]] = {
@@ -52,24 +54,14 @@ def torque(name: str, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return plant.JOINT[name](LAWS[name], q, v)
 
 
-def write_log(recording: Path, out: Path, law: str | None) -> None:
-    """The first seconds of a recording, with the law taken out of the torque of its joint."""
-    with recording.open() as file:
-        names = file.readline().strip().split(",")
-        rows = np.loadtxt(file, delimiter=",")
-    rows = rows[rows[:, names.index("time")] <= SECONDS]
-    if law is not None:
-        drive, q, v = (names.index(f"{name}_meas{LAWS[law]['joint']}") for name in ("tau", "pos", "vel"))
-        rows[:, drive] -= torque(law, rows[:, q], rows[:, v])
-    np.savetxt(out / recording.name, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-
-
 def write_logs(source: list[Path], out: Path, law: str | None) -> list[Path]:
-    """All recordings, cut and, where a law is named, changed."""
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
+    """The beginnings of all recordings; where a law is named, it is taken out of the torque of its joint."""
     for recording in source:
-        write_log(recording, out, law)
+        names, rows = beginning(recording)
+        if law is not None:
+            drive, q, v = (names.index(f"{name}_meas{LAWS[law]['joint']}") for name in ("tau", "pos", "vel"))
+            rows[:, drive] -= torque(law, rows[:, q], rows[:, v])
+        write(out / recording.name, names, rows)
     return sorted(out.iterdir())
 
 
@@ -83,22 +75,49 @@ class Diagnosed(NamedTuple):
     after: Identified
 
 
-def diagnosed(source: list[Path], out: Path, law: str | None) -> Diagnosed:
-    """Write logs, bring them to one grid, and find what the model lacks; raises SystemExit where a command fails."""
-    logs, folder, found = (out / name for name in ("logs", "data", "found"))
-    shutil.rmtree(folder, ignore_errors=True)
-    paths = map(str, write_logs(source, logs, law))
-    for command in (
-        ("import", *paths, "--rig", str(RIG), "--out", str(folder), "--test", str(TEST)),
-        ("diagnose", str(folder), "--out", str(found)),
-    ):
-        if status := nnap_em([*command]):
-            raise SystemExit(status)
-    return read(out)
+def prepared(source: list[Path], out: Path, law: str | None) -> None:
+    """Write the logs, and bring them to one grid; raises SystemExit where that fails."""
+    shutil.rmtree(out, ignore_errors=True)
+    logs = map(str, write_logs(source, out / "logs", law))
+    if status := nnap_em(["import", *logs, "--rig", str(RIG), "--out", str(out / "data"), "--test", str(TEST)]):
+        raise SystemExit(status)
+
+
+def diagnose(folders: list[Path]) -> None:
+    """Find what the model lacks in every folder, all at once and on one core each; raises SystemExit where it fails."""
+    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1"}
+    command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose"]
+    processes = {
+        folder.name: subprocess.Popen(
+            [*command, str(folder / "data"), "--out", str(folder / "found")],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+        )
+        for folder in folders
+    }
+    try:
+        with ThreadPoolExecutor(len(processes)) as pool:
+            list(pool.map(told, processes, processes.values()))
+    finally:
+        for process in processes.values():
+            process.kill()
+            process.wait()
+    if any(process.returncode for process in processes.values()):
+        raise SystemExit(1)
+
+
+def told(name: str, process: subprocess.Popen[str]) -> None:
+    """Print the lines of a process behind its name, until it ends."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        print(f"{name:9s}| {line.removeprefix('nnap-em: ')}", end="", flush=True)
+    process.wait()
 
 
 def read(out: Path) -> Diagnosed:
-    """What `diagnosed` wrote into a folder."""
+    """What was left in a folder."""
     report = json.loads((out / "found" / "report.json").read_text())
     models = (load(out / "found" / f"{name}.npz") for name in ("before", "after"))
     return Diagnosed(out / "data", report, *models)
@@ -149,8 +168,14 @@ def listed(done: Diagnosed) -> str:
     """What a report says is missing."""
     report = done.report
     suspects = "".join(f"; a suspect: {s['law']}" for s in report.get("suspects", [])[:1])
-    found = "; ".join(e["description"].partition(":")[0] for e in report["effects"])
+    found = "; ".join(f"{e['description'].partition(':')[0]}{sure(e['evidence'])}" for e in report["effects"])
     return found or ("it cannot tell what" if report.get("cannot_tell") else f"nothing{suspects}")
+
+
+def sure(evidence: dict[str, float | None]) -> str:
+    """What a law removes of the squared prediction error, where that is known."""
+    share = evidence.get("share_of_error")
+    return "" if share is None or not np.isfinite(share) else f" ({share:.0%} of the error of unseen motions)"
 
 
 def main() -> int:
@@ -166,8 +191,12 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     law, words = args.plant, args.plant.replace("_", " ")
-    recorded = diagnosed(source, args.out / "recorded", None)
-    planted = diagnosed(source, args.out / "planted", law)
+    folders = [args.out / "recorded", args.out / "planted"]
+    for folder, taken_out in zip(folders, (None, law), strict=True):
+        prepared(source, folder, taken_out)
+    diagnose(folders)
+    recorded, planted = map(read, folders)
+    set_up()
     lacks = [
         lack("as recorded", recorded, law, planted=False),
         lack(f"{words} taken out of the log", planted, law, planted=True),

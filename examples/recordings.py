@@ -2,12 +2,19 @@
 
 Eight CSV files (14 MB) of the double pendulum of the DFKI RIC Underactuated Robotics Lab, which has a motor in each
 joint: swing-ups under programmed torque pulses.  BSD-3-Clause, (c) 2022 DFKI RIC Underactuated Robotics Lab.
+
+    python examples/recordings.py --out logs               # the first 5 s of each: most balance upright afterwards
+    python examples/recordings.py --out logs --seconds 10  # all of it
 """
 
+import argparse
 import functools
 import hashlib
+import sys
 from pathlib import Path
 from urllib.parse import urlsplit
+
+import numpy as np
 
 COMMIT = "1e8544e67f3da72a51ee52fbbb278e131ce2a43f"
 ADDRESS = (
@@ -26,6 +33,8 @@ HASHES = {
     "experiment08.csv": "a42c43093cdec9edb2dad3e8324b2405185380cafb09de2971807c1c7a1e2f27",
 }
 """SHA-256 of the published files."""
+SECONDS = 5.0
+"""Of each recording that are used: most of them balance upright afterwards, and show little."""
 RETRIES = 3
 """Connections made again after one that broke off."""
 
@@ -102,3 +111,39 @@ def _download(part: Path, url: str, target: str, _) -> None:
             for chunk in answer.iter_content(1 << 16):
                 file.write(chunk)
     part.replace(target)
+
+
+def beginning(path: Path, seconds: float = SECONDS) -> tuple[list[str], np.ndarray]:
+    """Names of the columns, and the rows up to a time."""
+    with path.open() as file:
+        names = file.readline().strip().split(",")
+        rows = np.loadtxt(file, delimiter=",")
+    return names, rows[rows[:, names.index("time")] <= seconds]
+
+
+def write(path: Path, names: list[str], rows: np.ndarray) -> None:
+    """A recording as a CSV file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
+
+
+def main() -> int:
+    """Write the beginnings of all recordings."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--from", dest="folder", type=Path, metavar="FOLDER", help="folder of the published files")
+    parser.add_argument("--seconds", type=float, default=SECONDS)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    try:
+        source = recordings(args.folder)
+    except RecordingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    for path in source:
+        write(args.out / path.name, *beginning(path, args.seconds))
+    print(f"wrote {len(source)} files to {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

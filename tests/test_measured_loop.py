@@ -74,6 +74,7 @@ def _diagnosed(folder, effects):
 def test_the_table_has_eight_lines(tmp_path):
     number = {"value": 0.3012, "std": 0.0123, "unit": "N m/rad"}
     spring = {"name": "torsional_spring", "joint": 2, "parameters": {"k": number}, "description": "spring at 2: k"}
+    spring["evidence"] = {"share_of_error": 0.7}
     recorded, planted = (_diagnosed(tmp_path, effects) for effects in ([], [spring]))
     off = {"before": 0.5, "after": 0.25, "recorded": 0.24}
     lines = dict(measured_loop.lines(recorded, planted, "torsional_spring", off))
@@ -104,3 +105,8 @@ def test_a_folder_without_the_files_is_refused_in_one_sentence(tmp_path, monkeyp
     assert measured_loop.main() == 1
     said = capsys.readouterr().err
     assert said.startswith("error: ") and "experiment01.csv: not there" in said and said.count("\n") == 1
+
+
+def test_the_page_shows_the_declaration_as_it_is():
+    page = measured_loop.RIG.parents[2] / "docs" / "real_machine.md"
+    assert f"```toml\n{measured_loop.RIG.read_text()}```\n" in page.read_text()

@@ -111,12 +111,12 @@ def errors(figure: Figure, d: Arrays, ink: Ink) -> None:
 def touch(figure: Figure, d: Arrays, ink: Ink) -> None:
     """Torque over time, with the pushes that were found."""
     ax = figure.subplots()
-    ax.plot(d["t"], d["torque"], color=ink.faint, lw=0.8, label="torque that the model lacks")
+    ax.plot(d["t"], d["torque"], color=ink.before, lw=1.0, label="torque that the model lacks")
     ax.plot(d["t"], d["true"], color=ink.truth, label="pushes that the log does not have", **TRUE)
     for i, (first, last) in enumerate(d["spans"]):
         ax.axvspan(first, last, color=ink.learned, alpha=0.3, lw=0, label="" if i else "found")
-    reach = 1.3 * max(np.max(np.abs(d["true"])), np.nanpercentile(np.abs(d["torque"]), 98))
-    ax.set(xlabel="time [s]", ylabel=f"torque at joint {int(d['joint'])} [N m]", ylim=(-reach, 1.5 * reach))
+    reach = 1.2 * max(np.max(np.abs(d["true"])), np.nanpercentile(np.abs(d["torque"]), 98))
+    ax.set(xlabel="time [s]", ylabel=f"torque at joint {int(d['joint'])} [N m]", ylim=(-reach, 1.8 * reach))
     ax.legend(loc="upper left", ncols=2)
 
 

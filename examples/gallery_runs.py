@@ -19,8 +19,9 @@ import numpy as np
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
-from nnap_em.residual.interventions import interventions
+from nnap_em.residual.interventions import WIDTHS, averaged
 from nnap_em.residual.residual import residual
+from nnap_em.residual.undisturbed import disturbance_free
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,26 +97,25 @@ def errors(out: Path) -> Arrays:
 
 
 def touch(out: Path) -> Arrays:
-    """Torque pulses on a real arm that its log does not have, and the disturbances that were found."""
+    """Torque pulses on a real arm that its log does not have, and the disturbances that were found.
+
+    Torques are means over the windows of the search.
+    """
     folder = _recordings("dfki_c1_hidden_pert")
     rig = read_rig(folder / "rig.toml", specs)
     logs = read_logs(folder / "train", rig)
-    fitted = identify(rig, logs.data, key=jax.random.key(0))
-    found, left = interventions(fitted, logs.data), residual(fitted, logs.data)
+    fit = lambda data: identify(rig, data, key=jax.random.key(0))  # noqa: E731
+    fitted, _, found, _ = disturbance_free(fit, fit(logs.data), logs.data)
+    force = residual(fitted, logs.data).force
     count = [sum(each.sequence == i for each in found) for i in range(len(logs.files))]
     number = int(np.argmax(count))
     true = _read(folder / "truth" / "train" / logs.files[number])
     here = [each for each in found if each.sequence == number]
     joint = max((1, 2), key=lambda j: sum(each.joint == j for each in here))
     spans = [(each.from_s, each.to_s) for each in here if each.joint == joint]
-    torque = left.force[number, :, joint - 1]
-    return {
-        "t": true["time"],
-        "true": true[f"hidden{joint}"],
-        "torque": torque,
-        "spans": np.asarray(spans),
-        "joint": joint,
-    }
+    mean = averaged(force[number], round(WIDTHS[0] / rig.dt))
+    torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
+    return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques
 
 
 def apart(out: Path) -> Arrays:

@@ -36,7 +36,7 @@ RIG = Path(__file__).resolve().parent / "machines" / "dfki_acrobot.toml"
 TEST = 2
 """Last recordings, which no fit sees."""
 LAWS: dict[str, dict[str, Any]] = {
-    "torsional_spring": {"joint": 2, "k": 0.3, "theta0": 0.2},
+    "torsional_spring": {"joint": 2, "k": 0.6, "theta0": 0.2},
     "cogging": {"joint": 2, "amplitude": 0.4, "k": 3.0, "phase": 0.5},
     "eddy_brake": {"joint": 2, "c": 0.05, "center": 0.5},
 }

@@ -12,7 +12,7 @@ from nnap_em.commands.cli import main as nnap_em
 from nnap_em.systems import specs
 
 LAWS = {
-    "torsional_spring": lambda q, v: -0.3 * (q - 0.2),
+    "torsional_spring": lambda q, v: -0.6 * (q - 0.2),
     "cogging": lambda q, v: 0.4 * np.sin(3 * q + 0.5),
     "eddy_brake": lambda q, v: -0.05 * np.cos(q - 0.5) ** 2 * v,
 }
@@ -51,7 +51,7 @@ def test_the_import_keeps_the_law_as_its_mean_over_each_step(source, tmp_path):
     np.testing.assert_array_equal(data["planted"].y, data["recorded"].y)
     change = np.asarray(data["planted"].u - data["recorded"].u)[0]
     raw = _columns(source[0])
-    whole = np.concatenate([[0.0], np.cumsum(0.3 * (raw["pos_meas2"][:-1] - 0.2) * np.diff(raw["time"]))])
+    whole = np.concatenate([[0.0], np.cumsum(0.6 * (raw["pos_meas2"][:-1] - 0.2) * np.diff(raw["time"]))])
     expected = np.diff(np.interp(0.01 * np.arange(len(change)), raw["time"], whole)) / 0.01
     np.testing.assert_allclose(change[:-1, 1], expected, atol=1e-6)
     np.testing.assert_array_equal(change[:, 0], 0.0)
@@ -72,7 +72,7 @@ def _diagnosed(folder, effects):
 
 
 def test_the_table_has_eight_lines(tmp_path):
-    number = {"value": 0.3012, "std": 0.0123, "unit": "N m/rad"}
+    number = {"value": 0.6012, "std": 0.0123, "unit": "N m/rad"}
     spring = {"name": "torsional_spring", "joint": 2, "parameters": {"k": number}, "description": "spring at 2: k"}
     spring["evidence"] = {"share_of_error": 0.7}
     recorded, planted = (_diagnosed(tmp_path, effects) for effects in ([], [spring]))
@@ -80,7 +80,7 @@ def test_the_table_has_eight_lines(tmp_path):
     lines = dict(measured_loop.lines(recorded, planted, "torsional_spring", off))
     assert len(lines) == 8
     assert list(lines.values())[:2] == ["6 to fit, 2 to test", "nothing"]
-    assert "0.3 N m/rad" in lines.values() and "0.301 ± 0.01 N m/rad" in lines.values()
+    assert "0.6 N m/rad" in lines.values() and "0.601 ± 0.01 N m/rad" in lines.values()
     assert [value for value in lines.values() if value.endswith(" rad")] == ["0.500 rad", "0.250 rad", "0.240 rad"]
     missed = dict(measured_loop.lines(recorded, recorded, "torsional_spring", off))
     assert "not found" in missed.values()

@@ -24,7 +24,7 @@ from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
-from .page import MOST, Picture, page, picture
+from .page import MOST, ROOM, Picture, page, picture
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
 
@@ -112,21 +112,24 @@ def _error_pictures(
 
 
 def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test: Logs) -> list[Picture]:
-    """Test sequences to choose from, the longest ones first."""
+    """Test sequences to choose from, the longest ones first; as many as there is room for."""
     rows = np.sum(np.asarray(test.data.valid), axis=1)
-    chosen = sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST]
-    return [_prediction_picture(predicted, names, test, i, alone=len(chosen) == 1) for i in chosen]
+    out: list[Picture] = []
+    for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST]:
+        out.append(_prediction_picture(predicted, names, test, i))
+        if sum(len(picture.image) for picture in out) > ROOM and len(out) > 1:
+            out.pop()
+            break
+    return out if len(out) > 1 else [picture._replace(choice="") for picture in out]
 
 
-def _prediction_picture(
-    predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int, *, alone: bool
-) -> Picture:
+def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int) -> Picture:
     rows = np.asarray(test.data.valid[number])
     sides = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predicted.items()}
     t, y = (np.asarray(a[number])[rows] for a in (test.data.t, test.data.y))
     caption = f"Predicted from its first second ({test.files[number]})."
     figure = prediction_figure(t, y, names, sides, GIVEN)
-    return picture("error", "One test sequence", caption, figure, "" if alone else test.files[number])
+    return picture("error", "One test sequence", caption, figure, test.files[number])
 
 
 def _residual_pictures(left: Mapping[str, Residual], lacked: Residual, names: Names) -> list[Picture]:

@@ -21,8 +21,8 @@ from .wording import finite, number, ratio
 
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
-MOST = 5
-"""Pictures to choose from under one title."""
+MOST, ROOM = 5, 900_000
+"""Pictures to choose from under one title, and bytes of all of them, at most; the first is always there."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _TRUST = {
     "share_of_error": ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely")),
@@ -31,6 +31,8 @@ _TRUST = {
 }
 """From where on a word is deserved: share of the error on recordings left out, log-likelihood [nat]; the first known
 decides, because nats are worth little where noise is not what the model says."""
+_PLACES = re.compile(rb'(?<=\s)(?:d|x|y)="[^"]*"')
+_DIGITS = re.compile(rb"(\.\d\d)\d+")
 _SVG_UNITS = {b"pt": 96 / 72, b"in": 96.0}
 
 
@@ -63,7 +65,13 @@ def picture(place: str, title: str, caption: str, figure: Figure, choice: str = 
     """A drawn figure for the page."""
     image = io.BytesIO()
     figure.savefig(image, format="svg")
-    return Picture(title, caption, image.getvalue(), place, choice)
+    return Picture(title, caption, _rounded(image.getvalue()), place, choice)
+
+
+def _rounded(svg: bytes) -> bytes:
+    """The drawing with paths and marks to a hundredth of a point: four fifths of the size."""
+    short = lambda found: _DIGITS.sub(rb"\1", found[0])  # noqa: E731
+    return _PLACES.sub(short, svg)
 
 
 def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:

@@ -15,7 +15,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import measured_loop
+import next_experiment
 import numpy as np
+import plant
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
@@ -120,14 +122,12 @@ def touch(out: Path) -> Arrays:
 
 def apart(out: Path) -> Arrays:
     """Inputs that hardly tell a late input from a lag, and one that does; how often each would name the wrong law."""
-    folder = Path("out/next_experiment")
-    if not (folder / "again" / "report.json").exists():
-        command = [sys.executable, str(ROOT / "examples" / "next_experiment.py"), "--out", str(folder)]
-        subprocess.run(command, check=True)
-    told = json.loads((folder / "plan" / "design.json").read_text())
-    old, new = (
-        _read(path) for path in (next((folder / "rig" / "train").glob("*.csv")), folder / "plan" / told["inputs"][0])
-    )
+    rig, first, plan, effect = out / "rig", out / "first", out / "plan", "input_delay"
+    plant.write(next_experiment.rig_of(effect, 1), rig)
+    _command(*next_experiment.diagnosis(rig, first))
+    _command(*next_experiment.design(first, plan, effect))
+    told = json.loads((plan / "design.json").read_text())
+    old, new = _read(rig / "train" / "01.csv"), _read(plan / told["inputs"][0])
     wrong = told["apart"][0]["told_wrong"]
     rates = {"wrong_old": wrong["same_time_of_old_inputs"], "wrong_new": wrong["expected"]}
     return {"t_old": old["time"], "u_old": old["u"], "t_new": new["time"], "u_new": new["u"]} | rates

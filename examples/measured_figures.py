@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO, head, styled
+from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO, dotted, head, styled
 
 
 class Lack(NamedTuple):
@@ -50,7 +50,8 @@ def finding_figure(lacks: Sequence[Lack], joint: int) -> Figure:
 def _lack(ax: Axes, lack: Lack) -> None:
     torque = lack.torque - np.mean(lack.torque)
     ax.plot(lack.angle, torque, ".", color=READING, ms=1.6, mew=0, alpha=0.5, label="each sample", rasterized=True)
-    ax.plot(*_means(lack.angle, torque), "o", color=BEFORE, ms=4, label="their mean", zorder=3)
+    ax.plot(*_means(lack.angle, torque), "o", color=BEFORE, ms=4, zorder=3)
+    ax.plot([], [], "o", color=BEFORE, ms=1.2, mew=0, label="their mean")  # marks of a legend are four times as large
     if lack.found is not None:
         ax.plot(*_means(lack.angle, lack.found), color=AFTER, lw=2.2, label="law that was found", zorder=4)
     if lack.true is not None:
@@ -71,13 +72,15 @@ def _means(angle: Float[Any, " sample"], torque: Float[Any, " sample"]) -> tuple
 @styled
 def errors_figure(horizons: Sequence[float], errors: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     """Root mean square prediction errors by horizon, `errors[model][column]`; the last model is the goal."""
-    looks = ({"color": BEFORE, "marker": "s"}, {"color": AFTER, "marker": "o"}, {"color": TRUTH, "ls": (0, (4, 2))})
+    looks = ((BEFORE, "s"), (AFTER, "o"))
     columns = [name for name in next(iter(errors.values())) if name.startswith("theta")]
     figure = Figure(figsize=(3.7 * len(columns) + 0.3, 3.5), layout="constrained")
     axes = figure.subplots(1, len(columns), squeeze=False)[0]
     for ax, column in zip(axes, columns, strict=True):
-        for (label, values), look in zip(errors.items(), looks, strict=True):
-            ax.plot(horizons, values[column], label=label, ms=4, **look)
+        *sides, (goal, best) = errors.items()
+        for (label, values), (colour, mark) in zip(sides, looks, strict=True):
+            dotted(ax, horizons, values[column], colour, label, mark)
+        ax.plot(horizons, best[column], color=TRUTH, ls=(0, (4, 2)), lw=1.4, label=goal)
         ax.set(title=f"joint {column.removeprefix('theta')}", xlabel="time predicted ahead [s]", xlim=(0, None))
         ax.set_ylim(0, None)
     axes[0].set_ylabel("root mean square error [rad]")

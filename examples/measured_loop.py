@@ -175,7 +175,7 @@ def listed(done: Diagnosed) -> str:
 def sure(evidence: dict[str, float | None]) -> str:
     """What a law removes of the squared prediction error, where that is known."""
     share = evidence.get("share_of_error")
-    return "" if share is None or not np.isfinite(share) else f" ({share:.0%} of the error of unseen motions)"
+    return "" if share is None or not np.isfinite(share) else f" (removes {share:.0%} of the error)"
 
 
 def main() -> int:

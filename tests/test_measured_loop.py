@@ -91,7 +91,7 @@ def test_the_law_through_the_samples_is_drawn_where_it_is():
     q = np.random.default_rng(0).uniform(-2, 2, 4000)
     lack = Lack("", q, -0.3 * q + np.random.default_rng(1).normal(0, 0.1, 4000), -0.3 * q, -0.3 * q)
     figure = finding_figure([lack, lack], 2)
-    for line in figure.axes[0].lines[2:4]:
+    for line in figure.axes[0].lines[3:5]:
         x, y = (np.asarray(a) for a in line.get_data())
         np.testing.assert_allclose(y, -0.3 * (x - q.mean()), atol=1e-9)
         assert len(x) > 20

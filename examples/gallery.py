@@ -193,9 +193,9 @@ def arrays(name: str, out: Path) -> Arrays:
     file = out / f"{name}.npz"
     if not file.exists():
         shutil.rmtree(out / name, ignore_errors=True)  # of a run that was stopped
-        told = PICTURES[name].run(out / name)
+        result = PICTURES[name].run(out / name)
         out.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(file, **told)
+        np.savez_compressed(file, **result)
     with np.load(file) as there:
         return dict(there)
 

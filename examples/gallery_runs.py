@@ -72,7 +72,7 @@ def hidden(out: Path) -> Arrays:
     return {"t": read["time"], "read": read["theta2"], "mean": smoothed["theta2"], "std": smoothed["theta2_std"]}
 
 
-def _loop() -> tuple[measured_loop.Diagnosed, measured_loop.Diagnosed]:
+def _loop() -> tuple[measured_loop.Diagnosis, measured_loop.Diagnosis]:
     """The two diagnoses of `measured_loop.py`, which is run where it has not been."""
     out = Path("out/measured_loop")
     if not (out / "planted" / "found" / "report.json").exists():
@@ -85,7 +85,7 @@ def _loop() -> tuple[measured_loop.Diagnosed, measured_loop.Diagnosed]:
 
 def law(out: Path) -> Arrays:
     """The torque that the model of the real acrobot lacks, against the angle, and the law that was found."""
-    lack = measured_loop.lack("", _loop()[1], LAW, planted=True)
+    lack = measured_loop.missing_torque("", _loop()[1], LAW, planted=True)
     return {name: value for name, value in lack._asdict().items() if name != "title" and value is not None}
 
 
@@ -94,8 +94,8 @@ def errors(out: Path) -> Arrays:
     recorded, planted = _loop()
     sides = {"before": planted.before, "after": planted.after, "goal": recorded.after}
     folders = {"before": planted.folder, "after": planted.folder, "goal": recorded.folder}
-    told = {name: measured_loop.errors(fitted, folders[name])["theta2"] for name, fitted in sides.items()}
-    return {"horizon": np.asarray(measured_loop.HORIZONS)} | {name: np.asarray(e) for name, e in told.items()}
+    errors_of = {name: measured_loop.errors(fitted, folders[name])["theta2"] for name, fitted in sides.items()}
+    return {"horizon": np.asarray(measured_loop.HORIZONS)} | {name: np.asarray(e) for name, e in errors_of.items()}
 
 
 def touch(out: Path) -> Arrays:
@@ -126,9 +126,9 @@ def apart(out: Path) -> Arrays:
     plant.write(next_experiment.rig_of(effect, 1), rig)
     _command(*next_experiment.diagnosis(rig, first))
     _command(*next_experiment.design(first, plan, effect))
-    told = json.loads((plan / "design.json").read_text())
-    old, new = _read(rig / "train" / "01.csv"), _read(plan / told["inputs"][0])
-    wrong = told["apart"][0]["told_wrong"]
+    design = json.loads((plan / "design.json").read_text())
+    old, new = _read(rig / "train" / "01.csv"), _read(plan / design["inputs"][0])
+    wrong = design["apart"][0]["told_wrong"]
     rates = {"wrong_old": wrong["same_time_of_old_inputs"], "wrong_new": wrong["expected"]}
     return {"t_old": old["time"], "u_old": old["u"], "t_new": new["time"], "u_new": new["u"]} | rates
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO, dotted, head, styled
 
 
-class Lack(NamedTuple):
+class MissingTorque(NamedTuple):
     """Torque that a model lacks at one joint, and laws that may explain it, by sample."""
 
     title: str
@@ -31,32 +31,32 @@ FEWEST = 20
 
 
 @styled
-def finding_figure(lacks: Sequence[Lack], joint: int) -> Figure:
+def finding_figure(panels: Sequence[MissingTorque], joint: int) -> Figure:
     """The missing torque against the angle, a panel for each log; samples, and means over bins of the angle.
 
     Every torque is drawn without its mean: a constant is part of the learned friction.
     """
-    figure = Figure(figsize=(3.7 * len(lacks) + 0.3, 3.7), layout="constrained")
-    axes = figure.subplots(1, len(lacks), sharey=True, squeeze=False)[0]
-    for ax, lack in zip(axes, lacks, strict=True):
-        _lack(ax, lack)
-        ax.set(title=lack.title, xlabel=f"angle of joint {joint} [rad]")
-    reach = 1.6 * max(np.percentile(np.abs(lack.torque - lack.torque.mean()), 97) for lack in lacks)
+    figure = Figure(figsize=(3.7 * len(panels) + 0.3, 3.7), layout="constrained")
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for ax, panel in zip(axes, panels, strict=True):
+        _draw(ax, panel)
+        ax.set(title=panel.title, xlabel=f"angle of joint {joint} [rad]")
+    reach = 1.6 * max(np.percentile(np.abs(panel.torque - panel.torque.mean()), 97) for panel in panels)
     axes[0].set(ylabel="torque that the model lacks [N m]", ylim=(-reach, reach))
     head(figure, f"What the model of the machine lacks at joint {joint}", list(axes))
     return figure
 
 
-def _lack(ax: Axes, lack: Lack) -> None:
-    torque = lack.torque - np.mean(lack.torque)
-    ax.plot(lack.angle, torque, ".", color=READING, ms=1.6, mew=0, alpha=0.5, label="each sample", rasterized=True)
-    ax.plot(*_means(lack.angle, torque), "o", color=BEFORE, ms=4, zorder=3)
+def _draw(ax: Axes, panel: MissingTorque) -> None:
+    torque = panel.torque - np.mean(panel.torque)
+    ax.plot(panel.angle, torque, ".", color=READING, ms=1.6, mew=0, alpha=0.5, label="each sample", rasterized=True)
+    ax.plot(*_means(panel.angle, torque), "o", color=BEFORE, ms=4, zorder=3)
     ax.plot([], [], "o", color=BEFORE, ms=1.2, mew=0, label="their mean")  # marks of a legend are four times as large
-    if lack.found is not None:
-        ax.plot(*_means(lack.angle, lack.found), color=AFTER, lw=2.2, label="law that was found", zorder=4)
-    if lack.true is not None:
+    if panel.found is not None:
+        ax.plot(*_means(panel.angle, panel.found), color=AFTER, lw=2.2, label="law that was found", zorder=4)
+    if panel.true is not None:
         dashes = (0, (4, 2))
-        ax.plot(*_means(lack.angle, lack.true), color=TRUTH, ls=dashes, lw=1.4, label="law taken out", zorder=5)
+        ax.plot(*_means(panel.angle, panel.true), color=TRUTH, ls=dashes, lw=1.4, label="law taken out", zorder=5)
     ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
 
 

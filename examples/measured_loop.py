@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import plant
-from measured_figures import Lack, errors_figure, finding_figure
+from measured_figures import MissingTorque, errors_figure, finding_figure
 from recordings import RecordingError, beginning, recordings, write
 
 from nnap_em import Identified, horizon_errors, load, predict, read_logs
@@ -65,7 +65,7 @@ def write_logs(source: list[Path], out: Path, law: str | None) -> list[Path]:
     return sorted(out.iterdir())
 
 
-class Diagnosed(NamedTuple):
+class Diagnosis(NamedTuple):
     """What a diagnosis left."""
 
     folder: Path
@@ -99,7 +99,7 @@ def diagnose(folders: list[Path]) -> None:
     }
     try:
         with ThreadPoolExecutor(len(processes)) as pool:
-            list(pool.map(told, processes, processes.values()))
+            list(pool.map(print_lines, processes, processes.values()))
     finally:
         for process in processes.values():
             process.kill()
@@ -108,7 +108,7 @@ def diagnose(folders: list[Path]) -> None:
         raise SystemExit(1)
 
 
-def told(name: str, process: subprocess.Popen[str]) -> None:
+def print_lines(name: str, process: subprocess.Popen[str]) -> None:
     """Print the lines of a process behind its name, until it ends."""
     assert process.stdout is not None
     for line in process.stdout:
@@ -116,11 +116,11 @@ def told(name: str, process: subprocess.Popen[str]) -> None:
     process.wait()
 
 
-def read(out: Path) -> Diagnosed:
+def read(out: Path) -> Diagnosis:
     """What was left in a folder."""
     report = json.loads((out / "found" / "report.json").read_text())
     models = (load(out / "found" / f"{name}.npz") for name in ("before", "after"))
-    return Diagnosed(out / "data", report, *models)
+    return Diagnosis(out / "data", report, *models)
 
 
 def errors(fitted: Identified, folder: Path) -> dict[str, list[float]]:
@@ -134,7 +134,7 @@ def errors(fitted: Identified, folder: Path) -> dict[str, list[float]]:
     return {n: list(np.sqrt(np.mean([np.square(one[n]) for one in squares], axis=0))) for n in names}
 
 
-def lack(title: str, done: Diagnosed, law: str, *, planted: bool) -> Lack:
+def missing_torque(title: str, done: Diagnosis, law: str, *, planted: bool) -> MissingTorque:
     """Samples of the force that the declared model lacks at the joint of the law, and of the laws."""
     joint = LAWS[law]["joint"] - 1
     left = residual(done.after, read_logs(done.folder / "train", done.after.rig).data).followed()
@@ -142,10 +142,10 @@ def lack(title: str, done: Diagnosed, law: str, *, planted: bool) -> Lack:
     q, v = (left.state[..., column][seen] for column in (joint, joint + 2))
     lacked, rest = left.lacked[..., joint][seen], left.force[..., joint][seen]
     true = torque(law, q, v) if planted else None
-    return Lack(title, q, lacked, lacked - rest if done.report["effects"] else None, true)
+    return MissingTorque(title, q, lacked, lacked - rest if done.report["effects"] else None, true)
 
 
-def lines(recorded: Diagnosed, planted: Diagnosed, law: str, off: dict[str, float]) -> list[tuple[str, str]]:
+def lines(recorded: Diagnosis, planted: Diagnosis, law: str, off: dict[str, float]) -> list[tuple[str, str]]:
     """The eight lines of the table; `off`: errors 1 s ahead [rad]."""
     name, unit = STRENGTH[law]
     number = next((e["parameters"][name] for e in planted.report["effects"] if e["name"] == law), None)
@@ -154,8 +154,8 @@ def lines(recorded: Diagnosed, planted: Diagnosed, law: str, off: dict[str, floa
     joint = f"joint {LAWS[law]['joint']}, 1 s ahead"
     return [
         ("recordings of a real acrobot", f"{logs[0]} to fit, {logs[1]} to test"),
-        ("as recorded, the model lacks", listed(recorded)),
-        (f"with a {what} taken out of the log", listed(planted)),
+        ("as recorded, the model lacks", summary(recorded)),
+        (f"with a {what} taken out of the log", summary(planted)),
         (f"its {name}, taken out", f"{LAWS[law][name]:.3g} {unit}"),
         (f"its {name}, found", f"{number['value']:.3g} ± {number['std']:.1g} {unit}" if number else "not found"),
         (f"prediction error of {joint}: without it", f"{off['before']:.3f} rad"),
@@ -164,15 +164,15 @@ def lines(recorded: Diagnosed, planted: Diagnosed, law: str, off: dict[str, floa
     ]
 
 
-def listed(done: Diagnosed) -> str:
+def summary(done: Diagnosis) -> str:
     """What a report says is missing."""
     report = done.report
     suspects = "".join(f"; a suspect: {s['law']}" for s in report.get("suspects", [])[:1])
-    found = "; ".join(f"{e['description'].partition(':')[0]}{sure(e['evidence'])}" for e in report["effects"])
+    found = "; ".join(f"{e['description'].partition(':')[0]}{share_removed(e['evidence'])}" for e in report["effects"])
     return found or ("it cannot tell what" if report.get("cannot_tell") else f"nothing{suspects}")
 
 
-def sure(evidence: dict[str, float | None]) -> str:
+def share_removed(evidence: dict[str, float | None]) -> str:
     """What a law removes of the squared prediction error, where that is known."""
     share = evidence.get("share_of_error")
     return "" if share is None or not np.isfinite(share) else f" (removes {share:.0%} of the error)"
@@ -197,11 +197,11 @@ def main() -> int:
     diagnose(folders)
     recorded, planted = map(read, folders)
     set_up()
-    lacks = [
-        lack("as recorded", recorded, law, planted=False),
-        lack(f"{words} taken out of the log", planted, law, planted=True),
+    panels = [
+        missing_torque("as recorded", recorded, law, planted=False),
+        missing_torque(f"{words} taken out of the log", planted, law, planted=True),
     ]
-    finding_figure(lacks, LAWS[law]["joint"]).savefig(args.out / "finding.png")
+    finding_figure(panels, LAWS[law]["joint"]).savefig(args.out / "finding.png")
     models = {"before": planted.before, "after": planted.after, "recorded": recorded.after}
     folders = {"before": planted.folder, "after": planted.folder, "recorded": recorded.folder}
     off = {name: errors(fitted, folders[name]) for name, fitted in models.items()}

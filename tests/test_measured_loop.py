@@ -5,7 +5,7 @@ import numpy as np
 import plant
 import pytest
 import recordings
-from measured_figures import Lack, errors_figure, finding_figure
+from measured_figures import MissingTorque, errors_figure, finding_figure
 
 from nnap_em import read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
@@ -68,7 +68,7 @@ def _diagnosed(folder, effects):
         (folder / part).mkdir(parents=True, exist_ok=True)
         for i in range(count):
             (folder / part / f"{i}.csv").touch()
-    return measured_loop.Diagnosed(folder, {"effects": effects}, None, None)  # type: ignore[arg-type]
+    return measured_loop.Diagnosis(folder, {"effects": effects}, None, None)  # type: ignore[arg-type]
 
 
 def test_the_table_has_eight_lines(tmp_path):
@@ -89,8 +89,8 @@ def test_the_table_has_eight_lines(tmp_path):
 def test_the_law_through_the_samples_is_drawn_where_it_is():
     """Means over bins of a line are on the line."""
     q = np.random.default_rng(0).uniform(-2, 2, 4000)
-    lack = Lack("", q, -0.3 * q + np.random.default_rng(1).normal(0, 0.1, 4000), -0.3 * q, -0.3 * q)
-    figure = finding_figure([lack, lack], 2)
+    panel = MissingTorque("", q, -0.3 * q + np.random.default_rng(1).normal(0, 0.1, 4000), -0.3 * q, -0.3 * q)
+    figure = finding_figure([panel, panel], 2)
     for line in figure.axes[0].lines[3:5]:
         x, y = (np.asarray(a) for a in line.get_data())
         np.testing.assert_allclose(y, -0.3 * (x - q.mean()), atol=1e-9)

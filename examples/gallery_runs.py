@@ -115,7 +115,7 @@ def touch(out: Path) -> Arrays:
     here = [each for each in found if each.sequence == number]
     joint = max((1, 2), key=lambda j: sum(each.joint == j for each in here))
     spans = [(each.from_s, each.to_s) for each in here if each.joint == joint]
-    mean = averaged(force[number], round(WIDTHS[0] / rig.dt))
+    mean = averaged(force, round(WIDTHS[0] / rig.dt))[number]
     torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
     return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques
 

@@ -126,9 +126,13 @@ def apart(figure: Figure, d: Arrays, ink: Ink) -> None:
     rows = (("old", ink.before, "an input of the first logs"), ("new", ink.learned, "a designed input"))
     for ax, (side, colour, label) in zip(axes, rows, strict=True):
         ax.step(d[f"t_{side}"] - d[f"t_{side}"][0], d[f"u_{side}"], where="post", color=colour, lw=1.2)
-        ax.set_title(f"{label}: wrong law once in {1 / d[f'wrong_{side}']:,.0f} times")
+        ax.set_title(f"{label}: the wrong law {_odds(float(d[f'wrong_{side}']))}")
         ax.set_ylabel("torque [N m]")
     axes[1].set_xlabel("time [s]")
+
+
+def _odds(chance: float) -> str:
+    return f"once in {1 / chance:.0f} times" if chance > 1e-4 else "less than once in 10,000 times"
 
 
 def arm(figure: Figure, d: Arrays, ink: Ink) -> None:

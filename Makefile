@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 # Lint and documentation side by side.
 MAKEFLAGS += --jobs=2
 
-.PHONY: demo test check lint docs matrix clean
+.PHONY: demo test check lint docs gallery notebook matrix clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
@@ -35,6 +35,13 @@ lint: .venv/.test
 
 docs: .venv/.test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# The pictures of docs/gallery.md; runs that are in out/gallery are not repeated.
+gallery: .venv/.examples
+	$(BIN)/python examples/gallery.py
+
+notebook: .venv/.examples
+	$(BIN)/jupytext --to ipynb examples/tour.py
 
 # The oldest accepted versions are those of constraints.txt, the newest what pyproject.toml lets through.
 matrix:
@@ -66,3 +73,7 @@ $(BIN)/python:
 .venv/.test: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable '.[test,docs]'
 	@touch $@ .venv/.demo
+
+.venv/.examples: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable '.[examples,robots]'
+	@touch $@

@@ -26,6 +26,23 @@ EFFECTS = {
 SEQUENCES = 6
 
 
+def rig_of(effect: str, seed: int) -> plant.Case:
+    """An acrobot whose drive is late, and six sequences of sines."""
+    noise = (0.002, 0.02)
+    return plant.Case(effects=(EFFECTS[effect],), sequences=SEQUENCES, tests=2, torque="sine", noise=noise, seed=seed)
+
+
+def diagnosis(rig: Path, first: Path) -> tuple[object, ...]:
+    """The command that finds what the first logs tell."""
+    return "diagnose", rig, "--out", first
+
+
+def design(first: Path, plan: Path, effect: str) -> tuple[object, ...]:
+    """The command that proposes inputs by which the law is told from the other one."""
+    rival = next(name for name in EFFECTS if name != effect)
+    return "design", first, "--out", plan, "--for", "apart", "--rival", rival, "--seconds", "30"
+
+
 def play(case: plant.Case, folder: Path, out: Path) -> None:
     """The machine plays the inputs of a design: logs of it, from starts that are set by hand."""
     machine, rng = plant.build(case), np.random.default_rng([case.seed, 99])
@@ -62,20 +79,12 @@ def main() -> int:
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--out", type=Path, default=Path("out/next_experiment"))
     args = arguments.parse_args()
-    case = plant.Case(
-        effects=(EFFECTS[args.effect],),
-        sequences=SEQUENCES,
-        tests=2,
-        torque="sine",
-        noise=(0.002, 0.02),
-        seed=args.seed,
-    )
+    case = rig_of(args.effect, args.seed)
     rig, first, plan, again = (args.out / name for name in ("rig", "first", "plan", "again"))
     plant.write(case, rig)
-    rival = next(name for name in EFFECTS if name != args.effect)
     commands = (
-        ("diagnose", rig, "--out", first),
-        ("design", first, "--out", plan, "--for", "apart", "--rival", rival, "--seconds", "30"),
+        diagnosis(rig, first),
+        design(first, plan, args.effect),
         ("diagnose", rig, "--more", args.out / "new", "--out", again),
     )
     for command in commands:

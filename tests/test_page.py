@@ -8,7 +8,7 @@ import pytest
 
 from nnap_em.diagnose.keys import words
 from nnap_em.effects import catalogue
-from nnap_em.report.page import Picture, page
+from nnap_em.report.page import MOST, Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, number, with_std
 from nnap_em.residual.statistics import LEVEL
@@ -116,6 +116,22 @@ def test_page_is_whole_whatever_is_missing(missing):
         assert "script" not in parsed.tags
         assert not re.search(r"https?://|url\(|@import", html)
         assert all(a.startswith("data:image/") for a in parsed.addresses)
+
+
+def test_pictures_of_one_title_are_chosen_from_and_every_picture_is_enlarged_without_a_script():
+    sequences = [Picture("One test sequence", name, SVG, "error", name) for name in ("a.csv", "b.csv", "c.csv")]
+    html = page(WHOLE, [*sequences, Picture("Errors", "", SVG, "error")])
+    _parsed(html)
+    radios = re.findall(
+        r'<input type="radio" name="(\S+)" id="(\S+?)"( checked)?><label for="(\S+?)">(\S+)</label>', html
+    )
+    assert [label for *_, label in radios] == ["a.csv", "b.csv", "c.csv"]
+    assert len({name for name, *_ in radios}) == 1 and all(own == of for _, own, _, of, _ in radios)
+    assert [bool(checked) for _, _, checked, _, _ in radios] == [True, False, False]
+    assert len(re.findall(r'<input type="checkbox"', html)) == 4
+    for place in range(1, MOST + 1):  # a picture that no rule shows would never be seen
+        assert f".choose>input:nth-of-type({place}):checked~div:nth-of-type({place})" in html
+    assert html.count("<figure") == 2
 
 
 def test_page_of_nothing():

@@ -1,16 +1,22 @@
 """Figures of machines with 1 to 7 joints: everything is drawn, with its unit, in a size that can be read."""
 
 import io
+import re
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
 from nnap_em.effects.base import Curve
 from nnap_em.em.identify import FrictionTable
+from nnap_em.em.predict import Prediction
+from nnap_em.report.diagnosis import _prediction_pictures
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure
 from nnap_em.report.friction_plots import friction_figure
+from nnap_em.report.page import picture
 from nnap_em.report.residual_plots import innovation_figure, residual_figure
 from nnap_em.residual.residual import Names, Residual
 
@@ -70,6 +76,46 @@ def drawn(request):
         "friction": friction_figure({"before": table, "after": table}, names, visited),
         "prediction": prediction_figure(found.t[0], found.state[0], names, both, 1.0),
     }
+
+
+def test_the_longest_test_sequences_are_those_to_choose_from():
+    """Of seven, the five longest, longest first."""
+    found, names = _found(1), _names(1)
+    length = np.asarray([50, 200, 60, 70, 80, 90, 40, 100])
+    valid = np.arange(ROWS) < length[:, None]
+    data = Dataset(found.t, found.u, found.state, valid)
+    files = tuple(f"{n}.csv" for n in length)
+    prediction = Prediction(jnp.asarray(found.state), jnp.ones_like(found.state), jnp.asarray(valid))
+    pictures = _prediction_pictures({"before": prediction}, names, Logs(files, data, ()))
+    assert [picture.choice for picture in pictures] == ["200.csv", "100.csv", "90.csv", "80.csv", "70.csv"]
+    (alone,) = _prediction_pictures({"before": prediction}, names, Logs(files[:1], Dataset(*(a[:1] for a in data)), ()))
+    assert alone.choice == ""
+
+
+def test_sequences_for_which_a_page_has_no_room_are_left_out(monkeypatch):
+    found, names = _found(1), _names(1)
+    prediction = Prediction(*(jnp.asarray(a) for a in (found.state, np.ones_like(found.state), found.valid)))
+    logs = Logs(tuple("abcdefgh"), Dataset(found.t, found.u, found.state, found.valid), ())
+    whole = _prediction_pictures({"before": prediction}, names, logs)
+    for count in (1, 3):
+        room = sum(len(picture.image) for picture in whole[:count]) + 1
+        monkeypatch.setattr("nnap_em.report.diagnosis.ROOM", room)
+        assert len(_prediction_pictures({"before": prediction}, names, logs)) == count
+
+
+def test_a_rounded_drawing_is_smaller_and_in_the_same_places():
+    """Coordinates of all paths within half a hundredth of a point; what scales them is untouched."""
+    found, names = _found(1), _names(1)
+    pair = found.state[0], np.ones((ROWS, 2))
+    figure = prediction_figure(found.t[0], found.state[0], names, {"before": pair}, 1.0)
+    image = io.BytesIO()
+    figure.savefig(image, format="svg")
+    plain, rounded = image.getvalue(), picture("error", "", "", figure).image
+    paths, scales = (re.compile(rb'(?s)\b%s="([^"]*)"' % name) for name in (b"d", b"transform"))
+    for a, b in zip(paths.findall(plain), paths.findall(rounded), strict=True):
+        numbers = (np.asarray(re.findall(rb"-?\d+\.?\d*", d), float) for d in (a, b))
+        np.testing.assert_allclose(*numbers, atol=0.0100001)
+    assert scales.findall(plain) == scales.findall(rounded) and len(rounded) < 0.9 * len(plain)
 
 
 def test_every_figure_can_be_read_whatever_the_number_of_joints(drawn):

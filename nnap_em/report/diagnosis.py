@@ -24,7 +24,7 @@ from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
-from .page import Picture, page, picture
+from .page import MOST, ROOM, Picture, page, picture
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
 
@@ -107,18 +107,29 @@ def _error_pictures(
             picture("error", "Learned friction", caption, friction_figure(tables, names, title="Learned friction"))
         )
     if test:
-        out.append(_prediction_picture(predicted, names, test))
+        out += _prediction_pictures(predicted, names, test)
     return out
 
 
-def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test: Logs) -> Picture:
-    """The longest test sequence."""
-    number = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1)))
+def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test: Logs) -> list[Picture]:
+    """Test sequences to choose from, the longest ones first; as many as there is room for."""
+    rows = np.sum(np.asarray(test.data.valid), axis=1)
+    out: list[Picture] = []
+    for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST]:
+        out.append(_prediction_picture(predicted, names, test, i))
+        if sum(len(picture.image) for picture in out) > ROOM and len(out) > 1:
+            out.pop()
+            break
+    return out if len(out) > 1 else [picture._replace(choice="") for picture in out]
+
+
+def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int) -> Picture:
     rows = np.asarray(test.data.valid[number])
     sides = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predicted.items()}
     t, y = (np.asarray(a[number])[rows] for a in (test.data.t, test.data.y))
     caption = f"Predicted from its first second ({test.files[number]})."
-    return picture("error", "One test sequence", caption, prediction_figure(t, y, names, sides, GIVEN))
+    figure = prediction_figure(t, y, names, sides, GIVEN)
+    return picture("error", "One test sequence", caption, figure, test.files[number])
 
 
 def _residual_pictures(left: Mapping[str, Residual], lacked: Residual, names: Names) -> list[Picture]:

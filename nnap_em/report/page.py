@@ -5,6 +5,7 @@
 
 import base64
 import io
+import itertools
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ from .wording import finite, number, ratio
 
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
+MOST, ROOM = 5, 900_000
+"""Pictures to choose from under one title, and bytes of all of them, at most; the first is always there."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _TRUST = {
     "share_of_error": ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely")),
@@ -28,6 +31,8 @@ _TRUST = {
 }
 """From where on a word is deserved: share of the error on recordings left out, log-likelihood [nat]; the first known
 decides, because nats are worth little where noise is not what the model says."""
+_PLACES = re.compile(rb'(?<=\s)(?:d|x|y)="[^"]*"')
+_DIGITS = re.compile(rb"(\.\d\d)\d+")
 _SVG_UNITS = {b"pt": 96 / 72, b"in": 96.0}
 
 
@@ -40,6 +45,8 @@ class Picture(NamedTuple):
     """PNG or SVG."""
     place: str = "residual"
     """Section: "found", "error", "residual" or "details"."""
+    choice: str = ""
+    """Name among the pictures of one title, of which the reader chooses one; empty: it stands alone."""
 
     @property
     def source(self) -> str:
@@ -54,11 +61,23 @@ class Picture(NamedTuple):
         return f"min-width:{least}px;max-width:{round(1.1 * width)}px" if width else ""
 
 
-def picture(place: str, title: str, caption: str, figure: Figure) -> Picture:
+def picture(place: str, title: str, caption: str, figure: Figure, choice: str = "") -> Picture:
     """A drawn figure for the page."""
     image = io.BytesIO()
     figure.savefig(image, format="svg")
-    return Picture(title, caption, image.getvalue(), place)
+    return Picture(title, caption, _rounded(image.getvalue()), place, choice)
+
+
+def _rounded(svg: bytes) -> bytes:
+    """The drawing with paths and marks to a hundredth of a point: four fifths of the size."""
+    short = lambda found: _DIGITS.sub(rb"\1", found[0])  # noqa: E731
+    return _PLACES.sub(short, svg)
+
+
+def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
+    """Pictures of a section in their order; those to choose from share a list."""
+    here = [picture for picture in pictures if picture.place == place]
+    return [list(group) for _, group in itertools.groupby(here, lambda p: p.title if p.choice else id(p))]
 
 
 def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
@@ -93,10 +112,11 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    made.filters["grouped"] = grouped
     names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence")
     made.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "look_first": _look_first}
     made.tests |= {"finite": finite, "failed": _fails}
-    made.globals |= {"meanings": MEANINGS, "words": WORDS, "level": LEVEL, "at": _at, "ratio": ratio}
+    made.globals |= {"most": MOST, "meanings": MEANINGS, "words": WORDS, "level": LEVEL, "at": _at, "ratio": ratio}
     return made
 
 

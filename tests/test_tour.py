@@ -1,0 +1,41 @@
+"""The tour, `examples/tour.py`: a notebook kept as text in cells of jupytext's percent format."""
+
+import re
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+TOUR = Path(__file__).resolve().parents[1] / "examples" / "tour.py"
+
+
+def _cells():
+    """Kind and text of every cell."""
+    _, *parts = re.split(r"(?m)^# %%", TOUR.read_text())
+    return [("markdown" if part.startswith(" [markdown]\n") else "code", part.partition("\n")[2]) for part in parts]
+
+
+def test_it_is_short_and_told():
+    cells = _cells()
+    assert 15 <= len(cells) <= 20
+    assert all(line.startswith("#") for kind, text in cells if kind == "markdown" for line in text.split("\n") if line)
+    assert TOUR.read_text().startswith("# ---\n# jupyter:\n")
+
+
+@pytest.mark.slow
+def test_it_runs_and_finds_the_cable(tmp_path, monkeypatch, capsys):
+    """The truth is 30 N/m; the stated standard deviation holds it."""
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("agg")
+    names = {"__name__": "tour"}
+    for kind, text in _cells():
+        if kind == "code":
+            exec(compile(text, str(TOUR), "exec"), names)
+    (finding,) = names["found"]
+    number = finding.parameters["k"]
+    assert finding.effect.name == "torsional_spring"
+    assert abs(number.value - 30.0) < max(3 * number.std, 1.0)
+    before, after = (names["error"][side]["x"] for side in ("before", "after"))
+    assert after[-1] < 0.5 * before[-1]
+    assert names["design"].u.shape[0] == 2
+    assert "torsional spring" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from nnap_em.data.rig import Rig, read_rig
 from nnap_em.em.build import build
 from nnap_em.em.identify import identify
 from nnap_em.em.loop import e_step
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.systems import specs
 
 _e_step = eqx.filter_jit(e_step)
@@ -32,7 +32,7 @@ def test_every_shared_rig_has_a_finite_first_e_step(shared):
     for folder in folders:
         rig, data = _read(folder, 2, 100)
         problem = build(rig, data, key=jax.random.key(0))
-        posterior = _e_step(problem.model, data, ExtendedKalmanSmoother(problem.bank), key=jax.random.key(1))
+        posterior = _e_step(problem.model, data, CubatureSmoother(problem.bank), key=jax.random.key(1))
         numbers = posterior._replace(ess=posterior.loglik)  # infinite: nothing is sampled
         assert all(np.all(np.isfinite(a)) for a in jax.tree.leaves(numbers)), folder
 
@@ -45,7 +45,7 @@ def test_a_measured_arm_is_identified(shared):
         rig,
         data,
         key=jax.random.key(0),
-        smoother=ExtendedKalmanSmoother,
+        smoother=CubatureSmoother,
         epochs=4,
         watch=lambda state, seen, kept: used.append(kept),
     )

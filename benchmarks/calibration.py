@@ -14,8 +14,10 @@ import platform
 import sys
 from collections.abc import Callable
 from datetime import date
+from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,6 +60,12 @@ def slide_bench(sequences: int = 8, steps: int = 150) -> Bench:
     return Bench(machine, sweep, start, sequences, steps)
 
 
+@eqx.filter_jit
+def _log_pull(weights, unknown, middle, symmetry, w):
+    phi = weights.phi(unknown, middle + w)
+    return -0.5 * phi @ symmetry @ phi
+
+
 def prior_draw(start: Identified, key, moves: int = 200):
     """A friction map from the prior of the M-step, by elliptical slice sampling [Murray, Adams & MacKay 2010].
 
@@ -67,12 +75,9 @@ def prior_draw(start: Identified, key, moves: int = 200):
     middle, symmetry = weights.middle(), weights.symmetry()
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
-    @jax.jit
-    def log_pull(w):
-        phi = weights.phi(unknown, middle + w)
-        return -0.5 * phi @ symmetry @ phi
-
-    draw = lambda: rng.normal(size=middle.shape) / np.sqrt(np.asarray(weights.precision(middle)))  # noqa: E731
+    log_pull = partial(_log_pull, weights, unknown, middle, symmetry)
+    std = 1 / np.sqrt(np.asarray(weights.precision(middle)))
+    draw = lambda: rng.normal(size=middle.shape) * std  # noqa: E731
     now = draw()
     level = float(log_pull(now))
     for _ in range(moves):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from helpers import optimised
 
 from nnap_em.data.dataset import Dataset, fill_missing
 from nnap_em.model.base import prepare
@@ -138,7 +139,8 @@ def test_friction_band_holds_its_share_of_the_truth():
     """Frictions drawn from the prior of the fit, one velocity each: `benchmarks/calibration.py` in small."""
     draws = 12
     bench = calibration.slide_bench(sequences=4, steps=100)
-    z = np.asarray([calibration.places(bench, calibration.prior_draw, i)[i % 5] for i in range(draws)])
+    with optimised():
+        z = np.asarray([calibration.places(bench, calibration.prior_draw, i)[i % 5] for i in range(draws)])
     inside = int(np.sum(np.abs(z) < scipy.stats.norm.ppf(0.95)))
     assert inside > scipy.stats.binom.ppf(1e-3, draws, 0.9)
     _inside(np.sum(z**2), draws)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from .design.limits import DesignError
     from .diagnose.compare import CompareError, Comparison, compare
     from .diagnose.findings import findings
-    from .diagnose.loop import close_the_loop
     from .diagnose.outcome import Closed
+    from .diagnose.search import close_the_loop
     from .em.check import Finding, check
     from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
@@ -27,8 +27,11 @@ if TYPE_CHECKING:
     from .model.simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .model.state_space import StateSpaceModel
     from .numerics.parallel import all_devices, over
+    from .portable.c99 import write_c
+    from .portable.draws import write_draws
     from .portable.export import ExportError, export
     from .portable.mjcf import write_mjcf
+    from .portable.urdf import write_urdf
     from .smoother.gaussian import ExtendedKalmanSmoother
     from .smoother.particle import ParticleSmoother
     from .smoother.posterior import Posterior
@@ -89,8 +92,11 @@ __all__ = [
     "simulate",
     "smooth",
     "specs",
+    "write_c",
+    "write_draws",
     "write_mjcf",
     "write_rig",
+    "write_urdf",
 ]
 _homes = {
     "em.check": ("Finding", "check"),
@@ -102,11 +108,14 @@ _homes = {
     "diagnose.findings": ("findings",),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),
+    "portable.c99": ("write_c",),
+    "portable.draws": ("write_draws",),
     "portable.mjcf": ("write_mjcf",),
+    "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
     "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
-    "diagnose.loop": ("close_the_loop",),
+    "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),
     "numerics.parallel": ("all_devices", "over"),

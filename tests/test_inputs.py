@@ -11,8 +11,11 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.losses import OneStep
 from nnap_em.diagnose.propose import proposals, surroundings
-from nnap_em.diagnose.screen import judge, project, sheet
+from nnap_em.diagnose.screen import screen
+from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import Around, Scene, catalogue, free_form
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build
@@ -66,7 +69,8 @@ def plain():
 def _screened(asked, candidates):
     model, rule, data, path, _ = asked
     data = jax.tree.map(jnp.asarray, data)
-    return judge(project(sheet(model, model, rule.weights(model), candidates, path, data, np.ones(COUNT))), candidates)
+    bare = Hypothesis(model, rule)
+    return screen(OneStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates).screened
 
 
 def _functions(around):
@@ -86,7 +90,7 @@ def test_a_function_of_the_second_input_is_found_at_its_joint(plain):
     bump = jnp.zeros(20).at[13:17].set(0.1)
     asked = _asked((UnknownFunction(bump, seed.start.axes, joint=2),))
     candidates = _functions(asked[-1])
-    found = candidates[int(np.argmax([v.gain for v in _screened(asked, candidates)]))].start
+    found = candidates[int(np.argmax([v.share.inside for v in _screened(asked, candidates)]))].start
     assert (found.joint, found.inputs_named()) == (2, ("tau2",))
 
 
@@ -115,7 +119,7 @@ def test_an_input_that_never_moves_is_no_signal():
     assert not any("tau2" in c.start.inputs_named() for c in candidates)
     assert all(np.isfinite(np.asarray(leaf)).all() for c in candidates for leaf in jax.tree.leaves(c))
     some = [c for c in candidates if c.start.inputs_named() == ("tau1",) or c.start.name == "torsional_spring"]
-    assert all(np.isfinite(v.gain) for v in _screened(asked, some))
+    assert all(np.isfinite(v.share.inside) for v in _screened(asked, some))
 
 
 def test_models_saved_with_u_read_the_first_driven_joint():

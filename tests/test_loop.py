@@ -11,16 +11,12 @@ import pytest
 
 from nnap_em import close_the_loop, findings, load, read_logs, read_rig, specs
 from nnap_em.commands import cli
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnose.case import held_out_gain
 from nnap_em.diagnose.findings import Finding, verdict
-from nnap_em.diagnose.refit import Trial
 from nnap_em.effects import catalogue
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 DEAD = {"name": "dead_zone", "joint": 1, "width": 1.0}
-USED = np.arange(9) != 4
 DRAG = {"name": "air_drag", "joint": 1, "c": 0.8}
 
 
@@ -128,20 +124,3 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
         "The model lacks payload at joint 1, payload at joint 2 and payload at joint"
     )
     assert "with them" in verdict(several[:2], error)
-
-
-def test_held_out_gain_counts_what_was_left_out_of_the_fit(monkeypatch):
-    """Two nats a sequence where it is left out, a hundred where it is fitted: two is what counts."""
-    left_out = []
-    data = Dataset(*(np.zeros((9, 1, *shape)) for shape in ((), (1,), (1,))), np.ones((9, 1), bool))
-
-    def refit(model, m_step, path, data, mask, *, passes, noise):
-        assert not noise
-        left_out.append(USED & ~mask)
-        gain = 0.0 if model == "null" else 1.0
-        return Trial(model, m_step, path, 50.0 + gain * np.where(mask, 100.0, 2.0), None)
-
-    monkeypatch.setattr("nnap_em.diagnose.case.refit", refit)
-    null, full = (Trial(name, None, None, None, None) for name in ("null", "full"))
-    assert held_out_gain(null, full, data, USED) == pytest.approx(2.0 * USED.sum(), rel=1e-12)
-    np.testing.assert_array_equal(np.sum(left_out, axis=0), 2 * USED)  # each once, in either fit

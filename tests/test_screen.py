@@ -1,4 +1,4 @@
-"""The score test against brute force: columns by difference quotients, projection by least squares."""
+"""One-step errors and their columns against difference quotients; what friction can hold is projected out."""
 
 from dataclasses import replace
 
@@ -10,9 +10,11 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.losses import OneStep
 from nnap_em.diagnose.propose import extended, proposals, seeded, surroundings
-from nnap_em.diagnose.screen import Sheet, judge, project, sheet, unlike
-from nnap_em.effects import Candidate, catalogue
+from nnap_em.diagnose.screen import overlaps, project, screen
+from nnap_em.diagnose.smoothed import SmoothedFit
+from nnap_em.effects import catalogue
 from nnap_em.em.local import local
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
@@ -31,6 +33,26 @@ def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
     return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, here.seq).innovation
 
 
+def _fit(bench) -> SmoothedFit:
+    _, model, rule, data, path = bench
+    bare = Hypothesis(model, rule)
+    return SmoothedFit(bare, bare, path, data, np.ones(4, bool), ROWS)
+
+
+def test_a_lost_sequence_does_not_count_not_even_as_nan(bench):
+    fit = _fit(bench)
+    spring = catalogue["torsional_spring"].candidates(surroundings(bench[0], *_of(fit)))[:1]
+    lost = fit._replace(path=fit.path._replace(mean=fit.path.mean.at[1].set(jnp.nan)))
+    (found,) = OneStep().linearise(lost, spring)
+    assert not found.weight[1].any() and found.weight[[0, 2, 3]].all()
+    (unused,) = OneStep().linearise(fit._replace(used=np.array([True, False, True, True])), spring)
+    np.testing.assert_array_equal(unused.weight, found.weight)
+
+
+def _of(fit: SmoothedFit):
+    return fit.model, fit.data, fit.path, fit.rows
+
+
 @pytest.mark.parametrize(
     "name", ["torsional_spring", "payload", "base_tilt", "eddy_brake", "input_delay", "sensor_bias", "sensor_scale"]
 )
@@ -47,26 +69,11 @@ def test_columns_are_difference_quotients(bench, name):
         before = run(model, at, seq)
         column = -(run(full, at, seq) - before) / small
         size = float(jnp.linalg.norm(column) * jnp.linalg.norm(before))
-        table = sheet(model, model, rule.weights(model), [candidate], path, data, np.eye(4)[i])
-        assert table.score[-1] == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
-        assert table.information[-1, -1] == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
-
-
-def test_projection_is_least_squares():
-    """Gain and coefficient of a candidate are those of a regression beside the nuisance."""
-    rng = np.random.default_rng(0)
-    x, e = rng.normal(size=(200, 5)), rng.normal(size=200)
-    x[:, 4] += 0.8 * x[:, 0]
-    e += 0.4 * x[:, 4]
-    table = Sheet(x.T @ e, x.T @ x, 3, 1e-9 * np.eye(3))
-    one = catalogue["motor_gain"](jnp.zeros(()), joint=2)
-    verdict = judge(project(table), [Candidate(one, (one, one), one)])[0]
-    full = np.linalg.lstsq(x, e, rcond=None)[0]
-    rest = np.sum((e - x[:, :3] @ np.linalg.lstsq(x[:, :3], e, rcond=None)[0]) ** 2)
-    gain = 0.5 * (rest - np.sum((e - x @ full) ** 2))
-    assert verdict.directions == 2
-    assert verdict.gain == pytest.approx(gain, rel=1e-3)
-    np.testing.assert_allclose(verdict.coefficients, full[3:], rtol=1e-3)
+        (found,) = OneStep().linearise(_fit(bench), [candidate])
+        np.testing.assert_allclose(found.error[i], before, atol=1e-5)
+        own = found.columns[i, ..., -1].astype(float)
+        assert float(jnp.sum(own * before)) == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
+        assert float(jnp.sum(own**2)) == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
 
 
 def test_what_a_friction_map_holds_gains_nothing(bench):
@@ -76,9 +83,12 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
     maps = ("torque_offset", "motor_back_emf", "air_drag")
     held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
     free = catalogue["torsional_spring"].candidates(around)
-    much = np.full(4, 1e4)  # as many copies of the data, beside which the prior of the map counts for nothing
-    table = sheet(model, model, rule.weights(model), [*held, *free], path, data, much)
-    share = np.diag(project(table).information) / np.diag(table.information)[table.nuisance :]
+    (found,) = OneStep().linearise(_fit(bench), [*held, *free])
+    count = rule.weights(model).nodes.size + rule.weights(model).prior.size
+    none, weak = np.zeros(found.error.shape[:2], int), 1e-4 * np.eye(count)  # a prior that counts for nothing
+    rows = project(found, none, none, weak, np.zeros(count))
+    whole = np.sum(found.columns[..., count:].astype(float) ** 2 * found.weight[..., None], axis=(0, 1, 2))
+    share = np.sum(rows.columns**2, axis=0) / whole
     # what the map has no nodes for, and what a spring keeps: 4e-4 at most and .025 at least with this key
     assert np.all(share[: len(held)] < 0.003)
     slope, moment = share[len(held) :: 2], share[len(held) + 1 :: 2]
@@ -105,12 +115,12 @@ def test_effects_come_and_go(bench):
 
 def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
     """The interface calls the first two the same model; here it is measured."""
-    rig, model, rule, data, path = bench
+    rig, model, _, data, path = bench
     around = surroundings(rig, model, data, path, data.t.shape[1])
     names = ("base_tilt", "sensor_bias", "torsional_spring")
     candidates = [catalogue[name].candidates(around)[0] for name in names]
-    table = sheet(model, model, rule.weights(model), candidates, path, data, np.ones(4))
-    tilt, bias, spring = unlike(project(table), candidates, candidates[0])
+    seen = screen(OneStep(), _fit(bench), candidates)
+    tilt, bias, spring = overlaps(seen, seen.screened[0])
     # itself; the same but for the prior of the first row (3e-4 with this key); another force (.7)
     assert tilt < 1e-6
     assert bias < 0.02

@@ -6,7 +6,7 @@ import time
 import jax
 
 from ..diagnose.findings import findings
-from ..diagnose.loop import close_the_loop
+from ..diagnose.search import close_the_loop
 from ..em.store import fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from .common import Say, read_bench, resumable, warn_of_torques

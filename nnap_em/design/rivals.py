@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..data.dataset import Dataset
+from ..diagnose.context import Say
 from ..diagnose.keys import key_of, words
-from ..diagnose.look import Say
 from ..diagnose.rivals import instead, possible
 from ..effects import AbstractEffect
 from ..em.identify import Identified

@@ -21,7 +21,7 @@ class Found(NamedTuple):
     gain: float
     """Log-likelihood over the model without it, where it was found [nat]."""
     held_out: float
-    """Gain on sequences that had no part in the fit [nat]; NaN where the rule did not ask for it."""
+    """Gain on sequences that had no part in the fit [nat]; NaN where many steps decided."""
     p_value: float
     """Of the likelihood ratio, times the number of candidates tried."""
     horizon: int
@@ -30,6 +30,8 @@ class Found(NamedTuple):
     """Effects that the data cannot tell from it."""
     share: float = float("nan")
     """Share of the multi-step error that it removes on recordings left out of its fit."""
+    removed: float = float("nan")
+    """Share of the squared error that its refit removed where it was found."""
 
 
 class Addition(NamedTuple):

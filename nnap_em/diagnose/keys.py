@@ -6,6 +6,7 @@ import jax
 
 from ..effects import AbstractEffect, flat
 from ..model.state_space import StateSpaceModel
+from ..systems import AbstractSystem
 
 Key = tuple[str, int | None, str | None, tuple[str, ...]]
 """Name, joint, channel and inputs of an effect."""
@@ -48,6 +49,13 @@ def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
 def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """Whether an unnamed law in the model is a function of the same signals at the same joint as a named one."""
     return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
+
+
+def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:
+    """True where a function of some signals at a joint can be what `law` is: named, or a function of fewer of them."""
+    own, its = (set(effect.signals(system)) for effect in (free, law))
+    inside = bool(its) and its <= own and (law.named or its < own)
+    return not free.named and inside and free.joint == law.joint
 
 
 def _alike(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:

@@ -11,35 +11,35 @@ from ..effects import Candidate
 from ..effects.sensor import SensorQuantization, grid_step
 from ..em.loop import EMState
 from ..model.state_space import StateSpaceModel
-from .accept import LikelihoodRule
-from .grow import Loop, grow
+from .context import SearchContext, extend
 from .hypothesis import Found, Hypothesis
+from .verdict import ONE_STEP
 
 
-def quantised(loop: Loop, now: Hypothesis) -> tuple[Hypothesis, EMState | None]:
+def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMState | None]:
     """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise.
 
     A fit that took the steps for motion has lost its way: it begins again where it was short.
     """
-    rig, state, first = loop.before.rig, None, min(loop.stages)
+    rig, state, first = context.before.rig, None, min(context.stages)
     for i, channel in enumerate(rig.measured):
-        y = np.asarray(loop.data.y)[..., i]
+        y = np.asarray(context.data.y)[..., i]
         step = grid_step(y.ravel())
         model = cast(StateSpaceModel, state.best if state else now.model)
         told, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
         share = step**2 / 12 / (told**2 if told else max(now_r - step**2 / 12, 0.25 * now_r))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
-        if share < 0.1 or gain < LikelihoodRule().margin:
+        if share < 0.1 or gain < ONE_STEP.nats:
             continue
-        loop.say(f"  {channel} comes in steps of {step:.4g}")
+        context.say(f"  {channel} comes in steps of {step:.4g}")
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        found = Found(candidate, float(gain), float(gain), 0.0, loop.data.t.shape[1])
-        early = cast(StateSpaceModel, state.best if state else loop.stages[first][0].best)
+        found = Found(candidate, float(gain), float(gain), 0.0, context.data.t.shape[1])
+        early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         now = now.refitted(early).plus(effect, candidate, found)
         if told:
             log_r = now.model.log_r.at[i].set(math.log(told**2 + step**2 / 12))
             now = now.refitted(eqx.tree_at(lambda m: m.log_r, now.model, log_r))
-        state = grow(loop, now, first, loop.longest)
+        state = extend(context, now, first)
     return now, state

@@ -10,30 +10,28 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
 from ..em.identify import Identified, finished
-from .accept import LikelihoodRule
-from .evidence import Question
-from .grow import Loop, asked, grow
+from .context import EFFORT, SearchContext, extend, smooth
 from .hypothesis import Hypothesis
 from .keys import Key, key_of
-from .look import EFFORT
+from .losses import OneStep
 from .outcome import Closed
 from .propose import extended, proposals, seeded, surroundings
 from .refit import Trial, refit
-from .screen import score_test
+from .screen import screen
+from .smoothed import SmoothedFit
+from .verdict import EVEN_NATS
 
 STARTS = 3
 """Places from which a law is fitted; one that is not linear, from all that there are."""
 PASSES = 10
 """Passes of a fit from one of them, more than in a search: rivals are compared closely."""
-EVEN = 5.0
-"""Log-likelihood [nat] within which two laws cannot be told apart."""
 
 
 def possible(fitted: Identified, data: Dataset) -> list[AbstractEffect]:
     """The laws that the machine of a fit may have."""
-    question = _question(fitted, data, None)
-    around = surroundings(fitted.rig, question.model, question.data, question.path, question.rows)
-    return [candidate.start for candidate in proposals(around, question.model.effects)]
+    fit = _smoothed(fitted, data, None)
+    around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
+    return [candidate.start for candidate in proposals(around, fit.model.effects)]
 
 
 def instead(
@@ -43,23 +41,23 @@ def instead(
 
     None where the machine cannot have one.
     """
-    question = _question(fitted, data, place)
-    around = surroundings(fitted.rig, question.model, question.data, question.path, question.rows)
-    same = [one for one in proposals(around, question.model.effects) if means(one.start)]
+    fit = _smoothed(fitted, data, place)
+    around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
+    same = [one for one in proposals(around, fit.model.effects) if means(one.start)]
     trials = []
-    screened = sorted(score_test(question, same).screened, key=lambda s: -s.gain) if same else []
+    screened = sorted(screen(OneStep(), fit, same).screened, key=lambda s: -s.share.inside) if same else []
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
-        full = question.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
-        path = extended(full.model, question.path, question.data)
-        trials.append(refit(full.model, full.m_step.early(), path, question.data, question.used, passes=PASSES))
+        full = fit.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
+        path = extended(full.model, fit.path, fit.data)
+        trials.append(refit(full.model, full.m_step.early(), path, fit.data, fit.used, passes=PASSES))
     return _with(fitted, max(trials, key=lambda trial: float(np.nansum(trial.loglik)))) if trials else None
 
 
 def again(fitted: Identified, data: Dataset) -> Identified:
     """The fit after as many quick passes as its rivals get."""
-    question = _question(fitted, data, None)
-    rule = question.m_step.early()
-    return _with(fitted, refit(question.model, rule, question.path, question.data, question.used, passes=PASSES))
+    fit = _smoothed(fitted, data, None)
+    rule = fit.m_step.early()
+    return _with(fitted, refit(fit.model, rule, fit.path, fit.data, fit.used, passes=PASSES))
 
 
 def apart(closed: Closed, data: Dataset) -> Closed:
@@ -76,12 +74,12 @@ def apart(closed: Closed, data: Dataset) -> Closed:
         own = max(_total(one) for one in (again(fitted, data), own[1]) if one is not None)
         leads = {key: _total(other) - own for key, other in others if other is not None}
         best, other = max(others, key=lambda entry: leads.get(entry[0], -math.inf))
-        if other is not None and leads[best] > EVEN:
+        if other is not None and leads[best] > EVEN_NATS:
             rest = [one for i, one in enumerate(closed.found) if i != place]
-            even = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EVEN]
+            even = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EVEN_NATS]
             found = found._replace(equivalent=tuple(even))
             return closed._replace(after=_settled(other, data), found=(*rest, found))
-        even = [key for key in found.equivalent if leads.get(key, 0.0) >= -EVEN]
+        even = [key for key in found.equivalent if leads.get(key, 0.0) >= -EVEN_NATS]
         both = closed.found[:place], closed.found[place + 1 :]
         closed = closed._replace(found=(*both[0], found._replace(equivalent=tuple(even)), *both[1]))
     return closed
@@ -94,22 +92,22 @@ def _is(key: Key, effect: AbstractEffect) -> bool:
 def _settled(fitted: Identified, data: Dataset) -> Identified:
     """A quick refit after EM over the whole length."""
     data = jax.device_put(data)
-    loop = _loop(fitted, data)
+    context = _context(fitted, data)
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    return finished(fitted._replace(state=grow(loop, now, loop.longest, loop.longest)), data)
+    return finished(fitted._replace(state=extend(context, now, context.longest)), data)
 
 
-def _loop(fitted: Identified, data: Dataset) -> Loop:
-    return Loop(fitted, {}, data, LikelihoodRule(), EFFORT, lambda text: None)
+def _context(fitted: Identified, data: Dataset) -> SearchContext:
+    return SearchContext(fitted, {}, data, OneStep(), EFFORT, lambda text: None)
 
 
-def _question(fitted: Identified, data: Dataset, place: int | None) -> Question:
+def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:
     """What a fit lacks without one of its effects, over the whole length."""
     data = jax.device_put(data)
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     now = now if place is None else now.without(place)
-    loop = _loop(fitted, data)
-    return asked(loop, now, loop.longest)[0]._replace(bare=now.having(()))
+    context = _context(fitted, data)
+    return smooth(context, now, context.longest)[0]._replace(declared=now.having(()))
 
 
 def _total(fitted: Identified) -> float:

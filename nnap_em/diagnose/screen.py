@@ -1,171 +1,280 @@
-"""Score test of everything that the fitted model may lack, all candidates in one pass.
+"""The share of a squared error that each candidate removes, and the share that chance removes.
 
-Every candidate is a column: how the whitened readings would move if it were there.  Friction maps, uncertain
-parameters and effects already in the model are projected out, so that only what they cannot explain counts
-[Rao 1948, Proc. Camb. Phil. Soc. 44; the columns by the sensitivity equations of the Kalman filter].
+Friction, parameters and accepted effects are nuisance: all data together project them out of errors and candidates, and
+only the strengths of a candidate are fitted without the parts left out.  A nuisance fitted anew to every fold
+diverges on chaotic recordings, and refuses true effects.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ..data.dataset import Dataset
-from ..effects import Candidate
-from ..em.local import locals_along
-from ..em.multistep import read_columns
-from ..em.quadratic import friction_columns, whitened_sensitivities
-from ..em.weights import Weights
-from ..model.state_space import StateSpaceModel
-from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, turns
-from ..smoother.kalman import CUBATURE, kalman_filter
+from ..effects import Candidate, flat
+from ..em.shape import friction_prior
 from ..storage.journal import HERE, step
-from .columns import candidate_columns, tracks
-from .evidence import Projected, Question, Screen, Screened
+from .folds import members, parts
+from .losses import AbstractLoss, Linearised
+from .smoothed import SmoothedFit
+from .verdict import CHANCE, Share, admissible
+
+SHIFTS = 2
+"""Placebos whose largest share is the chance level."""
+SHIFTABLE = 8
+"""Moments of a sequence below which a shift would leave its columns where they are."""
 
 
-class Sheet(NamedTuple):
-    """Score and information of nuisance and candidate columns."""
+class Rows(NamedTuple):
+    """Errors and candidate columns without what the nuisance can explain; a row per error, sorted by cell."""
 
-    score: Float[np.ndarray, " column"]
-    information: Float[np.ndarray, "column column"]
-    nuisance: int
-    """Leading columns that are projected out."""
-    prior: Float[np.ndarray, "nuisance nuisance"]
-    """Prior precision of the nuisance."""
-
-
-def _sheet(common, one) -> tuple[Float[Array, " column"], Float[Array, "column column"]]:
-    """Score and information of one sequence."""
-    (log_q, log_r, start, nodes), (here, middle, found) = common, one
-    dof = nodes.shape[0]
-    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
-    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
-    states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-    readings = read_columns(nodes, here, middle, found)
-    states = jnp.where(here.seq.active[:, None, None], states, 0.0)
-    jac = whitened_sensitivities(filtered, states, readings, here.seq.observed).reshape(-1, states.shape[-1])
-    return jac.T @ filtered.innovation.ravel(), jac.T @ jac
+    error: Float[np.ndarray, " row"]
+    columns: Float[np.ndarray, "row column"]
+    cell: Int[np.ndarray, " row"]
+    """Fold times `step` plus block."""
+    step: int
+    overlap: float
+    """Rows that count as one."""
 
 
-def sheet(
-    base: StateSpaceModel,
-    null: StateSpaceModel,
-    weights: Weights,
-    candidates: Sequence[Candidate],
-    path: Gaussian,
-    data: Dataset,
-    used: Float[np.ndarray, " seq"],
-    rows: int = 0,
-) -> Sheet:
-    """Columns of all probes of all candidates along the smoothed path of `null`, which is `base` and its effects: the
-    sum over sequences with weights `used`.  What a lost one says does not count, not even as NaN.
+class Shares(NamedTuple):
+    """Shares of all candidates at one band of horizons."""
+
+    inside: Float[np.ndarray, " candidate"]
+    left_out: Float[np.ndarray, " candidate"]
+    folds: Float[np.ndarray, "candidate fold"]
+    directions: Float[np.ndarray, " candidate"]
+    coefficients: Float[np.ndarray, " probe"]
+
+
+class Screened(NamedTuple):
+    """A candidate before any refit, at the band of horizons that shows it best."""
+
+    candidate: Candidate
+    coefficients: Float[np.ndarray, " probe"]
+    """Multiples of its probes."""
+    directions: int
+    share: Share
+    band: int
+    floor: float
+    """Smallest share that counts at that band."""
+    chance: float
+    """Largest share of any placebo at that band."""
+    independent: float
+    """Number of independent errors."""
+
+    @property
+    def bar(self) -> float:
+        """Share that a law with a name must reach."""
+        return max(self.floor, CHANCE * self.chance)
+
+    @property
+    def admissible(self) -> bool:
+        """True where the parts left out confirm the share."""
+        start = self.candidate.start
+        multiple = float(self.coefficients[0])
+        return admissible(self.share, self.floor, multiple, linear=start.linear, answers=start.answers())
+
+
+def spans(candidates: Sequence[Candidate]) -> list[slice]:
+    """Places of the probes of every candidate among all."""
+    ends = np.cumsum([0, *(len(c.probes) for c in candidates)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
+def project(
+    found: Linearised,
+    fold: Int[np.ndarray, "seq time"],
+    block: Int[np.ndarray, "seq time"],
+    precision: Float[np.ndarray, "nuisance nuisance"],
+    pull: Float[np.ndarray, " nuisance"],
+) -> Rows:
+    """Errors and candidates without the part that the nuisance explains under its prior."""
+    keep = found.weight > 0
+    step = int(block.max(initial=0)) + 1
+    cell = np.broadcast_to((fold * step + block)[:, :, None], keep.shape)[keep]
+    order, root = np.argsort(cell, kind="stable"), np.sqrt(found.weight[keep])
+    error = (root * found.error[keep])[order]
+    columns = (root[:, None] * found.columns[keep])[order].astype(float)
+    nuisance, own = columns[:, : len(pull)], columns[:, len(pull) :]
+    factor = np.linalg.cholesky(nuisance.T @ nuisance + precision)
+    solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
+    error = error - nuisance @ solve(nuisance.T @ error - pull)
+    return Rows(error, own - nuisance @ solve(nuisance.T @ own), cell[order], step, found.overlap)
+
+
+def shifted(found: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
+    """Errors beside candidate columns of another time of their own sequence.
+
+    The columns behind the first `nuisance` ones are rolled over the moments of each sequence, by a quarter to three
+    quarters of them: they keep their size, their colour and their number, and lose their meaning.  What is rolled over
+    the end changes its sign, since a constant would keep its meaning.
     """
-    here = locals_along(null, weights.prior, path, data, CUBATURE)
-    track = tracks(null, path, here.seq.inputs)
-    base = eqx.tree_at(lambda m: m.unknown, base, null.unknown)
-    along = candidate_columns(base, candidates, rows)
-    common = (null.log_q, null.log_r, null.start, weights.nodes)
-    nuisance = weights.nodes.size + weights.prior.size
-    size = nuisance + sum(len(candidate.probes) for candidate in candidates)
-    score, information = np.zeros(size), np.zeros((size, size))
-    for some, (local, own) in turns(len(used), here, track):  # columns of all fill the memory
-        found = map(np.asarray, each(_sheet, common, (local, own.middle, along(own)), together=1))
-        for weight, its, told in zip(used[some[0] :], *found, strict=False):
-            if weight > 0 and np.isfinite(its).all() and np.isfinite(told).all():
-                score += weight * its
-                information += weight * told
-    prior = np.asarray(weights.symmetry()) + _smooth_prior(weights)
-    return Sheet(score, information, nuisance, prior)
+    columns = found.columns.copy()
+    for weight, own in zip(found.weight, columns, strict=True):
+        count = int((weight > 0).any(axis=1).sum())
+        if count >= SHIFTABLE:
+            by = rng.integers(count // 4, 3 * count // 4 + 1)
+            moved = np.roll(own[:count, ..., nuisance:], by, axis=0)
+            moved[:by] *= -1
+            own[:count, ..., nuisance:] = moved
+    return found._replace(columns=columns)
 
 
-def _smooth_prior(weights: Weights) -> np.ndarray:
-    """Prior precision of the nuisance: friction maps of a natural size and smoothness, parameters as declared."""
-    dof, count = weights.nodes.shape
-    size = 10 * np.asarray(weights.asymmetry)
-    bend = np.diff(np.eye(count), 2, axis=0)
-    blocks = [np.eye(count) / s**2 + bend.T @ bend / (0.3 * s) ** 2 for s in size]
-    out = np.eye(dof * count + weights.prior.size)
-    for j, block in enumerate(blocks):
-        out[j * count : (j + 1) * count, j * count : (j + 1) * count] = block
-    return out
+class _Sums(NamedTuple):
+    """Score and Gram matrix of candidates with equally many probes, by cell."""
+
+    score: Float[np.ndarray, "cell candidate probe"]
+    gram: Float[np.ndarray, "cell candidate probe probe"]
+    ridge: Float[np.ndarray, "candidate probe"]
+
+    def fitted(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Squared error that a fit to all cells removes, its coefficients, and its directions."""
+        score, gram = self.score.sum(axis=0), self.gram.sum(axis=0)
+        matrix, c = self._solved(score, gram)
+        return _gone(c, score, gram), c, np.trace(np.linalg.solve(matrix, gram), axis1=1, axis2=2)
+
+    def left_out(self, cells: Bool[np.ndarray, " cell"]) -> Float[np.ndarray, " candidate"]:
+        """Squared error in some cells that a fit to the others removes."""
+        _, c = self._solved(self.score[~cells].sum(axis=0), self.gram[~cells].sum(axis=0))
+        return _gone(c, self.score[cells].sum(axis=0), self.gram[cells].sum(axis=0))
+
+    def _solved(self, score, gram) -> tuple[np.ndarray, np.ndarray]:
+        matrix = gram + self.ridge[:, None, :] * np.eye(size := score.shape[-1])
+        jitter = 1e-9 * np.trace(matrix, axis1=1, axis2=2) / size + 1e-30
+        matrix = matrix + jitter[:, None, None] * np.eye(size)
+        return matrix, np.linalg.solve(matrix, score[..., None])[..., 0]
 
 
-def project(sheet: Sheet) -> Projected:
-    """What the nuisance cannot say."""
-    score, information = sheet.score, sheet.information
-    n = sheet.nuisance
-    factor = np.linalg.cholesky(information[:n, :n] + sheet.prior)
-    half = np.linalg.solve(factor, information[:n, n:])
-    left = np.linalg.solve(factor, score[:n])
-    return Projected(score[n:] - half.T @ left, information[n:, n:] - half.T @ half)
+def _gone(c, score, gram) -> Float[np.ndarray, " candidate"]:
+    """Squared error that some coefficients remove."""
+    return 2 * np.sum(c * score, axis=1) - np.einsum("mk,mkl,ml->m", c, gram, c)
 
 
-@step(lambda *_: Projected(HERE, HERE))
-def screen(
-    base: StateSpaceModel,
-    null: StateSpaceModel,
-    weights: Weights,
-    candidates: Sequence[Candidate],
-    path: Gaussian,
-    data: Dataset,
-    used: Bool[np.ndarray, " seq"],
-    rows: int,
-) -> Projected:
-    """The sheet of all candidates, projected: what the sequences `used` say of them."""
-    return project(sheet(base, null, weights, candidates, path, data, np.asarray(used, float), rows))
+def _sums(rows: Rows, places: Int[np.ndarray, "candidate probe"], ridge) -> _Sums:
+    edges = np.flatnonzero(np.diff(rows.cell)) + 1
+    scores, grams = [], []
+    for here in np.split(np.arange(len(rows.cell)), edges):
+        x = np.moveaxis(rows.columns[here[0] : here[-1] + 1][:, places], 0, 1)  # candidate row probe
+        scores.append(np.einsum("mrk,r->mk", x, rows.error[here[0] : here[-1] + 1]))
+        grams.append(np.swapaxes(x, 1, 2) @ x)
+    return _Sums(np.stack(scores), np.stack(grams), ridge)
 
 
-def score_test(question: Question, candidates: Sequence[Candidate]) -> Screen:
-    """The expected gain of every candidate over the model as it stands."""
-    now = question.now
-    weights = now.m_step.weights(now.model)
-    asked = (candidates, question.path, question.data, question.used, question.rows)
-    projected = screen(question.bare.model, now.model, weights, *asked)
-    return Screen(tuple(judge(projected, candidates)), projected)
+def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -> Shares:
+    """Shares of all candidates.
+
+    Every fold of motions is left out in turn and, unless a law is `timed`, every block of time; the smaller share
+    counts.  A fold whose error rises is compared with an average one, if that holds more.
+    """
+    cells, first = np.unique(rows.cell, return_index=True)
+    square = np.add.reduceat(rows.error**2, first)
+    total, fold, block = square.sum(), cells // rows.step, cells % rows.step
+    held = np.array([square[fold == f].sum() for f in np.unique(fold)] or [0.0])
+    where, sizes = spans(candidates), np.array([len(c.probes) for c in candidates])
+    inside, left_out, directions = np.zeros((3, len(candidates)))
+    folds, coefficients = np.zeros((len(candidates), len(held))), np.zeros(where[-1].stop)
+    for size in np.unique(sizes) if len(held) > 1 else ():  # of one fold nothing can be left out
+        some = np.flatnonzero(sizes == size)
+        places = np.array([np.arange(where[int(i)].start, where[int(i)].stop) for i in some])
+        sums = _sums(rows, places, np.array([_ridge(candidates[int(i)]) for i in some]))
+        gone, coefficients[places], directions[some] = sums.fitted()
+        count = np.maximum(len(rows.error) / rows.overlap, directions[some] + 2)
+        inside[some] = 1 - (1 - gone / total) * (count - 1) / (count - directions[some] - 1)
+        out = np.stack([sums.left_out(fold == f) for f in np.unique(fold)], axis=1)
+        folds[some] = out / np.where(out < 0, np.maximum(held, held.mean()), held)
+        moments = sum(sums.left_out(block == b) for b in np.unique(block))
+        least = np.where(np.asarray(timed)[some], np.inf, moments)
+        left_out[some] = np.minimum(out.sum(axis=1), least) / total
+    return Shares(inside, left_out, folds, directions, coefficients)
 
 
-def unlike(projected: Projected, candidates: Sequence[Candidate], chosen: Candidate) -> list[float]:
-    """Share of what the data say of `chosen` that each candidate could not say in its place; 0: the same model."""
-    sizes = np.cumsum([0, *(len(c.probes) for c in candidates)])
-    spans = [np.arange(a, b) for a, b in itertools.pairwise(sizes)]
-    own = spans[next(i for i, c in enumerate(candidates) if c is chosen)]
-    whole = projected.information[np.ix_(own, own)]
+def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
+    """Prior precision of the multiples of the probes."""
+    start, spread = np.asarray(flat(candidate.start)), np.asarray(flat(candidate.spread))
+    steps = [(np.asarray(flat(probe)) - start) / spread for probe in candidate.probes]
+    return np.array([np.sum(step**2) for step in steps]) if candidate.start.linear else np.zeros(len(steps))
+
+
+class _Band(NamedTuple):
+    """What the screen keeps of one band."""
+
+    shares: Shares
+    placebos: tuple[Shares, ...]
+    information: Float[np.ndarray, "probe probe"]
+    """Gram matrix of the columns, in independent errors."""
+    independent: float
+    """Number of independent errors."""
+
+
+_SHARES = Shares(HERE, HERE, HERE, HERE, HERE)
+_BAND = _Band(_SHARES, (_SHARES,) * SHIFTS, HERE, HERE)
+
+
+@step(lambda loss, *_: ((_BAND,) * len(loss.bands), HERE))
+def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]):
+    """The screen of every band, and the sequences that each fold holds.
+
+    The seed of the placebos is fixed, so that the same data give the same chance level.
+    """
+    model, weights = fit.model, fit.m_step.weights(fit.model)
+    precision, pull = friction_prior(model, weights)
+    timed = ["time" in c.start.signals(model.system) for c in candidates]
+    out, fold = [], np.zeros((len(fit.used), 1), int)
+    for found in loss.linearise(fit, candidates):
+        fold, block = parts(model, fit.path, fit.data, fit.used, fit.recording, found.rows)
+        rng, of = np.random.default_rng(0), lambda one: project(one, fold, block, precision, pull)  # noqa: B023
+        rows = of(found)
+        real = shares(rows, candidates, timed)
+        moved = (of(shifted(found, len(pull), rng)) for _ in range(SHIFTS))
+        placebos = tuple(shares(one, candidates, timed) for one in moved)
+        columns = (rows.columns / np.sqrt(rows.overlap)).astype(np.float32)
+        out.append(_Band(real, placebos, columns.T @ columns, len(rows.error) / rows.overlap))
+    return tuple(out), members(fold, fit.used)
+
+
+class Screen(NamedTuple):
+    """All candidates before any refit."""
+
+    screened: tuple[Screened, ...]
+    information: tuple[Float[np.ndarray, "probe probe"], ...]
+    """Gram matrix of the columns of all probes, by band."""
+    members: Bool[np.ndarray, "fold seq"]
+    """Sequences that each fold holds, or pieces of."""
+
+
+def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]) -> Screen:
+    """Every candidate at the band of horizons where its share is the largest multiple of what it must reach."""
+    bands, folds = _bands(loss, fit, candidates)
     out = []
-    for span in spans:
-        block = projected.information[np.ix_(span, span)]
-        cross = projected.information[np.ix_(own, span)]
-        left = whole - cross @ np.linalg.pinv(block, rcond=1e-9, hermitian=True) @ cross.T
+    for number, band in enumerate(bands):
+        floor = loss.bars.floor(band.independent)
+        placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
+        chance = max((s.share.least for s in placebo if s.admissible), default=0.0)
+        out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))
+    best = (max(same, key=lambda s: (s.admissible, s.share.least / s.bar)) for same in zip(*out, strict=True))
+    return Screen(tuple(best), tuple(band.information for band in bands), np.asarray(folds))
+
+
+def _screened(
+    found: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float, independent: float
+) -> Iterator[Screened]:
+    for i, (candidate, here) in enumerate(zip(candidates, spans(candidates), strict=True)):
+        share = Share(float(found.inside[i]), float(found.left_out[i]), tuple(found.folds[i].tolist()))
+        directions = round(float(found.directions[i]))
+        yield Screened(candidate, found.coefficients[here], directions, share, band, floor, chance, independent)
+
+
+def overlaps(screen: Screen, chosen: Screened) -> list[float]:
+    """Share of what the data say of the `chosen` candidate that each could not say in its place; 0: the same model."""
+    candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
+    where = spans(candidates)
+    own = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
+    whole, out = information[own, own].astype(float), []
+    for here in where:
+        cross = information[own, here].astype(float)
+        block = information[here, here].astype(float)
+        left = whole - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross.T
         out.append(float(np.clip(np.trace(left) / max(np.trace(whole), 1e-300), 0.0, 1.0)))
-    return out
-
-
-def judge(projected: Projected, candidates: Sequence[Candidate]) -> list[Screened]:
-    """The score test of every candidate.
-
-    Raises FloatingPointError for a gain that is no number.
-    """
-    out, place = [], 0
-    for candidate in candidates:
-        here = slice(place, place + len(candidate.probes))
-        place = here.stop
-        block = projected.information[here, here]
-        if not np.isfinite(block).all() or not np.isfinite(projected.score[here]).all():
-            raise FloatingPointError(
-                f"{candidate.start.name}: its effect on the readings is no number; is a column of the logs constant?"
-            )
-        values, vectors = np.linalg.eigh(block)
-        # a unit of a probe is a typical strength: what a few of them would not show is not seen
-        seen = values > max(1e-6 * values[-1], 1e-3)
-        along = vectors[:, seen].T @ projected.score[here]
-        weight = values[seen] + 0.01
-        gain = float(0.5 * np.sum(along**2 / weight))
-        out.append(Screened(candidate, vectors[:, seen] @ (along / weight), int(seen.sum()), gain, None))
     return out

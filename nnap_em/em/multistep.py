@@ -77,9 +77,9 @@ def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Gri
     return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
 
 
-def starts(model: StateSpaceModel, data: Dataset) -> Int[np.ndarray, " start"]:
+def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Int[np.ndarray, " start"]:
     """Rows at which all sequences are forked."""
-    return _grid(model, data).starts(data.t.shape[1])
+    return _grid(model, data, horizons).starts(data.t.shape[1])
 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
@@ -94,9 +94,10 @@ def forks(
     path: Gaussian,
     data: Dataset,
     extra: Callable[[Int[np.ndarray, " some"]], Columns] | None = None,
+    horizons: tuple[float, ...] = HORIZONS,
 ) -> Forks:
     """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` says more columns of some."""
-    grid = _grid(model, data)
+    grid = _grid(model, data, horizons)
     here, exact = _wide(model, weights.prior, path, data)
     state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
     error = np.array(each(_errors, (model, grid), (state, here.seq)))

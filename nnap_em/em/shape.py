@@ -24,9 +24,9 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
         here = slice(j * count, (j + 1) * count)
         top = np.abs(v).max()
         laws = np.stack([v / top, *(np.tanh(v / (r * top)) for r in KNEES)], axis=1)
-        basis = np.linalg.svd(laws, full_matrices=False)[0]
-        beside = (np.eye(count) - basis @ basis.T) / (SHAPE * np.sqrt(np.mean(value[here] ** 2)) + 1e-12) ** 2
-        precision[here, here] = beside + 1e-12 * np.eye(count)
+        others = np.linalg.svd(laws)[0][:, laws.shape[1] :]  # what no sum of known laws can be
+        beside = others @ others.T / (SHAPE * np.sqrt(np.mean(value[here] ** 2)) + 1e-12) ** 2
+        precision[here, here] = beside + (1e-9 * np.trace(beside) / count + 1e-12) * np.eye(count)
         pull[here] = beside @ value[here]
     own = slice(nodes.size, size)
     precision[own, own] = np.eye(weights.prior.size)

@@ -1,0 +1,172 @@
+"""What a search works on, and its two long steps: smooth a hypothesis, and extend its fit to a longer horizon."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from ..data.dataset import Dataset, horizon
+from ..em.identify import Identified
+from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
+from ..em.mstep import kept
+from ..em.multistep import JUDGED, errors, ratio
+from ..model.state_space import StateSpaceModel
+from .hypothesis import Hypothesis
+from .losses import AbstractLoss, MultiStep
+from .smoothed import SmoothedFit
+
+_Tree = TypeVar("_Tree")
+Say = Callable[[str], None]
+
+Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
+"""State of a fit at the end of each of its horizons, and the sequences used."""
+
+SHORT = 150
+"""Rows to which short horizons are cut, so that they share their programs."""
+LOOSER = 3.0
+"""Increase of the log of the process noise where a fit loses tracks: a looser filter keeps them."""
+
+
+class Effort(NamedTuple):
+    """Extent of a search; it decides nothing."""
+
+    shortlist: int = 5
+    """Candidates that are refitted at most."""
+    passes: int = 8
+    """Passes of a refit."""
+    most: int = 4
+    """Effects at most."""
+    loud: float = 5.0
+    """Standard deviations of a kick with which a track begins to diverge."""
+    later: tuple[int, ...] = (8, 3, 1)
+    """Rows after that which still count; the fewer where the many are too much."""
+
+
+EFFORT = Effort()
+
+
+class SearchContext(NamedTuple):
+    """What does not change during a search."""
+
+    before: Identified
+    stages: Stages
+    data: Dataset
+    loss: AbstractLoss
+    effort: Effort
+    say: Say
+    pieces: tuple[int, ...] = ()
+    """Recording that every sequence is a piece of; empty: each is a recording."""
+
+    @property
+    def longest(self) -> int:
+        """Rows of the longest sequence."""
+        return int(np.max(np.sum(np.asarray(self.data.valid), axis=1)))
+
+    @property
+    def declared(self) -> Hypothesis:
+        """The declared model."""
+        return Hypothesis(self.before.model, self.before.m_step)
+
+
+def beginning(data: Dataset, length: int) -> Dataset:
+    """The first `length` rows."""
+    return _cut(horizon(data, length), length)
+
+
+def _cut(tree: _Tree, length: int) -> _Tree:
+    """All of it, over no more rows than a short horizon needs."""
+    return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if length <= SHORT else tree  # a view, no program
+
+
+def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
+    """`now` along its smoothed paths over `length` rows, and the sequences that are followed whole.
+
+    A diverged sequence is most informative around its divergence: it is used up to 8, 3 or 1 rows after that moment,
+    the longest stretch that the smoother still follows.
+    """
+    before, rows = context.before, context.data.t.shape[1]
+    smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
+    posterior = e_step(now.model, every, smoother, key=before.state.key)
+    whole = np.asarray(kept(posterior, every))
+    both = _cut(posterior.state, length), _cut(every, length)
+    found = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
+    if whole.all():
+        return found, whole
+    dof = len(now.model.system.coordinates)
+    kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
+    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.loud)
+    first = np.where(loud.any(axis=1), loud.argmax(axis=1), every.t.shape[1])
+    row, used, cut = np.arange(every.t.shape[1]), whole, every
+    for later in context.effort.later:
+        early = every.valid & jnp.asarray(row < first[:, None] + later)
+        cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
+        posterior = e_step(now.model, cut, smoother, key=before.state.key)
+        used = np.asarray(kept(posterior, cut))
+        if used.all():
+            break
+    return found._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
+
+
+def extend(context: SearchContext, now: Hypothesis, first: int, state: EMState | None = None) -> EMState:
+    """EM of `now` from a horizon of `first` rows (or from `state`) to the whole length."""
+    before, longest = context.before, context.longest
+    if state is not None:
+        now = now.refitted(cast(StateSpaceModel, state.best))
+    schedule = Schedule(first=min(first, longest), growth=1.6, hold=1)
+    growing = math.ceil(math.log(longest / schedule.first) / math.log(1.6)) if longest > schedule.first else 0
+
+    def run(model: StateSpaceModel) -> EMState:
+        begun = start_state(model, now.m_step, key=before.state.key)._replace(epoch=1)
+        return fit(begun, context.data, before.smoother, now.m_step, epochs=growing + 8, schedule=schedule)
+
+    def looser(model: StateSpaceModel) -> StateSpaceModel:
+        return eqx.tree_at(lambda m: m.log_q, model, model.log_q + LOOSER)
+
+    try:
+        state = run(now.model)
+    except FitError:
+        state = run(looser(now.model))
+    if np.isfinite(before.state.top).sum() > np.isfinite(state.top).sum():
+        try:  # tracks that the model without it keeps are lost
+            other = run(looser(cast(StateSpaceModel, state.best)))
+            state = other if ahead(other, state) > 0 else state
+        except FitError:
+            pass
+    if isinstance(context.loss, MultiStep):
+        state = _predicting(context, now, state)
+    context.say(f"  fitted over the whole length in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
+    return state
+
+
+def _predicting(context: SearchContext, now: Hypothesis, state: EMState) -> EMState:
+    """A fit, or that of the model it began from where that predicts better.
+
+    EM, by one-step likelihood, may go away from what the errors of many steps had taught.
+    """
+    reached = now.refitted(cast(StateSpaceModel, state.best))
+    (a, one), (b, other) = (smooth(context, each, context.longest) for each in (now, reached))
+    if not (one & other).any():
+        return state
+    before, after = (errors(f.model, f.m_step.prior, f.path, context.data, JUDGED) for f in (a, b))
+    if ratio(before, after, one & other) <= 1:
+        return state
+    begun = start_state(now.model, now.m_step, key=state.key)._replace(epoch=1)
+    schedule = Schedule(first=context.longest)
+    return fit(begun, context.data, context.before.smoother, now.m_step, epochs=2, schedule=schedule)
+
+
+def trimmed(gain) -> float:
+    """Sum of gains with a sixth at either end replaced by the mean of the others."""
+    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
+    cut = gain.size // 6
+    return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+
+
+def ahead(a: EMState, b: EMState) -> float:
+    """Log-likelihood of one fit over another [nat]; a sixth of the sequences is trimmed at either end."""
+    return trimmed(np.nan_to_num(a.top, nan=-1e3) - np.nan_to_num(b.top, nan=-1e3))

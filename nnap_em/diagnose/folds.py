@@ -1,0 +1,80 @@
+"""Parts of the data that are left out in turn: motions, repetitions together, and moments of all recordings."""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..data.dataset import Dataset
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+
+FOLDS = 5
+"""Parts of motions, as far as there are recordings."""
+BLOCKS = 5
+"""Parts of time: what happens at one moment of every recording is no law."""
+QUARTERS = 4
+"""Parts of each motion, where there are fewer than three motions."""
+REPEATS = 0.2
+"""Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
+differ by up to .13, others by .25 and more."""
+
+
+def motions(
+    state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"], recording: Int[np.ndarray, " seq"]
+) -> Int[np.ndarray, " seq"]:
+    """Number of the motion of every sequence.
+
+    Recordings that repeat a motion are no evidence of each other and share its number; so do the pieces of a recording.
+    """
+    size = np.nanmean(state[used] ** 2, axis=(0, 1)) + 1e-12
+    scaled = state / np.sqrt(size)
+    motion = recording.copy()
+    for i, j in itertools.combinations(np.flatnonzero(used), 2):
+        difference, own = np.nanmean((scaled[i] - scaled[j]) ** 2), np.nanmean(scaled[[i, j]] ** 2)
+        if difference < REPEATS * own:
+            motion[motion == motion[j]] = motion[i]
+    return motion
+
+
+def times(
+    clock: Float[np.ndarray, "seq time"], data: Dataset, recording: Int[np.ndarray, " seq"], count: int
+) -> Int[np.ndarray, "seq time"]:
+    """Which of `count` equal parts of its recording each moment of `clock` [s] belongs to."""
+    t = np.where(np.asarray(data.valid), np.asarray(data.t), np.nan)
+    low, high = (np.array([of(t[recording == r]) for r in recording])[:, None] for of in (np.nanmin, np.nanmax))
+    return np.clip((count * (clock - low) / (high - low + 1e-12)).astype(int), 0, count - 1)
+
+
+def fold_of(
+    used: Bool[np.ndarray, " seq"], motion: Int[np.ndarray, " seq"], quarter: Int[np.ndarray, "seq time"]
+) -> Int[np.ndarray, "seq time"]:
+    """Part of every moment: neighbouring motions together, or quarters of the only ones."""
+    different, first = np.unique(motion[used], return_index=True)
+    order = np.zeros(used.size, int)
+    for rank, i in enumerate(np.argsort(first)):
+        order[motion == different[i]] = rank
+    count = different.size
+    if count >= 3:
+        return np.repeat((order * min(FOLDS, count) // count)[:, None], quarter.shape[1], axis=1)
+    return order[:, None] * QUARTERS + quarter
+
+
+def parts(
+    model: StateSpaceModel,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    recording: Int[np.ndarray, " seq"],
+    rows: Int[np.ndarray, " time"],
+) -> tuple[Int[np.ndarray, "seq time"], Int[np.ndarray, "seq time"]]:
+    """Fold and block of the moments at `rows` of every sequence."""
+    state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
+    motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
+    clock = np.asarray(data.t)[:, rows]
+    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, BLOCKS)
+
+
+def members(fold: Int[np.ndarray, "seq time"], used: Bool[np.ndarray, " seq"]) -> Bool[np.ndarray, "fold seq"]:
+    """Sequences that each fold holds, or pieces of."""
+    return np.array([(fold == f).any(axis=1) & used for f in np.unique(fold[used])]).reshape(-1, used.size)

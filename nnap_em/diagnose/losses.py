@@ -1,0 +1,177 @@
+"""Losses of a fitted model that are quadratic about its smoothed paths, and what candidates would change of them.
+
+Each loss gives its errors and their derivatives by friction, parameters and candidates in one form, on which the one
+screen of `screen.py` works.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..data.dataset import Dataset
+from ..effects import Candidate
+from ..em.local import locals_along
+from ..em.multistep import HORIZONS, JUDGED, SOON, errors, finish, forks, ratio, read_columns, starts, weighed
+from ..em.quadratic import friction_columns, whitened_sensitivities
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.parallel import each, turns
+from ..smoother.kalman import CUBATURE, kalman_filter
+from .columns import candidate_columns, tracks
+from .refit import Trial
+from .smoothed import SmoothedFit
+from .verdict import MULTI_STEP, ONE_STEP, Bars
+
+
+class Linearised(NamedTuple):
+    """Errors of a fitted model, and their derivatives; sequence by moment by output."""
+
+    error: Float[np.ndarray, "seq time output"]
+    columns: Float[np.ndarray, "seq time output column"]
+    """By friction nodes, by parameters, then by the probes of all candidates: what each takes off the error."""
+    weight: Float[np.ndarray, "seq time output"]
+    """One over the variance of an error; 0 where it does not count."""
+    overlap: float
+    """Number of errors that count as one."""
+    rows: Int[np.ndarray, " time"]
+    """Row of the log of every moment."""
+
+
+class AbstractLoss(eqx.Module):
+    """Which errors are looked at, and how a fit to them is finished."""
+
+    bars: ClassVar[Bars]
+    bands: eqx.AbstractVar[tuple[tuple[float, ...], ...]]
+    """Horizons [s] that are looked at together."""
+    measure: ClassVar[str]
+    """Name of the share that the screen computes, as a figure labels it."""
+
+    @abstractmethod
+    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
+        """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
+
+    @abstractmethod
+    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
+        """Model of a `trial` after what its fit by likelihood leaves to do."""
+
+    @abstractmethod
+    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+        """Squared error of one fit over that of another, on the sequences that `fit` uses, at a band of horizons."""
+
+
+class MultiStep(AbstractLoss):
+    """Open-loop errors of the measured coordinates some time ahead, by band of horizons.
+
+    A machine whose noise is not what its model says shows here what it lacks: that adds up over many steps, and what
+    spoils its readings does not.  Fast machines forget, and show it at the shorter horizons only.
+    """
+
+    bars: ClassVar[Bars] = MULTI_STEP
+    measure: ClassVar[str] = "share of the squared multi-step error"
+    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SOON))
+    """Horizons [s] that are looked at together."""
+    judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SOON))
+    """Horizons [s] at which a law that a band shows is judged after its refit."""
+
+    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
+        """Filter errors forked every 50 ms, with robust weights."""
+        model, path, data = fit.model, fit.path, fit.data
+        weights = fit.m_step.weights(model)
+        track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
+        along = candidate_columns(_machine(fit), candidates)
+        every = tuple(sorted(set(sum(self.bands, ()))))
+        found = forks(model, weights, path, data, lambda some: along(jax.tree.map(lambda a: a[some], track)), every)
+        rows, weight = starts(model, data, every), weighed(found, fit.used)
+        bands = [[every.index(h) for h in band] for band in self.bands]
+        return tuple(
+            Linearised(
+                _flat(found.error[:, :, band]),
+                _flat(found.columns[:, :, band], 1),
+                _flat(weight[:, :, band]),
+                float(np.mean(found.overlap[band])),
+                rows,
+            )
+            for band in bands
+        )
+
+    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
+        """Model after Gauss-Newton steps on the multi-step errors."""
+        return finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
+
+    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+        """Ratio of robust squares, each fit along its own smoothed paths."""
+        before, after = (errors(t.model, t.m_step.prior, t.path, fit.data, self.judged[band]) for t in (null, full))
+        return ratio(before, after, fit.used)
+
+
+class OneStep(AbstractLoss):
+    """Whitened innovations: efficient where they are white, as the model says."""
+
+    bars: ClassVar[Bars] = ONE_STEP
+    measure: ClassVar[str] = "share of the squared one-step error"
+    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=((),))
+
+    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
+        """Innovations in standard deviations; derivatives by the sensitivity equations of the Kalman filter."""
+        model, data = fit.model, fit.data
+        weights = fit.m_step.weights(model)
+        here = locals_along(model, weights.prior, fit.path, data, CUBATURE)
+        track = tracks(model, fit.path, here.seq.inputs)
+        along = candidate_columns(_machine(fit), candidates, fit.rows)
+        common = (model.log_q, model.log_r, model.start, weights.nodes)
+        parts = []
+        for _, (local, own) in turns(len(data.t), here, track):  # columns of all at once fill the memory
+            found = each(_innovations, common, (local, own.middle, along(own)), together=1)
+            parts.append([np.asarray(a, np.float32) for a in found])
+        error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
+        sound = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
+        weight = (np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None] & sound[:, None, None]).astype(
+            float
+        )
+        return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
+
+    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
+        """Model as it is: likelihood leaves nothing to do."""
+        return trial.model
+
+    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+        """One minus twice the gain in log-likelihood over the readings, of sequences that both fits follow."""
+        gain = (full.loglik - null.loglik)[fit.used]
+        return 1.0 - 2.0 * float(np.nansum(gain)) / readings(fit.data, fit.used)
+
+
+def readings(data: Dataset, used) -> int:
+    """Number of readings of the sequences `used`."""
+    return int(np.sum(np.isfinite(np.asarray(data.y)[used]) & np.asarray(data.valid)[used][..., None]))
+
+
+def _machine(fit: SmoothedFit) -> StateSpaceModel:
+    """The declared machine with the friction of the fit: what candidates act on."""
+    return eqx.tree_at(lambda m: m.unknown, fit.declared.model, fit.model.unknown)
+
+
+def _flat(a: np.ndarray, last: int = 0) -> np.ndarray:
+    """Horizons and channels as one axis."""
+    return a.reshape(*a.shape[:2], -1, *a.shape[4 : 4 + last])
+
+
+def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
+    return model.inputs(seq)
+
+
+def _innovations(common, one) -> tuple[Float[Array, "time obs"], Float[Array, "time obs column"]]:
+    """Whitened innovations of one sequence and what friction nodes, parameters and candidates take off them."""
+    (log_q, log_r, start, nodes), (here, middle, found) = common, one
+    dof = nodes.shape[0]
+    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
+    states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
+    read = read_columns(nodes, here, middle, found)
+    states = jnp.where(here.seq.active[:, None, None], states, 0.0)
+    return filtered.innovation, whitened_sensitivities(filtered, states, read, here.seq.observed)

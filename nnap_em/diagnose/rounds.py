@@ -1,0 +1,228 @@
+"""One screening round: all candidates are screened, and the best are refitted until one is accepted."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from ..effects import AbstractEffect
+from ..model.state_space import StateSpaceModel
+from ..systems import AbstractSystem
+from .context import SearchContext
+from .keys import Key, contains, covered, key_of, replaced, rest_of, words
+from .losses import MultiStep
+from .outcome import Disputed, Step, Suspect
+from .propose import proposals, seeded, surroundings
+from .screen import Screen, Screened, overlaps, screen
+from .smoothed import SmoothedFit
+from .trial import Refit, fitted, with_candidate
+from .verdict import EVEN, EVEN_NATS, NAMED, SAME, agreed, odds, required, suspected
+
+_Law = TypeVar("_Law", Screened, Refit)
+
+SUSPECTS = 4
+"""Suspects that are listed: the right law was the fourth on a real arm with three recordings."""
+
+
+class Round(NamedTuple):
+    """Outcome of a screening round."""
+
+    step: Step
+    screen: Screen
+    accepted: Refit | None
+    equivalent: tuple[Key, ...] = ()
+    """Named laws that the data cannot tell from the accepted one."""
+
+
+def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
+    """Screen everything that the machine may have, and refit the best until one is accepted."""
+    rig, model = context.before.rig, fit.model
+    around = surroundings(rig, model, fit.data, fit.path, fit.rows)
+    seen = screen(context.loss, fit, proposals(around, model.effects))
+    fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, model)]
+    ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).possible())
+    length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
+    listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
+    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, _disputed(fresh, seen))
+    admitted = [s for s in ranked if s.admissible and _reached(s)]
+    entries = _entries(admitted, model)[: context.effort.shortlist]
+    if not entries:
+        return Round(step._replace(suspects=_suspects(ranked)), seen, None)
+    null = fitted(fit.now, fit.path, fit, context.loss, context.effort.passes)
+    tried: list[Refit] = []
+
+    def refit(screened: Screened) -> Refit:
+        tried.append(with_candidate(screened, null, fit, context.loss, context.effort.passes))
+        _log(tried[-1], context)
+        return tried[-1]
+
+    while entries:
+        even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
+        sound = [case for case in map(refit, even + _inside(even, admitted, model)) if case.rejection is None]
+        if sound:
+            return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
+        entries = [s for s in entries if not any(s is other for other in even)]
+    suspects = _suspects([s for s in ranked if not any(s is case.screened for case in tried)])
+    return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
+
+
+def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+    """Choose among laws that the screen cannot tell apart.
+
+    The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
+    best odds, then the likeliest.  None is accepted where one of these is of another cause.
+    """
+    sound = _standing(sound, [case.removed for case in sound], fit.model)
+    values = [case.removed * _odds(case.candidate.start, fit.model) for case in sound]
+    even = [case for case, value in zip(sound, values, strict=True) if value >= EVEN * max(values)]
+    best = max(even, key=lambda case: (_odds(case.candidate.start, fit.model), case.gain))
+    law = best.candidate.start
+    rivals = [case for case in even if other_cause(case.effect, law, fit.model.system)]
+    if rivals and isinstance(context.loss, MultiStep):
+        keys = tuple(key_of(case.effect) for case in (best, *rivals))
+        context.say(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
+        return found._replace(step=found.step._replace(rivals=keys))
+    candidates = [s.candidate.start for s in found.screen.screened]
+    parts = zip(candidates, overlaps(found.screen, best.screened), strict=True)
+    same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EVEN_NATS)]
+    same += [key_of(case.effect) for case in even if case.effect.named and best.gain - case.gain < EVEN_NATS]
+    equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
+    return Round(found.step._replace(accepted=key_of(best.effect)), found.screen, best, equivalent)
+
+
+def _entries(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
+    """Laws to be refitted, best first."""
+    standing = _standing(admitted, [_ratio(s) for s in admitted], model)
+    return sorted(standing, key=lambda s: -score(s, model))
+
+
+def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[_Law]:
+    """Laws that none of the others stands for.
+
+    A free function contains the named laws of its signals, and functions of fewer: as far as one of these is even with
+    it the free one goes, else they go.
+    """
+
+    def beaten(one: int) -> bool:
+        law = laws[one].candidate.start
+        for other, its in enumerate(each.candidate.start for each in laws):
+            if contains(its, law, model.system) and values[one] < EVEN * values[other]:
+                return True
+            if contains(law, its, model.system) and values[other] >= EVEN * values[one]:
+                return True
+        return False
+
+    return [law for i, law in enumerate(laws) if not beaten(i)]
+
+
+def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
+    """Best named law that each free function among the `chosen` contains: a refit may show that it is even with it."""
+    out = []
+    for free in chosen:
+        named = [
+            s
+            for s in admitted
+            if s.candidate.start.named and contains(free.candidate.start, s.candidate.start, model.system)
+        ]
+        out += named[:1] if named and _ratio(named[0]) >= NAMED * _ratio(free) else []
+    return out
+
+
+def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSystem) -> bool:
+    """True for laws of another kind and of other signals."""
+    own, its = (set(effect.signals(system)) for effect in (best, one))
+    alike = one.named and one.name == best.name
+    return not alike and bool(own and its) and own.isdisjoint(its)
+
+
+def score(screened: Screened, model: StateSpaceModel) -> float:
+    """Multiple of its bar that the share of a candidate reaches, times its prior odds; the larger the better."""
+    return _ratio(screened) * _odds(screened.candidate.start, model)
+
+
+def _odds(law: AbstractEffect, model: StateSpaceModel) -> float:
+    remainder = rest_of(law, model) is not None or replaced(law, model) is not None
+    return odds(named=law.named, remainder=remainder)
+
+
+def _ratio(screened: Screened) -> float:
+    """Multiple of its bar that a share reaches."""
+    return screened.share.least / screened.bar
+
+
+def _reached(screened: Screened) -> bool:
+    """True for a share that reaches the bar of its law."""
+    return screened.share.least >= required(screened.bar, named=screened.candidate.start.named)
+
+
+def _listed(screened: Screened) -> float:
+    """Share as a report lists it: none where the parts disagree."""
+    return screened.share.least if screened.admissible else 0.0
+
+
+def _fresh(law: AbstractEffect, model: StateSpaceModel) -> bool:
+    """True for a law that the model does not hold, or that takes the place of one."""
+    present = {key_of(effect) for effect in model.effects}
+    return (key_of(law) not in present or replaced(law, model) is not None) and not covered(law, model)
+
+
+def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
+    """The best candidate of every kind, best first."""
+    best: dict[Key, Screened] = {}
+    for screened in every:
+        key = key_of(screened.candidate.start)
+        if key not in best or _order(best[key]) < _order(screened):
+            best[key] = screened
+    return sorted(best.values(), key=_order, reverse=True)
+
+
+def _order(screened: Screened) -> float:
+    return _ratio(screened) if screened.admissible else 0.0
+
+
+def _log(case: Refit, context: SearchContext) -> None:
+    """One line on a refit."""
+    values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
+    share, reason = case.screened.share.least, case.rejection
+    context.say(
+        f"  refitted {words(key_of(case.effect))} {values}: {share:.1%} of the squared error before the refit, "
+        f"{case.removed:.1%} after it ({case.gain:.0f} nat); bar {case.screened.bar:.1%}"
+    )
+    if reason is not None:
+        context.say(f"  {words(key_of(case.effect))} {reason.sentence}")
+
+
+def _removals(tried: Sequence[Refit]) -> tuple[tuple[Key, float], ...]:
+    best: dict[Key, float] = {}
+    for case in tried:
+        key = key_of(case.effect)
+        best[key] = max(best.get(key, -np.inf), case.removed)
+    return tuple(sorted(best.items(), key=lambda entry: -entry[1]))
+
+
+def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
+    """Laws that remove more than chance in a round after which none was accepted: those near the best, and of these the
+    named ones first.
+    """
+    near = [s for s in ranked if _listed(s) >= NAMED * max(map(_listed, ranked))]
+    near.sort(key=lambda s: not s.candidate.start.named)
+    over = (s for s in near if suspected(_listed(s), s.floor, s.chance))
+    return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over)[:SUSPECTS]
+
+
+def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
+    """The best law of every kind that would reach its bar, had a few recordings not said the opposite."""
+    best: dict[Key, Disputed] = {}
+    for one in every:
+        folds, key = np.asarray(one.share.folds), key_of(one.candidate.start)
+        if not _reached(one) or agreed(one.share.folds, one.floor):
+            continue
+        against = seen.members[folds < 0].any(axis=0)
+        if not 0 < 2 * against.sum() < seen.members.any(axis=0).sum():
+            continue  # no odd ones: it is no law
+        if not seeded(one.candidate, one.coefficients).possible():
+            continue
+        entry = Disputed(key, one.share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))
+        if key not in best or best[key].share < entry.share:
+            best[key] = entry
+    return tuple(sorted(best.values(), key=lambda entry: -entry.share))

@@ -1,0 +1,205 @@
+"""Close the loop: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
+
+import math
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, PRNGKeyArray
+from scipy import stats
+
+from ..data.dataset import Dataset
+from ..data.rig import Rig
+from ..em.identify import Identified, finished, identify
+from ..em.loop import EMState, FitError
+from ..em.noise import white_readings
+from ..model.state_space import StateSpaceModel
+from ..numerics.programs import let_go
+from ..residual.innovations import white_innovations
+from ..residual.undisturbed import disturbance_free
+from .context import EFFORT, Effort, Say, SearchContext, Stages, extend, smooth
+from .hypothesis import Found, Hypothesis
+from .keys import Key, key_of, replaced, rest_of, words
+from .losses import MultiStep, OneStep, readings
+from .outcome import Closed, Step
+from .quantised import quantised
+from .rivals import apart
+from .rounds import Round, screening_round
+from .trial import Refit, fitted
+from .verdict import explains, needed
+
+
+def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
+    """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
+    let_go()
+    fit, whole = smooth(context, now, length)
+    reach = f"{length * context.before.rig.dt:.2f} s"
+    context.say(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
+    if not fit.used.any() or len(now.found) >= context.effort.most:
+        return now
+    found = screening_round(fit, context)
+    steps.append(found.step)
+    return now if found.accepted is None else _with(now, found.accepted, _found(found, length), context)
+
+
+def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
+    """`now` with a refitted law; a named law whose remainder explains the larger part of both gives way to that."""
+    context.say(f"  added {words(key_of(case.effect))}")
+    m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, now.m_step.tie)  # under the old hold on noise
+    following = case.after._replace(m_step=m_step).because(-1, found)
+    place = rest_of(case.effect, now.model)
+    if place is None or replaced(case.effect, now.model) is not None:
+        return following
+    law = now.found[place]
+    if law is None or explains(law.removed, case.removed):
+        return following
+    context.say(f"  {words(key_of(now.model.effects[place]))} was a part of it")
+    return following.without(place)
+
+
+def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
+    """The laws and their forms."""
+    return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
+
+
+def _found(found: Round, length: int) -> Found:
+    """Why a law was accepted, and what the data cannot tell from it."""
+    case, many = cast(Refit, found.accepted), found.step.measure == MultiStep.measure
+    screened, directions = case.screened, max(case.screened.directions, 1)
+    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * found.step.tried)
+    left_out = screened.share.left_out
+    held_out, share = (math.nan, left_out) if many else (0.5 * left_out * screened.independent, math.nan)
+    return Found(screened.candidate, case.gain, held_out, p_value, length, found.equivalent, share, case.removed)
+
+
+def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
+    """Backward elimination: remove laws, the least needed first, without which a fit loses too little to count.
+
+    The models with and without a law are fitted in the same way, from their own smoothed paths.
+    """
+    while now.found:
+        fit, _ = smooth(context, now, context.longest)
+        full = fitted(now, fit.path, fit, context.loss, context.effort.passes)
+        lost = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
+        least = int(np.argmin(lost))
+        floor = context.loss.bars.floor(_count(context, fit))
+        if needed(lost[least], floor):
+            break
+        name = words(key_of(now.model.effects[least]))
+        context.say(f"  {name} goes: without it {lost[least]:.1%} of the squared error is lost, {floor:.1%} counts")
+        now = now.without(least)
+    return now
+
+
+def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> float:
+    """Share of the squared error of a fit without an effect that the fit with it removes, at its best band of horizons.
+
+    Infinite for steps of a reading, which are seen in the numbers themselves.
+    """
+    effect = now.model.effects[place]
+    if effect.read_off:
+        return math.inf
+    if not effect.possible():
+        return -math.inf
+    less = now.without(place)
+    own, _ = smooth(context, less, context.longest)
+    both = fit._replace(used=fit.used & own.used)
+    trial = fitted(less, own.path, both._replace(now=less), context.loss, context.effort.passes)
+    return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
+
+
+def _count(context: SearchContext, fit) -> float:
+    return readings(fit.data, fit.used) if isinstance(context.loss, OneStep) else 1.0
+
+
+def search(context: SearchContext) -> Closed:
+    """Search for what the declared model lacks: by many steps first; then, where innovations are white, by one step."""
+    before, data = context.before, context.data
+    steps: list[Step] = []
+    now, state = quantised(context, context.declared)  # steps in a reading spoil the noise that all else leans on
+    length = context.longest if state else _first(context)
+    now, state = _search(context, now, state, length, steps)
+    white = white_readings(data) and white_innovations(_outcome(before, now, state), data)
+    if white:
+        now, state = _search(context._replace(loss=OneStep()), now, state, context.longest, steps)
+    if not now.found or state is None:
+        return Closed(before, before, (), tuple(steps))
+    outcome = finished(_outcome(before, now, state), data)
+    closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps))
+    return apart(closed, data) if white else closed
+
+
+def _first(context: SearchContext) -> int:
+    """Rows of the first round: all, unless most sequences diverge before their end; then as many as most keep."""
+    followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
+    most = [length for length, share in followed.items() if share >= 0.5]
+    return max(most, default=min(followed, default=context.longest))
+
+
+def _outcome(before: Identified, now: Hypothesis, state: EMState | None) -> Identified:
+    return before if state is None else before._replace(state=state, m_step=now.m_step)
+
+
+def _search(
+    context: SearchContext, now: Hypothesis, state: EMState | None, length: int, steps: list[Step]
+) -> tuple[Hypothesis, EMState | None]:
+    """Forward selection and backward elimination by one loss, until neither changes anything."""
+    searched: set[frozenset] = set()
+    longest = context.longest
+    while True:
+        best = state.best if state else context.stages[length][0].best if length < longest else context.before.model
+        now = now.refitted(cast(StateSpaceModel, best))
+        searched.add(_names(now))
+        more = _forward(context, now, length, steps)
+        if _names(more) in searched:  # nothing new, or one law in the place of another and back
+            if length < longest:
+                length = longest
+                continue
+            more = _backward(context, now)
+            if more.found is now.found:
+                return now, state
+        try:
+            now, state = more, extend(context, more, length) if more.found else None
+        except FitError as error:
+            context.say(f"  with what was added no sequence can be followed to its end ({error}); it goes again")
+            return now, state
+        if _names(now) in searched:
+            return now, state
+        length = longest
+
+
+def close_the_loop(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    effort: Effort = EFFORT,
+    say: Say = lambda text: None,
+) -> Closed:
+    """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
+
+    Where readings do not carry white noise, as on real machines, external disturbances are left out before.
+    Raises FitError when no sequence can be followed.
+    """
+    data = jax.device_put(data)
+    stages: Stages = {}
+
+    def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
+        stages[seen] = (state, used)
+        say(f"epoch {state.epoch}, horizon {seen * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+
+    def fitted(part: Dataset) -> Identified:
+        stages.clear()
+        return identify(rig, part, key=key, watch=watch)
+
+    if len(data.t) < 2:
+        say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
+    before = fitted(data)
+    if white_readings(data):
+        return search(SearchContext(before, stages, data, MultiStep(), effort, say))
+    before, data, touches, pieces = disturbance_free(fitted, before, data)
+    if touches:
+        say(f"{len(touches)} external disturbances: their rows are left out")
+    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces))
+    return closed._replace(interventions=touches, pieces=pieces)

@@ -1,0 +1,44 @@
+"""A hypothesis along its smoothed paths: what every loss is taken of."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from ..data.dataset import Dataset
+from ..em.mstep import ScoringMStep
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from .hypothesis import Hypothesis
+
+
+class SmoothedFit(NamedTuple):
+    """A fitted hypothesis and its smoothed paths, over all rows or their beginning."""
+
+    declared: Hypothesis
+    """The declared model."""
+    now: Hypothesis
+    """The same with the effects that were accepted."""
+    path: Gaussian
+    data: Dataset
+    used: Bool[np.ndarray, " seq"]
+    """Sequences that the smoother follows."""
+    rows: int
+    """Rows of the whole recording, of which `data` may be a part."""
+    pieces: tuple[int, ...] = ()
+    """Recording that every sequence is a piece of; empty: each is a recording."""
+
+    @property
+    def model(self) -> StateSpaceModel:
+        """Model of the hypothesis."""
+        return self.now.model
+
+    @property
+    def m_step(self) -> ScoringMStep:
+        """M-step that fits it."""
+        return self.now.m_step
+
+    @property
+    def recording(self) -> Int[np.ndarray, " seq"]:
+        """Number of the recording of every sequence."""
+        return np.asarray(self.pieces) if self.pieces else np.arange(len(self.data.t))

@@ -1,0 +1,104 @@
+"""A candidate after its refit, beside the model without it fitted in the same way."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..effects import AbstractEffect, Candidate, flat
+from ..numerics.gaussian import Gaussian
+from .findings import estimates
+from .hypothesis import Hypothesis, blocks
+from .keys import replaced
+from .losses import AbstractLoss
+from .propose import extended, seeded
+from .refit import Trial, refit
+from .screen import Screened
+from .smoothed import SmoothedFit
+from .verdict import Rejection, veto
+
+
+class Refit(NamedTuple):
+    """A hypothesis with one effect more (or another in the place of one), and what that is worth."""
+
+    screened: Screened
+    trial: Trial
+    after: Hypothesis
+    """The model with it."""
+    removed: float
+    """Share of the squared error that it removes, at the horizons by which its band is judged."""
+    gain: float
+    """Log-likelihood over the model without it [nat]."""
+    certainty: float
+    """Wald statistic of its strengths, jointly [standard deviations]."""
+    amplitude: float
+    """The same of its reported amplitude alone; infinite for a law that reports none."""
+
+    @property
+    def candidate(self) -> Candidate:
+        """The candidate that was refitted."""
+        return self.screened.candidate
+
+    @property
+    def effect(self) -> AbstractEffect:
+        """The effect with its fitted parameters."""
+        return self.after.model.effects[-1]
+
+    @property
+    def rejection(self) -> Rejection | None:
+        """Reason against it; None where there is none."""
+        numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
+        return veto(possible=self.effect.possible(), floor=self.screened.floor, named=self.effect.named, **numbers)
+
+
+def fitted(now: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
+    """`now` after some passes from a path, finished before and after on what the loss looks at."""
+    begun = Trial(now.model, now.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
+    trial = refit(loss.finish(fit, begun), now.m_step.early(), path, fit.data, fit.used, passes=passes)
+    return trial._replace(model=loss.finish(fit, trial))
+
+
+def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
+    """A candidate in the model, or in the place of the law that it is another form of, refitted."""
+    candidate, now = screened.candidate, fit.now
+    effect = seeded(candidate, screened.coefficients)
+    place = replaced(effect, now.model)
+    full = (now if place is None else now.without(place)).plus(effect, candidate)
+    trial = fitted(full, extended(full.model, fit.path, fit.data), fit, loss, passes)
+    after = full.refitted(trial.model)
+    gain = np.nan_to_num(trial.loglik, nan=-1e3) - np.nan_to_num(null.loglik, nan=-1e3)
+    return Refit(
+        screened,
+        trial,
+        after,
+        1 - loss.ratio(null, trial, fit, screened.band),
+        float(np.sum(gain[fit.used])),
+        certainty(candidate, after, trial.hessian),
+        _amplitude(after, trial.hessian),
+    )
+
+
+def _covariance(now: Hypothesis, hessian, place: int) -> np.ndarray:
+    """Of the parameters of an effect, all else integrated out."""
+    prior, here = now.m_step.prior, blocks(now.model, now.m_step)[place]
+    cov = np.linalg.inv(np.asarray(hessian))
+    cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)[here]
+    return cov[cut:, cut:][here, here] * np.outer(std, std)
+
+
+def certainty(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
+    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
+
+    Half its square is the log-likelihood that would be lost without the effect, to second order.
+    """
+    none = np.asarray(flat(candidate.start))
+    strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
+    cov = _covariance(now, hessian, place)[np.ix_(strong, strong)]
+    away = (np.asarray(flat(now.model.effects[place])) - none)[strong]
+    return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
+
+
+def _amplitude(now: Hypothesis, hessian, place: int = -1) -> float:
+    """Standard deviations of the reported amplitude of an effect from zero."""
+    told = estimates(now.model.effects[place], _covariance(now, hessian, place), now.model.system).get("amplitude")
+    return told.value / told.std if told and told.std > 0 else np.inf

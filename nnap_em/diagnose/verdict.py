@@ -1,0 +1,156 @@
+"""Every number that decides whether an effect enters a model or leaves it, and the decisions.
+
+The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
+candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+CHANCE = 2.0
+"""Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three looks."""
+NAMED = 0.6
+"""Prior odds of a law without a name to one with a name, and of any law to the remainder of one that was accepted:
+shares are multiplied by them before they are compared, and a law without a name has bars higher by as much."""
+AGREE = 0.75
+"""Share of the parts left out on which the error must fall."""
+HARM = 2 / 3
+"""Multiple of the floor by which the error may rise on one part: 10 % of a multi-step error."""
+PROBE = (0.3, 3.0)
+"""Smallest and largest multiple of its probe at which a law that is not linear is still the law that was probed."""
+CERTAIN = 5.0
+"""Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
+DETERMINED = 2.0
+"""The same for its amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
+EVEN = 0.9
+"""Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
+refits decide between others, and between laws of different causes the question stays open."""
+EVEN_NATS = 5.0
+"""Log-likelihood [nat] within which two laws cannot be told apart: 1 in 150."""
+SAME = 0.01
+"""Share of the information on an effect that an equivalent one may leave unexplained."""
+KEEP = 0.6
+"""Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay: a
+refit, which is not linear, differs from the screen by less than the rest."""
+SUSPECT = 0.5
+"""Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
+candidates removed .02 and .07 of the multi-step error."""
+
+
+class Bars(NamedTuple):
+    """What a share must reach, whatever chance can do."""
+
+    share: float
+    """Smallest share that counts: what a model lacks for another reason looks like some law up to here."""
+    nats: float
+    """Smallest gain in log-likelihood that counts [nat]."""
+
+    def floor(self, count: float) -> float:
+        """The larger of both as a share of `count` independent errors."""
+        return max(self.share, 2 * self.nats / max(count, 1.0))
+
+
+MULTI_STEP = Bars(0.15, 0.0)
+"""On three real rigs as recorded aliases of what their models lack remove up to .14."""
+ONE_STEP = Bars(0.004, 12.0)
+"""400 candidates gain 6 nat by chance; .002 nat a reading are certain with many readings, and nobody would notice."""
+
+
+class Share(NamedTuple):
+    """Part of the squared error that a candidate removes."""
+
+    inside: float
+    """Of all of it, adjusted for the number of directions [Wherry 1931]."""
+    left_out: float
+    """Of the parts that its strengths were not fitted to: of motions, or of moments, whichever is less."""
+    folds: tuple[float, ...]
+    """Of each part of motions; where it rises, relative to the error of an average part, if that is more."""
+
+    @property
+    def least(self) -> float:
+        """The smaller share."""
+        return min(self.inside, self.left_out)
+
+
+def admissible(share: Share, floor: float, multiple: float, *, linear: bool, answers: bool) -> bool:
+    """True for a law whose share the parts confirm.
+
+    `multiple` is the fitted multiple of its probe.  A free function of an input `answers` any disturbance under
+    feedback, and has to remove the floor on every part.
+    """
+    if not linear and not PROBE[0] < multiple < PROBE[1]:
+        return False
+    return agreed(share.folds, floor, answers=answers)
+
+
+def agreed(folds: Sequence[float], floor: float, *, answers: bool = False) -> bool:
+    """True where the error falls on most parts and rises on none by much."""
+    if answers:
+        return min(folds) >= floor
+    return sum(fold > 0 for fold in folds) >= AGREE * len(folds) and min(folds) > -HARM * floor
+
+
+def required(bar: float, *, named: bool) -> float:
+    """Share that a law must reach: the bar, higher by the odds for a law without a name."""
+    return bar if named else bar / NAMED
+
+
+def odds(*, named: bool, remainder: bool) -> float:
+    """Prior odds that a law is compared by: a remainder of an accepted law first, then named laws, then free ones."""
+    return 1.0 if remainder else NAMED if named else NAMED**2
+
+
+class Rejection(NamedTuple):
+    """Reason against a refitted effect, as data."""
+
+    code: str
+    value: float = math.nan
+
+    @property
+    def sentence(self) -> str:
+        """The reason as a clause whose subject is the effect."""
+        return REASONS[self.code].format(self.value)
+
+
+REASONS = {
+    "impossible": "has a value without physical meaning after its refit",
+    "uncertain": "is {:.1f} standard deviations from none after its refit",
+    "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
+    "small": "removes {:.1%} of the squared error after its refit",
+}
+
+
+def veto(
+    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, named: bool
+) -> Rejection | None:
+    """Reason against an effect after its refit, None where there is none.
+
+    `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
+    one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts.
+    """
+    if not possible:
+        return Rejection("impossible")
+    if not certainty > CERTAIN:
+        return Rejection("uncertain", certainty)
+    if not amplitude > DETERMINED:
+        return Rejection("undetermined", amplitude)
+    return None if needed(removed, required(floor, named=named)) else Rejection("small", removed)
+
+
+def needed(lost: float, floor: float) -> bool:
+    """True for a share between two fits, with an effect and without it, that is enough for the effect."""
+    return lost >= KEEP * floor
+
+
+def explains(own: float, more: float) -> bool:
+    """True where a named law stays beside its remainder.
+
+    The law removes the share `own`, the remainder the share `more` of what is left then.
+    """
+    return own >= EVEN * (own + (1 - own) * more)
+
+
+def suspected(share: float, floor: float, chance: float) -> bool:
+    """True for a share below the bar that is worth a line on the page."""
+    return share >= max(SUSPECT * floor, CHANCE * chance)

@@ -1,0 +1,226 @@
+"""One screening round on numbers: which laws are refitted, in what order, and what is said of those that are not."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import slide
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import rounds
+from nnap_em.diagnose.context import EFFORT, SearchContext
+from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.keys import contains, key_of
+from nnap_em.diagnose.losses import MultiStep, OneStep
+from nnap_em.diagnose.rounds import screening_round
+from nnap_em.diagnose.screen import Screen, Screened
+from nnap_em.diagnose.smoothed import SmoothedFit
+from nnap_em.diagnose.trial import Refit
+from nnap_em.diagnose.verdict import Share
+from nnap_em.effects import AbstractEffect, Candidate, catalogue
+from nnap_em.effects.function import Axis
+
+MODEL, RULE = slide()
+BARE = Hypothesis(MODEL, RULE)
+DATA = Dataset(*(np.zeros((6, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((6, 9), bool))
+RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.05, "sequence", ("x", "dx"), {}, {})
+FLOOR = 0.15
+MULTI = MultiStep()
+
+
+def _law(name: str, value: float = 1.0) -> AbstractEffect:
+    return catalogue[name](jnp.asarray(value), joint=1)
+
+
+def _spring() -> AbstractEffect:
+    return catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
+
+
+def _function(*names: str) -> AbstractEffect:
+    axes = tuple(Axis((name,), -2.0, 2.0, False, 20) for name in names)
+    return catalogue["unknown_function"](jnp.zeros(20 ** len(axes)), axes, joint=1)
+
+
+def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None, left_out: float | None = None):
+    own = Share(share, share if left_out is None else left_out, folds or (share,) * 3)
+    return Screened(Candidate(law, (law,), law), np.ones(1), 1, own, 0, FLOOR, chance, 100.0)
+
+
+def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, members=None):
+    """A round over these candidates, and the names of those that were refitted in turn.
+
+    A refit removes what the screen said, or leaves `errors` by name; its gain is 100 nat, or that of `gains`.
+    """
+    tried = []
+
+    def refit(screened, null, fit, loss, passes):
+        law = screened.candidate.start
+        tried.append(law.name)
+        removed = 1 - (errors or {}).get(law.name, 1 - screened.share.least)
+        after = now.plus(law, screened.candidate)
+        return Refit(screened, None, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
+
+    size = sum(len(s.candidate.probes) for s in entries)
+    seen = Screen(tuple(entries), (np.eye(size),), np.eye(3, 6, dtype=bool) if members is None else members)
+    monkeypatch.setattr(rounds, "surroundings", lambda *_: None)
+    monkeypatch.setattr(AbstractEffect, "visible", lambda *_: True)
+    monkeypatch.setattr(rounds, "proposals", lambda *_: [])
+    monkeypatch.setattr(rounds, "screen", lambda *_: seen)
+    monkeypatch.setattr(rounds, "fitted", lambda *_: None)
+    monkeypatch.setattr(rounds, "with_candidate", refit)
+    fit = SmoothedFit(BARE, now, None, DATA, np.ones(6, bool), 9)
+    before = SimpleNamespace(rig=RIG)
+    context = SearchContext(before, {}, DATA, loss, EFFORT, lambda text: None)
+    return screening_round(fit, context), tried
+
+
+@pytest.mark.parametrize(
+    ("share", "chance", "accepted"),
+    [(0.151, 0.0, True), (0.149, 0.0, False), (0.3, 0.149, True), (0.3, 0.151, False)],
+)
+def test_a_law_is_accepted_from_the_floor_and_from_twice_the_chance_level_on(monkeypatch, share, chance, accepted):
+    found, tried = _run(monkeypatch, [_screened(_law("motor_gain"), share, chance)])
+    assert (found.accepted is not None) == bool(tried) == accepted
+    assert found.step.accepted == (key_of(_law("motor_gain")) if accepted else None)
+
+
+def test_the_smaller_of_both_shares_counts_where_the_parts_agree(monkeypatch):
+    least = [_screened(_law("motor_gain"), 0.5, left_out=0.1)]
+    split = [_screened(_law("motor_gain"), 0.5, folds=(0.9, -0.1, -0.1))]
+    assert not _run(monkeypatch, least)[1] and not _run(monkeypatch, split)[1]
+
+
+@pytest.mark.parametrize(("free", "tried"), [(0.55, "air_drag"), (0.56, "unknown_function")])
+def test_a_law_with_a_name_is_preferred_where_it_is_even_with_six_tenths_of_another(monkeypatch, free, tried):
+    found, _ = _run(monkeypatch, [_screened(_function("x"), free), _screened(_law("air_drag"), 0.3)])
+    assert found.accepted.effect.name == tried
+
+
+@pytest.mark.parametrize(("named", "accepted"), [(0.46, "torsional_spring"), (0.44, "unknown_function")])
+def test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reaches_nine_tenths(
+    monkeypatch, named, accepted
+):
+    """The parts left out of both are the same, so that they differ by what they explain: a bump is no ripple."""
+    found, _ = _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), named)])
+    assert found.accepted.effect.name == accepted
+
+
+@pytest.mark.parametrize(("error", "accepted"), [(0.54, "torsional_spring"), (0.56, "unknown_function")])
+def test_a_refit_may_show_that_a_named_law_is_even_with_the_function_that_contains_it(monkeypatch, error, accepted):
+    """The screen is linear: it gave the spring .4, and its refit removes more."""
+    entries = [_screened(_function("x"), 0.5), _screened(_spring(), 0.4)]
+    found, tried = _run(monkeypatch, entries, {"torsional_spring": error})
+    assert set(tried) == {"torsional_spring", "unknown_function"} and found.accepted.effect.name == accepted
+    assert _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), 0.29)])[1] == ["unknown_function"]
+
+
+@pytest.mark.parametrize(("share", "accepted"), [(0.251, True), (0.249, False)])
+def test_a_law_without_a_name_has_a_higher_bar(monkeypatch, share, accepted):
+    found, _ = _run(monkeypatch, [_screened(_function("x"), share)])
+    assert (found.accepted is not None) == accepted
+
+
+def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(monkeypatch):
+    one, two = _function("x"), _function("x", "dx")
+    assert contains(two, one, MODEL.system) and not contains(one, two, MODEL.system)
+    assert contains(one, _spring(), MODEL.system) and not contains(one, _law("motor_gain"), MODEL.system)
+    for share, names in ((0.46, ("x",)), (0.44, ("x", "dx"))):
+        found, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
+        assert found.accepted.effect.inputs_named() == names
+
+
+@pytest.mark.parametrize(("rest", "accepted"), [(0.28, "unknown_function"), (0.26, "air_drag")])
+def test_the_remainder_of_a_law_comes_before_other_causes(monkeypatch, rest, accepted):
+    now = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
+    found, _ = _run(monkeypatch, [_screened(_law("air_drag"), 0.5), _screened(_function("x"), rest)], now=now)
+    assert found.accepted.effect.name == accepted
+
+
+def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.3)]
+    found, tried = _run(monkeypatch, entries, errors={"motor_gain": 0.92})
+    assert tried == ["motor_gain", "dead_zone"] and found.accepted.effect.name == "dead_zone"
+    found, _ = _run(monkeypatch, entries, errors={"motor_gain": 0.92, "dead_zone": 1.2})
+    assert found.accepted is None and not found.step.suspects  # what was refitted and rejected is no suspect
+    assert dict(found.step.refitted)[key_of(_law("motor_gain"))] == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize(
+    ("share", "errors", "gains", "accepted"),
+    [
+        (0.44, {}, {}, "motor_gain"),  # only the best is refitted
+        (0.46, {"dead_zone": 0.3}, {}, "dead_zone"),  # even on the screen: the refit that removes more
+        (0.46, {"dead_zone": 0.49}, {"dead_zone": 160.0}, "dead_zone"),  # even after it, too: the likelier
+        (0.46, {"dead_zone": 0.49}, {"dead_zone": 60.0}, "motor_gain"),
+    ],
+)
+def test_refits_decide_between_laws_that_the_screen_cannot_tell_apart(monkeypatch, share, errors, gains, accepted):
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), share)]
+    found, tried = _run(monkeypatch, entries, errors, gains)
+    assert found.accepted.effect.name == accepted
+    assert len(tried) == (1 if share < 0.45 else 2)
+
+
+@pytest.mark.parametrize(
+    ("law", "error", "open_"),
+    [(_spring(), 0.54, True), (_spring(), 0.56, False), (_law("dead_zone"), 0.5, False)],
+)
+def test_laws_of_other_causes_that_explain_the_same_leave_the_question_open(monkeypatch, law, error, open_):
+    """A gain and a spring; two laws of the input are told by their likelihood."""
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(law, 0.5)]
+    found, _ = _run(monkeypatch, entries, {law.name: error})
+    assert (found.accepted is None) == bool(found.step.rivals) == open_
+    if open_:
+        assert set(found.step.rivals) == {key_of(e.candidate.start) for e in entries}
+    found, _ = _run(monkeypatch, entries, {law.name: error}, loss=OneStep())
+    assert found.accepted is not None  # likelihood tells them
+
+
+def test_laws_whose_columns_are_the_same_are_equivalent(monkeypatch):
+    """Two of three candidates have proportional columns."""
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.2), _screened(_spring(), 0.2)]
+    found, _ = _run(monkeypatch, entries)
+    alike = np.array([[4.0, 2.0, 0.1], [2.0, 1.0, 0.0], [0.1, 0.0, 1.0]], np.float32)
+    seen = found.screen._replace(information=(alike,))
+    assert rounds.overlaps(seen, seen.screened[0]) == pytest.approx([0.0, 0.0, 1 - 0.01 / 4], abs=1e-5)
+
+
+def test_the_best_of_every_kind_stands_for_it(monkeypatch):
+    entries = [_screened(_law("air_drag", v), share) for v, share in ((1.0, 0.1), (2.0, 0.4), (3.0, 0.2))]
+    found, _ = _run(monkeypatch, entries)
+    assert found.step.screened == ((key_of(_law("air_drag")), 0.4),)
+    assert float(found.accepted.effect.c) == 2.0
+
+
+SCREENED = (("unknown_function", 0.14), ("dead_zone", 0.12), ("motor_gain", 0.10), ("air_drag", 0.08))
+
+
+@pytest.mark.parametrize(
+    ("chance", "names"),
+    [
+        (0.0, ["dead_zone", "motor_gain", "unknown_function"]),  # .08 is less than .6 of the best
+        (0.055, ["dead_zone", "unknown_function"]),  # .10 is within twice the chance level
+        (0.071, []),
+    ],
+)
+def test_suspects_are_near_the_best_and_over_chance_with_named_laws_first(monkeypatch, chance, names):
+    laws = [_function("x") if name == "unknown_function" else _law(name) for name, _ in SCREENED]
+    entries = [_screened(law, share, chance) for law, (_, share) in zip(laws, SCREENED, strict=True)]
+    entries = [e._replace(share=Share(e.share.inside, e.share.left_out, (0.2, 0.2, 0.2))) for e in entries]
+    found, tried = _run(monkeypatch, entries)
+    assert not tried
+    assert [suspect.key[0] for suspect in found.step.suspects] == names
+    assert all(suspect.chance == chance for suspect in found.step.suspects)
+
+
+def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it(monkeypatch):
+    members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
+    law = _screened(_law("motor_gain"), 0.5, folds=(0.8, 0.8, -0.6))
+    found, tried = _run(monkeypatch, [law, _screened(_law("dead_zone"), 0.05)], members=members)
+    assert not tried
+    (told,) = found.step.disputed
+    assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
+    weak = _screened(_law("motor_gain"), 0.14, folds=(0.8, 0.8, -0.6))
+    assert not _run(monkeypatch, [weak], members=members)[0].step.disputed

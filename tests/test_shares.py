@@ -1,0 +1,208 @@
+"""The share of a squared error that candidates remove, against least squares; its parts and its placebos."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.diagnose.folds import fold_of, motions, times
+from nnap_em.diagnose.losses import Linearised
+from nnap_em.diagnose.screen import Rows, project, shares, shifted
+from nnap_em.effects import Candidate, catalogue
+from nnap_em.em.multistep import ratio
+
+GAIN = catalogue["motor_gain"](jnp.zeros(()), joint=1)
+WIDE = catalogue["motor_gain"](jnp.asarray(1e9), joint=1)
+ONE = catalogue["motor_gain"](jnp.ones(()), joint=1)
+
+
+def _candidate(size: int) -> Candidate:
+    """A linear law of so many strengths, nearly free."""
+    return Candidate(GAIN, (ONE,) * size, WIDE)
+
+
+def _rows(error, columns, fold, block=None, overlap=1.0) -> Rows:
+    """Errors that no nuisance touches, sorted by part."""
+    block = fold if block is None else block
+    count = int(np.max(block, initial=0)) + 1
+    order = np.argsort(fold * count + block, kind="stable")
+    return Rows(error[order], columns[order], (fold * count + block)[order], count, overlap)
+
+
+def _share(rows: Rows, size: int, timed: bool = False):
+    """Shares of one candidate."""
+    found = shares(rows, [_candidate(size)], [timed])
+    return found.inside[0], found.left_out[0], found.folds[0], found.directions[0], found.coefficients
+
+
+def test_shares_are_those_of_least_squares():
+    """Inside adjusted for directions, and by folds left out; two candidates of different size beside each other."""
+    rng = np.random.default_rng(0)
+    x, fold = rng.normal(size=(400, 3)), rng.permutation(np.repeat(np.arange(4), 100))
+    e = x @ np.array([1.0, -0.5, 0.0]) + rng.normal(size=400)
+    found = shares(_rows(e, x, fold), [_candidate(2), _candidate(1)], [True, True])
+    fitted, rest, *_ = np.linalg.lstsq(x[:, :2], e, rcond=None)
+    np.testing.assert_allclose(found.coefficients[:2], fitted, rtol=1e-6)
+    raw = 1 - rest[0] / np.sum(e**2)
+    assert found.directions[0] == pytest.approx(2.0, rel=1e-6)
+    assert found.inside[0] == pytest.approx(1 - (1 - raw) * 399 / 397, rel=1e-6)
+    gone = 0.0
+    for f in range(4):
+        mask = fold == f
+        own = np.linalg.lstsq(x[~mask, :2], e[~mask], rcond=None)[0]
+        before, after = np.sum(e[mask] ** 2), np.sum((e[mask] - x[mask, :2] @ own) ** 2)
+        assert found.folds[0, f] == pytest.approx(1 - after / before, rel=1e-6)
+        gone += before - after
+    assert found.left_out[0] == pytest.approx(gone / np.sum(e**2), rel=1e-6)
+    assert found.left_out[1] < 0.02  # what is not there removes nothing of what is left out
+
+
+def test_errors_that_overlap_count_for_less():
+    """Of 400 errors four cover one moment: adjusted as for 100."""
+    rng = np.random.default_rng(1)
+    e, x = rng.normal(size=400), rng.normal(size=(400, 2))
+    fold, block = np.repeat(np.arange(4), 100), np.tile(np.arange(4), 100)
+    apart, together = (_share(_rows(e, x, fold, block, overlap), 2)[0] for overlap in (1.0, 4.0))
+    assert (1 - together) / (1 - apart) == pytest.approx((99 / 97) / (399 / 397), rel=1e-6)
+
+
+def test_the_nuisance_is_projected_out_by_ridge_regression():
+    """Its prior draws the whole, not its change, towards zero; what has no weight does not count."""
+    rng, size = np.random.default_rng(2), 5
+    columns, value = rng.normal(size=(3, 20, 2, size + 2)), rng.normal(size=size)
+    error = columns[..., :size] @ rng.normal(size=size) + 0.1 * rng.normal(size=(3, 20, 2))
+    weight = rng.uniform(0.5, 2.0, (3, 20, 2)) * (rng.uniform(size=(3, 20, 2)) > 0.2)
+    weight[1] = 0.0
+    precision = np.diag(rng.uniform(1, 9, size))
+    fold, none = np.repeat(np.arange(3)[:, None], 20, axis=1), np.zeros((3, 20), int)
+    found = Linearised(error, columns, weight, 1.0, np.arange(20))
+    rows = project(found, fold, none, precision, precision @ value)
+    keep, root = weight > 0, np.sqrt(weight[weight > 0])
+    e, wide = root * error[keep], root[:, None] * columns[keep]
+    nuisance, own = wide[:, :size], wide[:, size:]
+    prior = np.sqrt(precision)
+    stacked = np.concatenate([nuisance, prior])
+    taken = np.linalg.lstsq(stacked, np.concatenate([e, -prior @ value]), rcond=None)[0]
+    np.testing.assert_allclose(rows.error, e - nuisance @ taken, atol=1e-9)
+    explained = np.linalg.lstsq(stacked, np.concatenate([own, np.zeros((size, 2))]), rcond=None)[0]
+    np.testing.assert_allclose(rows.columns, own - nuisance @ explained, atol=1e-9)
+    assert np.unique(rows.cell).tolist() == [0, 2]
+
+
+def test_a_part_with_hardly_any_error_is_harmed_by_what_that_is_of_an_average_one():
+    """A step of 1 that two parts have and the third has not: it harms that by 2.4, where parts hold 1.34 on average."""
+    error, fold = np.array([1.0, 1.0, 1.0, 1.0, -0.1, -0.1]), np.repeat(np.arange(3), 2)
+    folds = _share(_rows(error, np.ones((6, 1)), fold), 1)[2]
+    assert folds[2] == pytest.approx(-2.4 / (4.02 / 3))
+    own = 2 * 0.45 - 0.45**2  # of one of the full parts, from the mean 0.45 of the others
+    assert folds[0] == pytest.approx(own)
+
+
+def test_folds_are_neighbours_and_pieces_where_there_are_few():
+    assert fold_of(np.ones(10, bool), np.arange(10), np.zeros((10, 3), int))[:, 0].tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+        3,
+        3,
+        4,
+        4,
+    ]
+    used = np.array([True, False, True, True])
+    assert fold_of(used, np.arange(4), np.zeros((4, 2), int))[used][:, 0].tolist() == [0, 1, 2]
+    assert fold_of(np.ones(1, bool), np.zeros(1, int), np.arange(8)[None] // 2)[0].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_recordings_of_one_motion_are_left_out_together():
+    """Three motions, the first played three times; two motions only, cut at the same times."""
+    rng = np.random.default_rng(0)
+    one, two, three = np.cumsum(rng.normal(size=(3, 200, 2)), axis=1)
+    again = lambda motion: motion + 0.1 * motion.std() * rng.normal(size=motion.shape)  # noqa: E731
+    late = again(one)
+    late[150:] = np.nan
+    state, used = np.stack([one, two, again(one), three, late, two]), np.array([True] * 5 + [False])
+    motion = motions(state, used, np.arange(6))
+    assert motion[:5].tolist() == [0, 1, 0, 3, 0]
+    assert fold_of(used, motion, np.zeros((6, 1), int))[used, 0].tolist() == [0, 1, 0, 2, 0]
+    used[3] = False
+    part = fold_of(used, motions(state, used, np.arange(6)), np.tile(np.arange(8) // 2, (6, 1)))
+    assert part[0].tolist() == part[2].tolist() == part[4].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
+
+
+def test_the_pieces_of_a_recording_are_one_motion_and_lie_at_their_times():
+    rng = np.random.default_rng(0)
+    state, used = rng.normal(size=(3, 50, 2)), np.ones(3, bool)
+    assert motions(state, used, np.array([0, 0, 1])).tolist() == [0, 0, 1]
+    t = np.stack([np.arange(50) * 0.1, 5.0 + np.arange(50) * 0.1, np.arange(50) * 0.1])
+    data = Dataset(t, t[..., None], t[..., None], np.ones(t.shape, bool))
+    assert times(t[:, ::10], data, np.array([0, 0, 1]), 2).tolist() == [[0] * 5, [1] * 5, [0, 0, 0, 1, 1]]
+
+
+def test_what_happens_at_one_moment_of_every_recording_is_no_law():
+    """A force in the second fifth of each of six recordings: seen on recordings left out, not on times left out."""
+    rng = np.random.default_rng(0)
+    fold, block = np.repeat(np.arange(6), 100), np.tile(np.repeat(np.arange(5), 20), 6)
+    x = np.where(block == 1, 1.0, 0.0)[:, None] * rng.normal(size=(600, 1))
+    e = 3.0 * x[:, 0] + 0.1 * rng.normal(size=600)
+    of_time, other = (_share(_rows(e, x, fold, block), 1, timed)[1] for timed in (True, False))
+    assert of_time > 0.9 and abs(other) < 1e-6
+
+
+def _placebo(error, columns, rng) -> tuple[float, float]:
+    """Share left out that one column removes, and that its placebo removes; a sequence is a fold."""
+    found = Linearised(error[..., None], columns, np.ones((*error.shape, 1)), 1.0, np.arange(error.shape[1]))
+    fold = np.repeat(np.arange(len(error)), error.shape[1])
+    out = []
+    for one in (found, shifted(found, 1, rng)):
+        rows = _rows(one.error.ravel(), one.columns.reshape(-1, 2)[:, 1:], fold)
+        out.append(_share(rows, 1, timed=True)[1])
+    return out[0], out[1]
+
+
+def test_a_placebo_keeps_a_column_s_numbers_and_loses_what_it_explains():
+    """A signal of the time since the start of a sequence, whose phase differs among 12 sequences of 60 moments."""
+    rng = np.random.default_rng(0)
+    phase = rng.uniform(0, 6, 12)[:, None]
+    signal = np.sin(0.9 * np.arange(60)[None] ** 1.2 + phase)
+    error = 0.8 * signal + 0.6 * rng.normal(size=signal.shape)
+    columns = np.stack([np.ones_like(signal), signal], axis=-1)[:, :, None]
+    weight = np.ones((12, 60, 1))
+    weight[:, 50:] = 0.0  # ends that nobody reads take no part
+    found = Linearised(error[..., None], columns, weight, 1.0, np.arange(60))
+    moved = shifted(found, 1, rng)
+    np.testing.assert_array_equal(moved.columns[..., 0], columns[..., 0])
+    np.testing.assert_array_equal(moved.columns[:, 50:], columns[:, 50:])
+    for a, b in zip(moved.columns[:, :50, 0, 1], columns[:, :50, 0, 1], strict=True):
+        assert not np.array_equal(a, b)
+        np.testing.assert_array_equal(np.sort(np.abs(a)), np.sort(np.abs(b)))
+    true, chance = _placebo(error[:, :50], columns[:, :50], rng)
+    assert true == pytest.approx(0.32 / (0.32 + 0.36), abs=4 / np.sqrt(600))  # of the variance; its standard error
+    assert chance < 4 / np.sqrt(600)
+
+
+def test_the_placebo_of_a_constant_explains_nothing():
+    """A constant in every sequence, which a shift alone would leave as it is."""
+    rng = np.random.default_rng(0)
+    error = 1.0 + 0.5 * rng.normal(size=(12, 60))
+    true, chance = _placebo(error, np.ones((12, 60, 1, 2)), rng)
+    assert true > 0.7
+    assert chance < 0.1
+
+
+def test_a_sequence_of_few_moments_is_not_shifted():
+    columns = np.arange(7.0).reshape(1, 7, 1, 1)
+    found = Linearised(np.zeros((1, 7, 1)), columns, np.ones((1, 7, 1)), 1.0, np.arange(7))
+    np.testing.assert_array_equal(shifted(found, 0, np.random.default_rng(0)).columns, columns)
+
+
+def test_logs_too_short_for_a_fork_say_nothing():
+    nothing = np.zeros((3, 0, 2, 1))
+    assert ratio(nothing, nothing, np.ones(3, bool)) == 1.0
+    empty = _rows(np.zeros(0), np.zeros((0, 2)), np.zeros(0, int))
+    assert _share(empty, 2)[:2] == (0.0, 0.0)
+    one = _rows(np.ones(9), np.ones((9, 2)), np.zeros(9, int))
+    assert _share(one, 2)[:2] == (0.0, 0.0)  # nothing can be left out

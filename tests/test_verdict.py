@@ -1,0 +1,145 @@
+"""Every number that decides whether an effect enters a model or leaves it, from both sides."""
+
+import math
+
+import pytest
+
+from nnap_em.diagnose.verdict import (
+    AGREE,
+    CHANCE,
+    EVEN,
+    HARM,
+    KEEP,
+    MULTI_STEP,
+    NAMED,
+    ONE_STEP,
+    REASONS,
+    SUSPECT,
+    Share,
+    admissible,
+    agreed,
+    explains,
+    needed,
+    odds,
+    required,
+    suspected,
+    veto,
+)
+
+FALLS = (0.3, 0.3, 0.3, 0.3)
+
+
+def test_what_counts_is_fifteen_per_cent_of_a_multi_step_error():
+    assert MULTI_STEP.floor(10.0) == MULTI_STEP.floor(1e9) == 0.15
+
+
+@pytest.mark.parametrize(
+    ("readings", "nats"),
+    [(1000, 12.0), (6000, 12.0), (29_000, 58.0)],  # many readings make certain of what nobody would notice
+)
+def test_what_counts_of_a_one_step_error_is_twelve_nats_and_two_thousandths_of_a_nat_a_reading(readings, nats):
+    assert ONE_STEP.floor(float(readings)) == pytest.approx(2 * nats / readings)
+
+
+def test_the_smaller_share_counts():
+    assert Share(0.3, 0.2, FALLS).least == Share(0.2, 0.3, FALLS).least == 0.2
+
+
+@pytest.mark.parametrize(
+    ("folds", "fine"),
+    [
+        (FALLS, True),
+        ((0.3, 0.3, 0.3, -0.05), True),
+        ((0.3, 0.3, -0.01, -0.05), False),  # two of four disagree
+        ((0.5, 0.5, 0.5, -0.099), True),
+        ((0.5, 0.5, 0.5, -0.101), False),  # one is harmed
+    ],
+)
+def test_the_error_falls_on_most_parts_and_rises_on_none_by_much(folds, fine):
+    assert (AGREE, HARM) == (0.75, 2 / 3)
+    assert agreed(folds, 0.15) == fine
+
+
+@pytest.mark.parametrize(("least", "fine"), [(0.15, True), (0.149, False)])
+def test_a_function_that_answers_a_disturbance_removes_the_floor_on_every_part(least, fine):
+    assert agreed((0.9, 0.9, least), 0.15, answers=True) == fine
+
+
+@pytest.mark.parametrize(
+    ("multiple", "linear", "fine"),
+    [
+        (0.31, False, True),
+        (0.29, False, False),  # a fifth of a dead zone is another one
+        (2.9, False, True),
+        (3.1, False, False),
+        (-1.0, False, False),
+        (-9.0, True, True),
+    ],
+)
+def test_a_multiple_of_a_law_that_is_not_linear_is_near_its_probe(multiple, linear, fine):
+    assert admissible(Share(0.3, 0.3, FALLS), 0.15, multiple, linear=linear, answers=False) == fine
+
+
+def test_a_remainder_comes_before_a_named_law_and_that_before_a_free_one():
+    remainder, named, free = odds(named=False, remainder=True), odds(named=True, remainder=False), odds(
+        named=False, remainder=False
+    )  # fmt: skip
+    assert named == pytest.approx(NAMED * remainder)
+    assert free == pytest.approx(NAMED * named)
+
+
+def test_a_law_without_a_name_has_higher_bars():
+    assert required(0.15, named=True) == 0.15
+    assert required(0.15, named=False) == pytest.approx(0.25)
+
+
+SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "named": True}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "code"),
+    [
+        ({}, None),
+        ({"possible": False}, "impossible"),
+        ({"certainty": 5.1}, None),
+        ({"certainty": 4.9}, "uncertain"),
+        ({"certainty": math.nan}, "uncertain"),
+        ({"amplitude": 2.1}, None),
+        ({"amplitude": 1.9}, "undetermined"),  # an amplitude of .20 +- .83 is no ripple
+        ({"removed": 0.09}, None),
+        ({"removed": 0.089}, "small"),
+        ({"removed": math.nan}, "small"),
+        ({"removed": 0.03, "floor": 0.04}, None),
+        ({"removed": 0.151, "named": False}, None),
+        ({"removed": 0.149, "named": False}, "small"),  # many numbers fit many things a little
+    ],
+)
+def test_a_refit_vetoes_what_is_impossible_uncertain_or_small(numbers, code):
+    reason = veto(**(SOUND | numbers))
+    assert (reason and reason.code) == code
+    assert reason is None or reason.sentence
+
+
+def test_every_reason_has_a_sentence():
+    assert {"impossible", "uncertain", "undetermined", "small"} == set(REASONS)
+
+
+def test_what_is_lost_without_an_effect_is_most_of_the_floor():
+    assert pytest.approx(0.09) == KEEP * 0.15
+    assert needed(0.09, 0.15) and not needed(0.0899, 0.15) and not needed(math.nan, 0.15)
+
+
+@pytest.mark.parametrize(("more", "stays"), [(0.1, True), (0.12, False)])
+def test_a_named_law_stays_beside_a_remainder_that_adds_a_tenth_at_most(more, stays):
+    """Half of the error goes with the law, and `more` of the other half with its remainder."""
+    assert EVEN == 0.9
+    assert explains(0.5, more) == stays
+
+
+@pytest.mark.parametrize(
+    ("share", "chance", "listed"),
+    [(0.075, 0.0, True), (0.074, 0.0, False), (0.12, 0.06, True), (0.12, 0.061, False), (0.9, 0.46, False)],
+)
+def test_a_suspect_removes_half_of_the_floor_and_twice_what_chance_does(share, chance, listed):
+    assert (SUSPECT, CHANCE) == (0.5, 2.0)
+    assert suspected(share, 0.15, chance) == listed

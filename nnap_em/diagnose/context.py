@@ -35,7 +35,7 @@ LOOSER = 3.0
 class Effort(NamedTuple):
     """Extent of a search; it decides nothing."""
 
-    shortlist: int = 5
+    shortlist: int = 8
     """Candidates that are refitted at most."""
     passes: int = 8
     """Passes of a refit."""

@@ -110,7 +110,7 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
 
 
 def _count(context: SearchContext, fit) -> float:
-    return readings(fit.data, fit.used) if isinstance(context.loss, OneStep) else 1.0
+    return float(readings(fit.data, fit.used)) if isinstance(context.loss, OneStep) else 1.0
 
 
 def search(context: SearchContext) -> Closed:

@@ -126,6 +126,7 @@ def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(m
     one, two = _function("x"), _function("x", "dx")
     assert contains(two, one, MODEL.system) and not contains(one, two, MODEL.system)
     assert contains(one, _spring(), MODEL.system) and not contains(one, _law("motor_gain"), MODEL.system)
+    assert not contains(two, _spring(), MODEL.system)  # another signal is another cause
     for share, names in ((0.46, ("x",)), (0.44, ("x", "dx"))):
         found, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
         assert found.accepted.effect.inputs_named() == names
@@ -220,7 +221,8 @@ def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it(monkey
     law = _screened(_law("motor_gain"), 0.5, folds=(0.8, 0.8, -0.6))
     found, tried = _run(monkeypatch, [law, _screened(_law("dead_zone"), 0.05)], members=members)
     assert not tried
-    (told,) = found.step.disputed
+    assert len(found.step.disputed) == 1
+    told = found.step.disputed[0]
     assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
     weak = _screened(_law("motor_gain"), 0.14, folds=(0.8, 0.8, -0.6))
     assert not _run(monkeypatch, [weak], members=members)[0].step.disputed

@@ -52,10 +52,10 @@ def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
 
 
 def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:
-    """True where a function of some signals at a joint can be what `law` is: named, or a function of fewer of them."""
+    """True where a function at a joint can be what `law` is: a named law of its signals, or a function of fewer."""
     own, its = (set(effect.signals(system)) for effect in (free, law))
-    inside = bool(its) and its <= own and (law.named or its < own)
-    return not free.named and inside and free.joint == law.joint
+    inside = its == own if law.named else its < own
+    return not free.named and bool(its) and inside and free.joint == law.joint
 
 
 def _alike(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:

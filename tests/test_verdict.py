@@ -81,19 +81,20 @@ def test_a_multiple_of_a_law_that_is_not_linear_is_near_its_probe(multiple, line
 
 
 def test_a_remainder_comes_before_a_named_law_and_that_before_a_free_one():
-    remainder, named, free = odds(named=False, remainder=True), odds(named=True, remainder=False), odds(
-        named=False, remainder=False
-    )  # fmt: skip
+    remainder, named, one, two = odds(1, remainder=True), *(odds(n, remainder=False) for n in range(3))
+    assert NAMED == 0.6
     assert named == pytest.approx(NAMED * remainder)
-    assert free == pytest.approx(NAMED * named)
+    assert one == pytest.approx(NAMED * named)
+    assert two == pytest.approx(NAMED * one)
 
 
 def test_a_law_without_a_name_has_higher_bars():
-    assert required(0.15, named=True) == 0.15
-    assert required(0.15, named=False) == pytest.approx(0.25)
+    assert required(0.15, 0) == 0.15
+    assert required(0.15, 1) == pytest.approx(0.25)
+    assert required(0.15, 3) == pytest.approx(0.25 / 0.36)
 
 
-SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "named": True}
+SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "signals": 0}
 
 
 @pytest.mark.parametrize(
@@ -110,8 +111,8 @@ SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 
         ({"removed": 0.089}, "small"),
         ({"removed": math.nan}, "small"),
         ({"removed": 0.03, "floor": 0.04}, None),
-        ({"removed": 0.151, "named": False}, None),
-        ({"removed": 0.149, "named": False}, "small"),  # many numbers fit many things a little
+        ({"removed": 0.151, "signals": 1}, None),
+        ({"removed": 0.149, "signals": 1}, "small"),  # many numbers fit many things a little
     ],
 )
 def test_a_refit_vetoes_what_is_impossible_uncertain_or_small(numbers, code):

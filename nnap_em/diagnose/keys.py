@@ -51,6 +51,11 @@ def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
 
 
+def free_signals(law: AbstractEffect) -> int:
+    """Number of signals of a law without a name; 0 for one with a name."""
+    return 0 if law.named else max(1, len(law.inputs_named()))
+
+
 def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:
     """True where a function at a joint can be what `law` is: a named law of its signals, or a function of fewer."""
     own, its = (set(effect.signals(system)) for effect in (free, law))

@@ -9,7 +9,7 @@ from ..effects import AbstractEffect
 from ..model.state_space import StateSpaceModel
 from ..systems import AbstractSystem
 from .context import SearchContext
-from .keys import Key, contains, covered, key_of, replaced, rest_of, words
+from .keys import Key, contains, covered, free_signals, key_of, replaced, rest_of, words
 from .losses import MultiStep
 from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
@@ -142,7 +142,7 @@ def score(screened: Screened, model: StateSpaceModel) -> float:
 
 def _odds(law: AbstractEffect, model: StateSpaceModel) -> float:
     remainder = rest_of(law, model) is not None or replaced(law, model) is not None
-    return odds(named=law.named, remainder=remainder)
+    return odds(free_signals(law), remainder=remainder)
 
 
 def _ratio(screened: Screened) -> float:
@@ -152,7 +152,7 @@ def _ratio(screened: Screened) -> float:
 
 def _reached(screened: Screened) -> bool:
     """True for a share that reaches the bar of its law."""
-    return screened.share.least >= required(screened.bar, named=screened.candidate.start.named)
+    return screened.share.least >= required(screened.bar, free_signals(screened.candidate.start))
 
 
 def _listed(screened: Screened) -> float:

@@ -9,7 +9,7 @@ from ..effects import AbstractEffect, Candidate, flat
 from ..numerics.gaussian import Gaussian
 from .findings import estimates
 from .hypothesis import Hypothesis, blocks
-from .keys import replaced
+from .keys import free_signals, replaced
 from .losses import AbstractLoss
 from .propose import extended, seeded
 from .refit import Trial, refit
@@ -48,7 +48,9 @@ class Refit(NamedTuple):
     def rejection(self) -> Rejection | None:
         """Reason against it; None where there is none."""
         numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
-        return veto(possible=self.effect.possible(), floor=self.screened.floor, named=self.effect.named, **numbers)
+        return veto(
+            possible=self.effect.possible(), floor=self.screened.floor, signals=free_signals(self.effect), **numbers
+        )
 
 
 def fitted(now: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 CHANCE = 2.0
 """Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three looks."""
 NAMED = 0.6
-"""Prior odds of a law without a name to one with a name, and of any law to the remainder of one that was accepted:
-shares are multiplied by them before they are compared, and a law without a name has bars higher by as much."""
+"""Prior odds of a free function to a named law, for every signal of the function, and of any law to the remainder of one
+that was accepted: shares are multiplied by them, and bars divided."""
 AGREE = 0.75
 """Share of the parts left out on which the error must fall."""
 HARM = 2 / 3
@@ -91,14 +91,14 @@ def agreed(folds: Sequence[float], floor: float, *, answers: bool = False) -> bo
     return sum(fold > 0 for fold in folds) >= AGREE * len(folds) and min(folds) > -HARM * floor
 
 
-def required(bar: float, *, named: bool) -> float:
-    """Share that a law must reach: the bar, higher by the odds for a law without a name."""
-    return bar if named else bar / NAMED
+def required(bar: float, signals: int) -> float:
+    """Share that a law must reach: the bar, higher by the odds for a free function of so many signals (named: 0)."""
+    return bar / NAMED**signals
 
 
-def odds(*, named: bool, remainder: bool) -> float:
-    """Prior odds that a law is compared by: a remainder of an accepted law first, then named laws, then free ones."""
-    return 1.0 if remainder else NAMED if named else NAMED**2
+def odds(signals: int, *, remainder: bool) -> float:
+    """Prior odds that a law is compared by: remainders of accepted laws first, then named laws (0 signals), then others."""
+    return 1.0 if remainder else NAMED ** (1 + signals)
 
 
 class Rejection(NamedTuple):
@@ -122,12 +122,13 @@ REASONS = {
 
 
 def veto(
-    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, named: bool
+    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, signals: int
 ) -> Rejection | None:
     """Reason against an effect after its refit, None where there is none.
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
-    one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts.
+    one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
+    `signals` those of a free function (named: 0).
     """
     if not possible:
         return Rejection("impossible")
@@ -135,7 +136,7 @@ def veto(
         return Rejection("uncertain", certainty)
     if not amplitude > DETERMINED:
         return Rejection("undetermined", amplitude)
-    return None if needed(removed, required(floor, named=named)) else Rejection("small", removed)
+    return None if needed(removed, required(floor, signals)) else Rejection("small", removed)
 
 
 def needed(lost: float, floor: float) -> bool:

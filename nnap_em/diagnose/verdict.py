@@ -11,8 +11,8 @@ from typing import NamedTuple
 CHANCE = 2.0
 """Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three looks."""
 NAMED = 0.6
-"""Prior odds of a free function to a named law, for every signal of the function, and of any law to the remainder of one
-that was accepted: shares are multiplied by them, and bars divided."""
+"""Prior odds of a free function to a named law, for every signal of the function, and of any law to the remainder of an
+accepted one: shares are multiplied by them, and bars divided."""
 AGREE = 0.75
 """Share of the parts left out on which the error must fall."""
 HARM = 2 / 3
@@ -97,7 +97,7 @@ def required(bar: float, signals: int) -> float:
 
 
 def odds(signals: int, *, remainder: bool) -> float:
-    """Prior odds that a law is compared by: remainders of accepted laws first, then named laws (0 signals), then others."""
+    """Prior odds of a law in comparisons: remainders of accepted laws first, then named laws, then free functions."""
     return 1.0 if remainder else NAMED ** (1 + signals)
 
 

@@ -43,9 +43,9 @@ def _function(*names: str) -> AbstractEffect:
     return catalogue["unknown_function"](jnp.zeros(20 ** len(axes)), axes, joint=1)
 
 
-def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None, left_out: float | None = None):
+def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None, left_out=None, band: int = 0):
     own = Share(share, share if left_out is None else left_out, folds or (share,) * 3)
-    return Screened(Candidate(law, (law,), law), np.ones(1), 1, own, 0, FLOOR, chance, 100.0)
+    return Screened(Candidate(law, (law,), law), np.ones(1), 1, own, band, FLOOR, chance, 100.0)
 
 
 def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, members=None):
@@ -63,7 +63,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, me
         return Refit(screened, None, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
 
     size = sum(len(s.candidate.probes) for s in entries)
-    seen = Screen(tuple(entries), (np.eye(size),), np.eye(3, 6, dtype=bool) if members is None else members)
+    seen = Screen(tuple(entries), (np.eye(size),) * 2, np.eye(3, 6, dtype=bool) if members is None else members)
     monkeypatch.setattr(rounds, "surroundings", lambda *_: None)
     monkeypatch.setattr(AbstractEffect, "visible", lambda *_: True)
     monkeypatch.setattr(rounds, "proposals", lambda *_: [])
@@ -137,6 +137,15 @@ def test_the_remainder_of_a_law_comes_before_other_causes(monkeypatch, rest, acc
     now = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
     found, _ = _run(monkeypatch, [_screened(_law("air_drag"), 0.5), _screened(_function("x"), rest)], now=now)
     assert found.accepted.effect.name == accepted
+
+
+def test_errors_soon_after_a_start_decide_where_later_ones_show_nothing(monkeypatch):
+    """An alias of what shows soon does not stand before a law that the longer horizons show."""
+    soon, late = _screened(_law("dead_zone"), 0.4, band=1), _screened(_law("motor_gain"), 0.2)
+    assert _run(monkeypatch, [soon, late])[1] == ["motor_gain"]
+    assert _run(monkeypatch, [soon])[1] == ["dead_zone"]
+    found, tried = _run(monkeypatch, [soon, late], errors={"motor_gain": 0.95})
+    assert tried == ["motor_gain", "dead_zone"] and found.accepted.effect.name == "dead_zone"
 
 
 def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):

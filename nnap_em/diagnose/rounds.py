@@ -45,7 +45,8 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
     step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, _disputed(fresh, seen))
     admitted = [s for s in ranked if s.admissible and _reached(s)]
-    entries = _entries(admitted, model)[: context.effort.shortlist]
+    entries = [s for band in range(len(context.loss.bands)) for s in _entries(admitted, band, model)]
+    entries = entries[: context.effort.shortlist]
     if not entries:
         return Round(step._replace(suspects=_suspects(ranked)), seen, None)
     null = fitted(fit.now, fit.path, fit, context.loss, context.effort.passes)
@@ -57,7 +58,8 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
         return tried[-1]
 
     while entries:
-        even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
+        first, least = entries[0].band, EVEN * score(entries[0], model)
+        even = [s for s in entries if s.band == first and score(s, model) >= least]
         sound = [case for case in map(refit, even + _inside(even, admitted, model)) if case.rejection is None]
         if sound:
             return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
@@ -90,9 +92,10 @@ def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: Searc
     return Round(found.step._replace(accepted=key_of(best.effect)), found.screen, best, equivalent)
 
 
-def _entries(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
-    """Laws to be refitted, best first."""
-    standing = _standing(admitted, [_ratio(s) for s in admitted], model)
+def _entries(admitted: Sequence[Screened], band: int, model: StateSpaceModel) -> list[Screened]:
+    """Laws to be refitted that a band of horizons shows, best first."""
+    own = [s for s in admitted if s.band == band]
+    standing = _standing(own, [_ratio(s) for s in own], model)
     return sorted(standing, key=lambda s: -score(s, model))
 
 
@@ -122,7 +125,9 @@ def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: Sta
         named = [
             s
             for s in admitted
-            if s.candidate.start.named and contains(free.candidate.start, s.candidate.start, model.system)
+            if s.band == free.band
+            and s.candidate.start.named
+            and contains(free.candidate.start, s.candidate.start, model.system)
         ]
         out += named[:1] if named and _ratio(named[0]) >= NAMED * _ratio(free) else []
     return out

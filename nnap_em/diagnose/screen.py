@@ -245,7 +245,10 @@ class Screen(NamedTuple):
 
 
 def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]) -> Screen:
-    """Every candidate at the band of horizons where its share is the largest multiple of what it must reach."""
+    """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
+
+    Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
+    """
     bands, folds = _bands(loss, fit, candidates)
     out = []
     for number, band in enumerate(bands):
@@ -253,8 +256,14 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
         placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
         chance = max((s.share.least for s in placebo if s.admissible), default=0.0)
         out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))
-    best = (max(same, key=lambda s: (s.admissible, s.share.least / s.bar)) for same in zip(*out, strict=True))
+    best = (max(same, key=_order) for same in zip(*out, strict=True))
     return Screen(tuple(best), tuple(band.information for band in bands), np.asarray(folds))
+
+
+def _order(screened: Screened) -> tuple[bool, bool, float]:
+    ratio = screened.share.least / screened.bar
+    shown = screened.admissible and ratio >= 1
+    return screened.admissible, shown, -screened.band if shown else ratio
 
 
 def _screened(

@@ -116,13 +116,17 @@ examples:
   nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
 
 Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
-time, all states, and their standard deviations without measurement noise.
+time, all states, and their standard deviations without measurement noise.  The file of --mcap gets the topics /log and
+/predicted, for Foxglove and other viewers.
 """
 _SMOOTH = """\
-example:
+examples:
   nnap-em smooth fit bench/test --out smoothed
+  nnap-em smooth fit bench/test --out smoothed --mcap smoothed.mcap
 
 DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+The file of --mcap gets JSON messages, for Foxglove and other viewers: /log, /smoothed, /one_row_ahead (states predicted
+from the rows before) and /missing_force (the generalised force that the model lacks, by coordinate).
 """
 _EXPORT = """\
 examples:
@@ -238,6 +242,7 @@ def parser() -> argparse.ArgumentParser:
         use.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
         use.add_argument("folder", metavar="FOLDER", type=Path, help="the logs, such as bench/test")
         use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
+        use.add_argument("--mcap", metavar="FILE", type=Path, help="write the log and the results as MCAP, too")
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 

@@ -17,11 +17,13 @@ import numpy as np
 from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
+from ..data.recordings.mcap_writer import Channel
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..design.limits import DesignError
 from ..diagnose.compare import CompareError
 from ..em.build import build_system, measure_scales
 from ..em.check import BAD, torques
+from ..em.identify import Identified
 from ..em.loop import FitError
 from ..em.predict import GIVEN
 from ..em.store import fingerprint
@@ -29,6 +31,7 @@ from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import keep_on
 from ..portable.export import ExportError
+from ..residual.residual import names_of
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
 from ..storage.shelf import Shelf
@@ -140,6 +143,19 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
         names = (*states, *(f"{name}_std" for name in states))
         time = {"time": np.asarray(logs.data.t[i])[rows]}
         write_csv((folder / file).with_suffix(".csv"), time | dict(zip(names, values.T, strict=True)))
+
+
+def states_of(fitted: Identified, mean, std) -> Channel:
+    """Mean and standard deviation of all states as a channel."""
+    units = {name: names_of(fitted).unit(name) for name in fitted.model.system.readable}
+    return Channel(units | {f"{name}_std": unit for name, unit in units.items()}, np.concatenate([mean, std], axis=-1))
+
+
+def log_of(fitted: Identified, logs: Logs) -> Channel:
+    """Inputs and readings of the logs as a channel, masked readings too."""
+    data, names = logs.as_read, names_of(fitted)
+    values = np.concatenate([np.asarray(data.u), np.asarray(data.y)], axis=-1)
+    return Channel({name: names.unit(name) for name in logs.columns}, values)
 
 
 # --- runs that go on after a stop

@@ -6,15 +6,22 @@ import jax
 import numpy as np
 
 from ..data.logs import read_logs
+from ..data.recordings.mcap_writer import require_mcap, write_mcap
 from ..em.predict import predict
 from ..em.store import load, model_file
-from .common import Say, write_states
+from .common import Say, log_of, states_of, write_states
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after the readings up to the given time."""
+    if args.mcap is not None:
+        require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
     found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
-    write_states(args.out, logs, fitted.model.system.readable, np.asarray(found.mean), np.asarray(found.std))
+    mean, std = np.asarray(found.mean), np.asarray(found.std)
+    write_states(args.out, logs, fitted.model.system.readable, mean, std)
     say(f"wrote {len(logs.files)} files to {args.out}")
+    if args.mcap is not None:
+        write_mcap(args.mcap, logs, {"/log": log_of(fitted, logs), "/predicted": states_of(fitted, mean, std)})
+        say(f"wrote {args.mcap}")

@@ -1,20 +1,44 @@
 """nnap-em smooth: states from all readings of each sequence."""
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
-from ..data.logs import read_logs
+from ..data.logs import Logs, read_logs
+from ..data.recordings.mcap_writer import Channel, require_mcap, write_mcap
+from ..em.identify import Identified
 from ..em.predict import smoothed_states
 from ..em.store import load, model_file
-from .common import Say, write_states
+from ..residual.residual import names_of, residual
+from .common import Say, log_of, states_of, write_states
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
     """Write the distribution of every state after all readings of the sequence."""
+    if args.mcap is not None:
+        require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
     state = smoothed_states(fitted, logs.data)
-    std = np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
-    write_states(args.out, logs, fitted.model.system.readable, np.asarray(state.mean), std)
+    mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
+    write_states(args.out, logs, fitted.model.system.readable, mean, std)
     say(f"wrote {len(logs.files)} files to {args.out}")
+    if args.mcap is not None:
+        _write_channels(args.mcap, fitted, logs, states_of(fitted, mean, std))
+        say(f"wrote {args.mcap}")
+
+
+def _write_channels(path: Path, fitted: Identified, logs: Logs, smoothed: Channel) -> None:
+    """The log, smoothed states, their prediction from the rows before, and the missing force, side by side."""
+    names, left = names_of(fitted), residual(fitted, logs.data)
+    states = names.coordinates + names.rates
+    forces = {name: names.force_unit(joint) for joint, name in enumerate(names.coordinates, 1)}
+    forces |= {f"{name}_std": unit for name, unit in forces.items()}
+    channels = {
+        "/log": log_of(fitted, logs),
+        "/smoothed": smoothed,
+        "/one_row_ahead": Channel({name: names.unit(name) for name in states}, left.predicted),
+        "/missing_force": Channel(forces, np.concatenate([left.force, left.force_std], axis=-1)),
+    }
+    write_mcap(path, logs, channels)

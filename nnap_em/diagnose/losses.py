@@ -51,6 +51,10 @@ class AbstractLoss(eqx.Module):
     measure: ClassVar[str]
     """Name of the share that the screen computes, as a figure labels it."""
 
+    def left(self, fit: SmoothedFit) -> float:
+        """Share of the declared model's squared error that the accepted laws left; 1 where it does not matter."""
+        return 1.0
+
     @abstractmethod
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
@@ -77,6 +81,11 @@ class MultiStep(AbstractLoss):
     """Horizons [s] that are looked at together."""
     judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SOON))
     """Horizons [s] at which a law that a band shows is judged after its refit."""
+
+    def left(self, fit: SmoothedFit) -> float:
+        """Product of what each refit left: a later law must remove the floor of the first error, not of the rest."""
+        removed = [found.removed for found in fit.now.found if found is not None]
+        return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
         """Filter errors forked every 50 ms, with robust weights."""

@@ -252,7 +252,7 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
     bands, folds = _bands(loss, fit, candidates)
     out = []
     for number, band in enumerate(bands):
-        floor = loss.bars.floor(band.independent)
+        floor = loss.bars.floor(band.independent) / loss.left(fit)
         placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
         chance = max((s.share.least for s in placebo if s.admissible), default=0.0)
         out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))

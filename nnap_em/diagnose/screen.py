@@ -263,7 +263,7 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
 def _order(screened: Screened) -> tuple[bool, bool, float]:
     ratio = screened.share.least / screened.bar
     shown = screened.admissible and ratio >= 1
-    return screened.admissible, shown, -screened.band if shown else ratio
+    return screened.admissible, shown, -float(screened.band) if shown else ratio
 
 
 def _screened(

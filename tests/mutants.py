@@ -953,8 +953,8 @@ MUTANTS = (
     Mutant(
         "a bump is a ripple",
         "diagnose/rounds.py",
-        "values[one] < EVEN * values[other]",
-        "values[one] < 0.6 * values[other]",
+        "other >= EVEN * value for",
+        "other >= 0.6 * value for",
         "test_rounds.py::test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reaches_nine_tenths",
     ),
     Mutant(
@@ -981,8 +981,8 @@ MUTANTS = (
     Mutant(
         "recordings against a law are those for it",
         "diagnose/rounds.py",
-        "seen.members[folds < 0]",
-        "seen.members[folds > 0]",
+        "held[folds < 0]",
+        "held[folds > 0]",
         "test_rounds.py::test_a_law_on_which_recordings_disagree_is_told_with_those_against_it",
     ),
     Mutant(
@@ -1051,7 +1051,7 @@ MUTANTS = (
     Mutant(
         "the placebo of a constant keeps its meaning",
         "diagnose/screen.py",
-        "            moved[:by] *= -1\n",
+        "        moved[:by] *= -1\n",
         "",
         "test_shares.py::test_the_placebo_of_a_constant_explains_nothing",
     ),

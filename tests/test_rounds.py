@@ -63,7 +63,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, me
         return Refit(screened, None, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
 
     size = sum(len(s.candidate.probes) for s in entries)
-    seen = Screen(tuple(entries), (np.eye(size),) * 2, np.eye(3, 6, dtype=bool) if members is None else members)
+    seen = Screen(tuple(entries), (np.eye(size),) * 2, (np.eye(3, 6, dtype=bool) if members is None else members,) * 2)
     monkeypatch.setattr(rounds, "surroundings", lambda *_: None)
     monkeypatch.setattr(AbstractEffect, "visible", lambda *_: True)
     monkeypatch.setattr(rounds, "proposals", lambda *_: [])
@@ -130,6 +130,13 @@ def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(m
     for share, names in ((0.46, ("x",)), (0.44, ("x", "dx"))):
         found, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
         assert found.accepted.effect.inputs_named() == names
+
+
+def test_of_a_chain_of_laws_that_contain_each_other_one_stands(monkeypatch):
+    """Each is even with the next, and the first is not even with the last."""
+    laws = [_screened(_function("x"), 0.42), _screened(_function("x", "dx"), 0.46), _screened(_spring(), 0.38)]
+    found, _ = _run(monkeypatch, laws)
+    assert found.accepted.effect.name == "torsional_spring"
 
 
 @pytest.mark.parametrize(("rest", "accepted"), [(0.28, "unknown_function"), (0.26, "air_drag")])

@@ -193,10 +193,24 @@ def test_the_placebo_of_a_constant_explains_nothing():
     assert chance < 0.1
 
 
-def test_a_sequence_of_few_moments_is_not_shifted():
-    columns = np.arange(7.0).reshape(1, 7, 1, 1)
-    found = Linearised(np.zeros((1, 7, 1)), columns, np.ones((1, 7, 1)), 1.0, np.arange(7))
-    np.testing.assert_array_equal(shifted(found, 0, np.random.default_rng(0)).columns, columns)
+def test_a_sequence_of_few_moments_takes_no_part_in_a_placebo():
+    columns = np.arange(1.0, 13.0).reshape(1, 3, 1, 4)
+    found = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
+    moved = shifted(found, 1, np.random.default_rng(0)).columns
+    np.testing.assert_array_equal(moved[..., :1], columns[..., :1])
+    assert not moved[..., 1:].any()
+
+
+def test_a_placebo_moves_the_moments_that_count():
+    """A reading in every fifth row: none of these keeps its column."""
+    columns, weight = np.random.default_rng(0).normal(size=(1, 100, 1, 2)), np.zeros((1, 100, 1))
+    weight[:, ::5] = 1.0
+    moved = shifted(
+        Linearised(np.zeros((1, 100, 1)), columns, weight, 1.0, np.arange(100)), 1, np.random.default_rng(1)
+    )
+    own, other = columns[0, ::5, 0, 1], moved.columns[0, ::5, 0, 1]
+    np.testing.assert_allclose(np.sort(np.abs(own)), np.sort(np.abs(other)))
+    assert not np.any(np.isclose(own, other))
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

@@ -75,6 +75,6 @@ def parts(
     return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, BLOCKS)
 
 
-def members(fold: Int[np.ndarray, "seq time"], used: Bool[np.ndarray, " seq"]) -> Bool[np.ndarray, "fold seq"]:
-    """Sequences that each fold holds, or pieces of."""
-    return np.array([(fold == f).any(axis=1) & used for f in np.unique(fold[used])]).reshape(-1, used.size)
+def members(fold: Int[np.ndarray, "seq time"], counts: Bool[np.ndarray, "seq time"]) -> Bool[np.ndarray, "fold seq"]:
+    """Sequences that each fold holds, or pieces of, as far as the moment counts."""
+    return np.array([((fold == f) & counts).any(axis=1) for f in np.unique(fold[counts])]).reshape(-1, len(fold))

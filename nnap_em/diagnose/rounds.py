@@ -100,22 +100,17 @@ def _entries(admitted: Sequence[Screened], band: int, model: StateSpaceModel) ->
 
 
 def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[_Law]:
-    """Laws that none of the others stands for.
+    """Laws that none of the others stands for, from simple ones to free functions of many signals.
 
     A free function contains the named laws of its signals, and functions of fewer: as far as one of these is even with
     it the free one goes, else they go.
     """
-
-    def beaten(one: int) -> bool:
-        law = laws[one].candidate.start
-        for other, its in enumerate(each.candidate.start for each in laws):
-            if contains(its, law, model.system) and values[one] < EVEN * values[other]:
-                return True
-            if contains(law, its, model.system) and values[other] >= EVEN * values[one]:
-                return True
-        return False
-
-    return [law for i, law in enumerate(laws) if not beaten(i)]
+    kept: list[tuple[_Law, float]] = []
+    for law, value in sorted(zip(laws, values, strict=True), key=lambda pair: free_signals(pair[0].candidate.start)):
+        inside = [k for k in kept if contains(law.candidate.start, k[0].candidate.start, model.system)]
+        if not any(other >= EVEN * value for _, other in inside):
+            kept = [k for k in kept if not any(k is other for other in inside)] + [(law, value)]
+    return [law for law, _ in kept]
 
 
 def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
@@ -222,8 +217,9 @@ def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
         folds, key = np.asarray(one.share.folds), key_of(one.candidate.start)
         if not _reached(one) or agreed(one.share.folds, one.floor):
             continue
-        against = seen.members[folds < 0].any(axis=0)
-        if not 0 < 2 * against.sum() < seen.members.any(axis=0).sum():
+        held = seen.members[one.band]
+        against = held[folds < 0].any(axis=0)
+        if not 0 < 2 * against.sum() < held.any(axis=0).sum():
             continue  # no odd ones: it is no law
         if not seeded(one.candidate, one.coefficients).possible():
             continue

@@ -22,8 +22,8 @@ from .verdict import CHANCE, Share, admissible
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
-SHIFTABLE = 8
-"""Moments of a sequence below which a shift would leave its columns where they are."""
+SHIFTABLE = 4
+"""Weighted moments of a sequence below which it takes no part in a placebo."""
 
 
 class Rows(NamedTuple):
@@ -113,12 +113,14 @@ def shifted(found: Linearised, nuisance: int, rng: np.random.Generator) -> Linea
     """
     columns = found.columns.copy()
     for weight, own in zip(found.weight, columns, strict=True):
-        count = int((weight > 0).any(axis=1).sum())
-        if count >= SHIFTABLE:
-            by = rng.integers(count // 4, 3 * count // 4 + 1)
-            moved = np.roll(own[:count, ..., nuisance:], by, axis=0)
-            moved[:by] *= -1
-            own[:count, ..., nuisance:] = moved
+        at = np.flatnonzero((weight > 0).any(axis=1))
+        if len(at) < SHIFTABLE:
+            own[..., nuisance:] = 0.0  # too few to lose their meaning: they take no part
+            continue
+        by = rng.integers(len(at) // 4, 3 * len(at) // 4 + 1)
+        moved = np.roll(own[at][..., nuisance:], by, axis=0)
+        moved[:by] *= -1
+        own[at, ..., nuisance:] = moved
     return found._replace(columns=columns)
 
 
@@ -206,22 +208,24 @@ class _Band(NamedTuple):
     """Gram matrix of the columns, in independent errors."""
     independent: float
     """Number of independent errors."""
+    members: Bool[np.ndarray, "fold seq"]
+    """Sequences that each fold holds, or pieces of."""
 
 
 _SHARES = Shares(HERE, HERE, HERE, HERE, HERE)
-_BAND = _Band(_SHARES, (_SHARES,) * SHIFTS, HERE, HERE)
+_BAND = _Band(_SHARES, (_SHARES,) * SHIFTS, HERE, HERE, HERE)
 
 
-@step(lambda loss, *_: ((_BAND,) * len(loss.bands), HERE))
+@step(lambda loss, *_: (_BAND,) * len(loss.bands))
 def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]):
-    """The screen of every band, and the sequences that each fold holds.
+    """The screen of every band.
 
     The seed of the placebos is fixed, so that the same data give the same chance level.
     """
     model, weights = fit.model, fit.m_step.weights(fit.model)
     precision, pull = friction_prior(model, weights)
     timed = ["time" in c.start.signals(model.system) for c in candidates]
-    out, fold = [], np.zeros((len(fit.used), 1), int)
+    out = []
     for found in loss.linearise(fit, candidates):
         fold, block = parts(model, fit.path, fit.data, fit.used, fit.recording, found.rows)
         rng, of = np.random.default_rng(0), lambda one: project(one, fold, block, precision, pull)  # noqa: B023
@@ -230,8 +234,9 @@ def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
         moved = (of(shifted(found, len(pull), rng)) for _ in range(SHIFTS))
         placebos = tuple(shares(one, candidates, timed) for one in moved)
         columns = (rows.columns / np.sqrt(rows.overlap)).astype(np.float32)
-        out.append(_Band(real, placebos, columns.T @ columns, len(rows.error) / rows.overlap))
-    return tuple(out), members(fold, fit.used)
+        independent, held = len(rows.error) / rows.overlap, members(fold, np.asarray((found.weight > 0).any(axis=2)))
+        out.append(_Band(real, placebos, columns.T @ columns, independent, held))
+    return tuple(out)
 
 
 class Screen(NamedTuple):
@@ -240,8 +245,8 @@ class Screen(NamedTuple):
     screened: tuple[Screened, ...]
     information: tuple[Float[np.ndarray, "probe probe"], ...]
     """Gram matrix of the columns of all probes, by band."""
-    members: Bool[np.ndarray, "fold seq"]
-    """Sequences that each fold holds, or pieces of."""
+    members: tuple[Bool[np.ndarray, "fold seq"], ...]
+    """Sequences that each fold holds, or pieces of, by band."""
 
 
 def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]) -> Screen:
@@ -249,15 +254,15 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
 
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
-    bands, folds = _bands(loss, fit, candidates)
+    bands = _bands(loss, fit, candidates)
     out = []
     for number, band in enumerate(bands):
         floor = loss.bars.floor(band.independent) / loss.left(fit)
         placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
-        chance = max((s.share.least for s in placebo if s.admissible), default=0.0)
+        chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
         out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))
     best = (max(same, key=_order) for same in zip(*out, strict=True))
-    return Screen(tuple(best), tuple(band.information for band in bands), np.asarray(folds))
+    return Screen(tuple(best), tuple(band.information for band in bands), tuple(b.members for b in bands))
 
 
 def _order(screened: Screened) -> tuple[bool, bool, float]:

@@ -80,6 +80,8 @@ def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
     """
     while now.found:
         fit, _ = smooth(context, now, context.longest)
+        if not fit.used.any():
+            break
         full = fitted(now, fit.path, fit, context.loss, context.effort.passes)
         lost = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
         least = int(np.argmin(lost))
@@ -98,13 +100,15 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
     Infinite for steps of a reading, which are seen in the numbers themselves.
     """
     effect = now.model.effects[place]
-    if effect.read_off:
-        return math.inf
+    if effect.read_off or any(rest_of(other, now.model) == place for other in now.model.effects):
+        return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
     if not effect.possible():
         return -math.inf
     less = now.without(place)
     own, _ = smooth(context, less, context.longest)
     both = fit._replace(used=fit.used & own.used)
+    if not both.used.any():  # without it no sequence is followed
+        return math.inf
     trial = fitted(less, own.path, both._replace(now=less), context.loss, context.effort.passes)
     return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
 
@@ -117,7 +121,11 @@ def search(context: SearchContext) -> Closed:
     """Search for what the declared model lacks: by many steps first; then, where innovations are white, by one step."""
     before, data = context.before, context.data
     steps: list[Step] = []
-    now, state = quantised(context, context.declared)  # steps in a reading spoil the noise that all else leans on
+    try:  # steps in a reading spoil the noise that all else leans on
+        now, state = quantised(context, context.declared)
+    except FitError as error:
+        context.say(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
+        now, state = context.declared, None
     length = context.longest if state else _first(context)
     now, state = _search(context, now, state, length, steps)
     white = white_readings(data) and white_innovations(_outcome(before, now, state), data)

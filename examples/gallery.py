@@ -24,7 +24,7 @@ from nnap_em.commands.common import set_up
 from nnap_em.report.style import NORMAL_90, STYLE
 
 SIZE = (4.4, 2.9)
-"""Of a picture [in]."""
+"""Width and height of a picture [in]."""
 DOTS = 160
 """Per inch."""
 
@@ -193,7 +193,7 @@ def drawn(picture: Picture, arrays: Arrays, ink: Ink) -> Figure:
 
 
 def arrays(name: str, out: Path) -> Arrays:
-    """What a run found, from its file where there is one."""
+    """Result of a run, from its file where there is one."""
     file = out / f"{name}.npz"
     if not file.exists():
         shutil.rmtree(out / name, ignore_errors=True)  # of a run that was stopped

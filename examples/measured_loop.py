@@ -40,7 +40,7 @@ LAWS: dict[str, dict[str, Any]] = {
     "cogging": {"joint": 2, "amplitude": 0.4, "k": 3.0, "phase": 0.5},
     "eddy_brake": {"joint": 2, "c": 0.05, "center": 0.5},
 }
-"""What --plant takes, in SI units; the formulas are those of plant.py."""
+"""Choices of --plant, in SI units; the formulas are those of plant.py."""
 STRENGTH = {"torsional_spring": ("k", "N m/rad"), "cogging": ("amplitude", "N m"), "eddy_brake": ("c", "N m s/rad")}
 """The number of each law that the table compares."""
 STARTS = np.arange(0.5, 3.51, 0.25)
@@ -66,10 +66,10 @@ def write_logs(source: list[Path], out: Path, law: str | None) -> list[Path]:
 
 
 class Diagnosis(NamedTuple):
-    """What a diagnosis left."""
+    """Results of a diagnosis."""
 
     folder: Path
-    """Of the data set."""
+    """Folder of the data set."""
     report: dict[str, Any]
     before: Identified
     after: Identified
@@ -117,7 +117,7 @@ def print_lines(name: str, process: subprocess.Popen[str]) -> None:
 
 
 def read(out: Path) -> Diagnosis:
-    """What was left in a folder."""
+    """Results of a diagnosis, from its folder."""
     report = json.loads((out / "found" / "report.json").read_text())
     models = (load(out / "found" / f"{name}.npz") for name in ("before", "after"))
     return Diagnosis(out / "data", report, *models)
@@ -165,7 +165,7 @@ def lines(recorded: Diagnosis, planted: Diagnosis, law: str, off: dict[str, floa
 
 
 def summary(done: Diagnosis) -> str:
-    """What a report says is missing."""
+    """Effects that a report lists as missing."""
     report = done.report
     suspects = "".join(f"; a suspect: {s['law']}" for s in report.get("suspects", [])[:1])
     found = "; ".join(f"{e['description'].partition(':')[0]}{share_removed(e['evidence'])}" for e in report["effects"])
@@ -173,7 +173,7 @@ def summary(done: Diagnosis) -> str:
 
 
 def share_removed(evidence: dict[str, float | None]) -> str:
-    """What a law removes of the squared prediction error, where that is known."""
+    """Share of the squared prediction error that a law removes, where that is known."""
     share = evidence.get("share_of_error")
     return "" if share is None or not np.isfinite(share) else f" (removes {share:.0%} of the error)"
 

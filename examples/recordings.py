@@ -34,7 +34,7 @@ HASHES = {
 }
 """SHA-256 of the published files."""
 SECONDS = 5.0
-"""Of each recording that are used: most of them balance upright afterwards, and show little."""
+"""Seconds of each recording that are used: most of them balance upright afterwards, and show little."""
 RETRIES = 3
 """Connections made again after one that broke off."""
 

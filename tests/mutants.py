@@ -960,8 +960,8 @@ MUTANTS = (
     Mutant(
         "the weakest of a kind stands for it",
         "diagnose/rounds.py",
-        "_order(best[key]) < _order(screened)",
-        "_order(best[key]) > _order(screened)",
+        "best[key].rank < screened.rank",
+        "best[key].rank > screened.rank",
         "test_rounds.py::test_the_best_of_every_kind_stands_for_it",
     ),
     Mutant(
@@ -995,8 +995,8 @@ MUTANTS = (
     Mutant(
         "a law stays beside any remainder",
         "diagnose/search.py",
-        "if law is None or explains(",
-        "if law is None or not explains(",
+        "form is None and explains(",
+        "form is None and not explains(",
         "test_search.py::test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part",
     ),
     Mutant(
@@ -1016,8 +1016,8 @@ MUTANTS = (
     Mutant(
         "the gain of a lost sequence counts",
         "diagnose/losses.py",
-        "float(np.nansum(gain))",
-        "float(np.sum(gain))",
+        "fit.used & np.isfinite(gain)",
+        "fit.used",
         "test_search.py::test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings",
     ),
     Mutant(

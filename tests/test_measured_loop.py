@@ -1,4 +1,4 @@
-"""What `examples/measured_loop.py` writes from raw recordings, and what it prints."""
+"""Files that `examples/measured_loop.py` writes from raw recordings, and its table."""
 
 import measured_loop
 import numpy as np

@@ -79,7 +79,7 @@ def drawn(request):
 
 
 def test_the_longest_test_sequences_are_those_to_choose_from():
-    """Of seven, the five longest, longest first."""
+    """The five longest of seven are kept, longest first."""
     found, names = _found(1), _names(1)
     length = np.asarray([50, 200, 60, 70, 80, 90, 40, 100])
     valid = np.arange(ROWS) < length[:, None]

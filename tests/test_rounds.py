@@ -132,6 +132,20 @@ def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(m
         assert found.accepted.effect.inputs_named() == names
 
 
+def test_a_simpler_law_is_refitted_where_the_function_that_beat_it_is_rejected(monkeypatch):
+    entries = [_screened(_function("x"), 0.5), _screened(_spring(), 0.2)]
+    found, tried = _run(monkeypatch, entries, errors={"unknown_function": 0.95})
+    assert tried == ["unknown_function", "torsional_spring"] and found.accepted.effect.name == "torsional_spring"
+
+
+def test_a_band_shows_a_free_function_at_its_own_bar():
+    """At 1.2 times the bar of a named law at the longer horizons, and 4 times at the shorter ones."""
+    free = [_screened(_function("x"), share, band=band) for share, band in ((0.18, 0), (0.6, 1))]
+    named = [_screened(_spring(), share, band=band) for share, band in ((0.18, 0), (0.6, 1))]
+    assert max(free, key=lambda s: s.rank).band == 1
+    assert max(named, key=lambda s: s.rank).band == 0
+
+
 def test_of_a_chain_of_laws_that_contain_each_other_one_stands(monkeypatch):
     """Each is even with the next, and the first is not even with the last."""
     laws = [_screened(_function("x"), 0.42), _screened(_function("x", "dx"), 0.46), _screened(_spring(), 0.38)]

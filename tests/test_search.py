@@ -1,4 +1,4 @@
-"""What the search makes of numbers: what enters a model, what leaves it again, and which loss decides."""
+"""Decisions of the search on numbers: laws that enter a model or leave it, and the loss that decides."""
 
 import dataclasses
 
@@ -281,7 +281,10 @@ def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(own,
     now = BARE.plus(_spring(), spring, Found(spring, 1.0, 1.0, 0.0, 9, removed=own))
     law = _function()
     case = _case(law)._replace(after=now.plus(law, _case(law).screened.candidate))
-    assert _names(search._with(now, case, _found("motor_gain"), _context()).model) == names
+    following = search._with(now, case, _found("motor_gain"), _context())
+    assert _names(following.model) == names
+    # the remainder that took the place removed what both did; beside the law only its own
+    assert following.found[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
 
 
 def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there():
@@ -318,9 +321,9 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
 
 
 def test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings():
-    """Five nats in each of four sequences of 18 readings; a sequence that one of both loses says nothing."""
+    """Five nats in each of four sequences of 18 readings; a sequence that one of both loses does not count."""
     fit = SmoothedFit(BARE, BARE, None, DATA, np.array([1, 1, 1, 1, 1, 0], bool), 9)
     null, full = (Trial(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
     full.loglik[0] = np.nan
-    assert readings(DATA, fit.used) == 90
-    assert OneStep().ratio(null, full, fit, 0) == pytest.approx(1 - 2 * 20 / 90)
+    assert readings(DATA, fit.used) == OneStep().count(fit) == 90
+    assert OneStep().ratio(null, full, fit, 0) == pytest.approx(1 - 2 * 20 / 72)

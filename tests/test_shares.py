@@ -133,6 +133,15 @@ def test_recordings_of_one_motion_are_left_out_together():
     assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
 
 
+def test_a_short_beginning_is_no_repetition_of_a_longer_motion():
+    """Five motions from one rest; the first diverged early."""
+    rng = np.random.default_rng(0)
+    state = np.cumsum(rng.normal(size=(5, 200, 2)), axis=1)
+    state[:, :20] = state[0, :20]
+    state[0, 12:] = np.nan
+    assert motions(state, np.ones(5, bool), np.arange(5)).tolist() == [0, 1, 2, 3, 4]
+
+
 def test_the_pieces_of_a_recording_are_one_motion_and_lie_at_their_times():
     rng = np.random.default_rng(0)
     state, used = rng.normal(size=(3, 50, 2)), np.ones(3, bool)

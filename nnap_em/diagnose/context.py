@@ -1,4 +1,4 @@
-"""What a search works on, and its two long steps: smooth a hypothesis, and extend its fit to a longer horizon."""
+"""Constants of a search, and its two long steps: smooth a hypothesis, and extend its fit to the whole length."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from ..em.mstep import kept
 from ..em.multistep import JUDGED, errors, ratio
 from ..model.state_space import StateSpaceModel
 from .hypothesis import Hypothesis
-from .losses import AbstractLoss, MultiStep
+from .losses import AbstractLoss
 from .smoothed import SmoothedFit
 
 _Tree = TypeVar("_Tree")
@@ -33,7 +33,7 @@ LOOSER = 3.0
 
 
 class Effort(NamedTuple):
-    """Extent of a search; it decides nothing."""
+    """Limits of a search."""
 
     shortlist: int = 8
     """Candidates that are refitted at most."""
@@ -51,7 +51,7 @@ EFFORT = Effort()
 
 
 class SearchContext(NamedTuple):
-    """What does not change during a search."""
+    """Constants of a search."""
 
     before: Identified
     stages: Stages
@@ -71,11 +71,6 @@ class SearchContext(NamedTuple):
     def declared(self) -> Hypothesis:
         """The declared model."""
         return Hypothesis(self.before.model, self.before.m_step)
-
-
-def beginning(data: Dataset, length: int) -> Dataset:
-    """The first `length` rows."""
-    return _cut(horizon(data, length), length)
 
 
 def _cut(tree: _Tree, length: int) -> _Tree:
@@ -112,11 +107,9 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
     return found._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
-def extend(context: SearchContext, now: Hypothesis, first: int, state: EMState | None = None) -> EMState:
-    """EM of `now` from a horizon of `first` rows (or from `state`) to the whole length."""
+def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:
+    """EM of `now` from a horizon of `first` rows to the whole length."""
     before, longest = context.before, context.longest
-    if state is not None:
-        now = now.refitted(cast(StateSpaceModel, state.best))
     schedule = Schedule(first=min(first, longest), growth=1.6, hold=1)
     growing = math.ceil(math.log(longest / schedule.first) / math.log(1.6)) if longest > schedule.first else 0
 
@@ -137,7 +130,7 @@ def extend(context: SearchContext, now: Hypothesis, first: int, state: EMState |
             state = other if ahead(other, state) > 0 else state
         except FitError:
             pass
-    if isinstance(context.loss, MultiStep):
+    if context.loss.predicts:
         state = _predicting(context, now, state)
     context.say(f"  fitted over the whole length in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
     return state

@@ -195,7 +195,7 @@ class Dispute(NamedTuple):
 def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
     """Laws that the last look would have tried, had some recordings not said the opposite; `files` by sequence."""
     out = []
-    for told in closed.steps[-1].disputed[:most] if closed.steps else ():
+    for told in [one for step in closed.last for one in step.disputed][:most]:
         name, joint, channel, inputs = told.key
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in told.against))
         text = (
@@ -227,7 +227,7 @@ class SuspectReport(NamedTuple):
 def suspected(closed: Closed) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
-    for each in closed.steps[-1].suspects if closed.steps else ():
+    for each in [one for step in closed.last for one in step.suspects]:
         name, joint, channel, inputs = each.key
         text = (
             f"{words(each.key)} would remove {each.share:.0%} of the squared prediction error, "
@@ -241,7 +241,7 @@ def suspected(closed: Closed) -> list[SuspectReport]:
 
 def undecided(closed: Closed) -> tuple[Key, ...]:
     """Laws of other causes that explain the same of what is left, so that none of them was added."""
-    return closed.steps[-1].rivals if closed.steps else ()
+    return tuple(key for step in closed.last for key in step.rivals)
 
 
 def advice(

@@ -31,7 +31,11 @@ def motions(
     scaled = state / np.sqrt(size)
     motion = recording.copy()
     for i, j in itertools.combinations(np.flatnonzero(used), 2):
-        difference, own = np.nanmean((scaled[i] - scaled[j]) ** 2), np.nanmean(scaled[[i, j]] ** 2)
+        known = np.isfinite(scaled[[i, j]]).all(axis=-1)
+        both = known.all(axis=0)
+        if 2 * both.sum() < known.sum(axis=1).max():  # too short a part of the longer one to be its repetition
+            continue
+        difference, own = np.mean((scaled[i] - scaled[j])[both] ** 2), np.mean(scaled[[i, j]][:, both] ** 2)
         if difference < REPEATS * own:
             motion[motion == motion[j]] = motion[i]
     return motion
@@ -40,7 +44,7 @@ def motions(
 def times(
     clock: Float[np.ndarray, "seq time"], data: Dataset, recording: Int[np.ndarray, " seq"], count: int
 ) -> Int[np.ndarray, "seq time"]:
-    """Which of `count` equal parts of its recording each moment of `clock` [s] belongs to."""
+    """Part, of `count` equal ones, of its recording that each moment of `clock` [s] lies in."""
     t = np.where(np.asarray(data.valid), np.asarray(data.t), np.nan)
     low, high = (np.array([of(t[recording == r]) for r in recording])[:, None] for of in (np.nanmin, np.nanmax))
     return np.clip((count * (clock - low) / (high - low + 1e-12)).astype(int), 0, count - 1)

@@ -21,7 +21,7 @@ class Found(NamedTuple):
     gain: float
     """Log-likelihood over the model without it, where it was found [nat]."""
     held_out: float
-    """Gain on sequences that had no part in the fit [nat]; NaN where many steps decided."""
+    """Expected gain on parts left out of the fit of its strengths [nat]; NaN where many steps decided."""
     p_value: float
     """Of the likelihood ratio, times the number of candidates tried."""
     horizon: int

@@ -33,7 +33,7 @@ class Linearised(NamedTuple):
 
     error: Float[np.ndarray, "seq time output"]
     columns: Float[np.ndarray, "seq time output column"]
-    """By friction nodes, by parameters, then by the probes of all candidates: what each takes off the error."""
+    """Change that friction nodes, parameters and the probes of all candidates, in this order, take off the error."""
     weight: Float[np.ndarray, "seq time output"]
     """One over the variance of an error; 0 where it does not count."""
     overlap: float
@@ -43,17 +43,23 @@ class Linearised(NamedTuple):
 
 
 class AbstractLoss(eqx.Module):
-    """Which errors are looked at, and how a fit to them is finished."""
+    """Errors by which candidates are judged, and the end of a fit to them."""
 
     bars: ClassVar[Bars]
     bands: eqx.AbstractVar[tuple[tuple[float, ...], ...]]
-    """Horizons [s] that are looked at together."""
+    """Horizons [s] whose errors are screened together, in the order of precedence."""
     measure: ClassVar[str]
     """Name of the share that the screen computes, as a figure labels it."""
+    predicts: ClassVar[bool] = False
+    """True where errors of many steps decide: likelihood then proves nothing."""
 
     def left(self, fit: SmoothedFit) -> float:
         """Share of the declared model's squared error that the accepted laws left; 1 where it does not matter."""
         return 1.0
+
+    def count(self, fit: SmoothedFit) -> float:
+        """Number of independent errors that the smallest gain in log-likelihood is spread over."""
+        return float(readings(fit.data, fit.used))
 
     @abstractmethod
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
@@ -77,8 +83,8 @@ class MultiStep(AbstractLoss):
 
     bars: ClassVar[Bars] = MULTI_STEP
     measure: ClassVar[str] = "share of the squared multi-step error"
+    predicts: ClassVar[bool] = True
     bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SOON))
-    """Horizons [s] that are looked at together."""
     judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SOON))
     """Horizons [s] at which a law that a band shows is judged after its refit."""
 
@@ -149,9 +155,10 @@ class OneStep(AbstractLoss):
         return trial.model
 
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
-        """One minus twice the gain in log-likelihood over the readings, of sequences that both fits follow."""
-        gain = (full.loglik - null.loglik)[fit.used]
-        return 1.0 - 2.0 * float(np.nansum(gain)) / readings(fit.data, fit.used)
+        """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""
+        gain = full.loglik - null.loglik
+        both = fit.used & np.isfinite(gain)
+        return 1.0 - 2.0 * float(np.sum(gain[both])) / max(readings(fit.data, both), 1)
 
 
 def readings(data: Dataset, used) -> int:
@@ -166,7 +173,7 @@ def _machine(fit: SmoothedFit) -> StateSpaceModel:
 
 def _flat(a: np.ndarray, last: int = 0) -> np.ndarray:
     """Horizons and channels as one axis."""
-    return a.reshape(*a.shape[:2], -1, *a.shape[4 : 4 + last])
+    return a.reshape(*a.shape[:2], a.shape[2] * a.shape[3], *a.shape[4 : 4 + last])
 
 
 def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:

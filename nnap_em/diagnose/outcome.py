@@ -13,7 +13,7 @@ class Disputed(NamedTuple):
 
     key: Key
     share: float
-    """Of the squared error that it would remove."""
+    """Share of the squared error that it would remove."""
     against: tuple[int, ...]
     """Sequences that it would harm."""
     harm: float
@@ -27,21 +27,21 @@ class Suspect(NamedTuple):
     share: float
     """Share of the squared multi-step error, before any refit [0 to 1]."""
     chance: float
-    """Largest share of any candidate whose columns are shifted in time."""
+    """Largest share of any placebo that the parts left out confirm."""
 
 
 class Step(NamedTuple):
-    """What was seen at one look, for the report."""
+    """Results of one screening round, for the report."""
 
     horizon: int
     screened: tuple[tuple[Key, float], ...]
-    """Best of every kind with its promise: nat, or a share."""
+    """Best of every kind with the share of the squared error that it removes."""
     refitted: tuple[tuple[Key, float], ...]
     accepted: Key | None
     tried: int
     """Candidates screened."""
-    measure: str = "expected gain in log-likelihood [nat]"
-    """What the numbers are."""
+    measure: str = "share of the squared error"
+    """Name of the share."""
     disputed: tuple[Disputed, ...] = ()
     """Best first."""
     rivals: tuple[Key, ...] = ()
@@ -61,3 +61,8 @@ class Closed(NamedTuple):
     """External disturbances, whose rows are in no fit."""
     pieces: tuple[int, ...] = ()
     """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
+
+    @property
+    def last(self) -> tuple[Step, ...]:
+        """Last round of every measure: one-step errors do not withdraw what the multi-step errors left open."""
+        return tuple({step.measure: step for step in self.steps}.values())

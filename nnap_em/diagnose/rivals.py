@@ -45,7 +45,7 @@ def instead(
     around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
     same = [one for one in proposals(around, fit.model.effects) if means(one.start)]
     trials = []
-    screened = sorted(screen(OneStep(), fit, same).screened, key=lambda s: -s.share.inside) if same else []
+    screened = sorted(screen(OneStep(), fit, same, shifts=0).screened, key=lambda s: -s.share.inside) if same else []
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
         full = fit.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
         path = extended(full.model, fit.path, fit.data)
@@ -63,7 +63,7 @@ def again(fitted: Identified, data: Dataset) -> Identified:
 def apart(closed: Closed, data: Dataset) -> Closed:
     """`closed` after its effects and their equivalents were compared over the whole length of the logs.
 
-    A playoff on the way ends where the search does, and what it leaves even more rows may tell: an equivalent that is
+    Screens are linear, and fits over the whole length tell more: an equivalent that is
     clearly less likely goes, and one that is clearly likelier takes the place of its effect.
     """
     for place, found in enumerate(closed.found):
@@ -102,7 +102,7 @@ def _context(fitted: Identified, data: Dataset) -> SearchContext:
 
 
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:
-    """What a fit lacks without one of its effects, over the whole length."""
+    """Smoothed fit without one of its effects, over the whole length."""
     data = jax.device_put(data)
     now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     now = now if place is None else now.without(place)

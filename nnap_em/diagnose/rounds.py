@@ -1,7 +1,7 @@
 """One screening round: all candidates are screened, and the best are refitted until one is accepted."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from ..model.state_space import StateSpaceModel
 from ..systems import AbstractSystem
 from .context import SearchContext
 from .keys import Key, contains, covered, free_signals, key_of, replaced, rest_of, words
-from .losses import MultiStep
 from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
+from .refit import Trial
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
 from .trial import Refit, fitted, with_candidate
@@ -43,28 +43,27 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).possible())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
-    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, _disputed(fresh, seen))
-    admitted = [s for s in ranked if s.admissible and _reached(s)]
-    entries = [s for band in range(len(context.loss.bands)) for s in _entries(admitted, band, model)]
-    entries = entries[: context.effort.shortlist]
-    if not entries:
-        return Round(step._replace(suspects=_suspects(ranked)), seen, None)
-    null = fitted(fit.now, fit.path, fit, context.loss, context.effort.passes)
+    disputed = _disputed(fresh, seen) if context.loss.predicts else ()
+    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, disputed)
+    admitted = [s for s in ranked if s.reached]
     tried: list[Refit] = []
-
-    def refit(screened: Screened) -> Refit:
-        tried.append(with_candidate(screened, null, fit, context.loss, context.effort.passes))
-        _log(tried[-1], context)
-        return tried[-1]
-
-    while entries:
-        first, least = entries[0].band, EVEN * score(entries[0], model)
-        even = [s for s in entries if s.band == first and score(s, model) >= least]
-        sound = [case for case in map(refit, even + _inside(even, admitted, model)) if case.rejection is None]
+    fitting = fit, context.loss, context.effort.passes
+    null = fitted(fit.now, fit.path, *fitting) if admitted else None
+    while admitted and len(tried) < context.effort.shortlist:
+        first = min(s.band for s in admitted)
+        entries = _entries([s for s in admitted if s.band == first], model)
+        even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
+        group = even + _inside(even, admitted, model)
+        cases = [with_candidate(s, cast(Trial, null), *fitting) for s in group]
+        tried += cases
+        for case in cases:
+            _log(case, context)
+        sound = [case for case in cases if case.rejection is None]
         if sound:
             return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
-        entries = [s for s in entries if not any(s is other for other in even)]
-    suspects = _suspects([s for s in ranked if not any(s is case.screened for case in tried)])
+        admitted = [s for s in admitted if not any(s is other for other in group)]
+    others = [s for s in ranked if not any(s is case.screened for case in tried)]
+    suspects = _suspects(others) if context.loss.predicts else ()
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
@@ -80,7 +79,7 @@ def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: Searc
     best = max(even, key=lambda case: (_odds(case.candidate.start, fit.model), case.gain))
     law = best.candidate.start
     rivals = [case for case in even if other_cause(case.effect, law, fit.model.system)]
-    if rivals and isinstance(context.loss, MultiStep):
+    if rivals and context.loss.predicts:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.say(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return found._replace(step=found.step._replace(rivals=keys))
@@ -92,10 +91,9 @@ def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: Searc
     return Round(found.step._replace(accepted=key_of(best.effect)), found.screen, best, equivalent)
 
 
-def _entries(admitted: Sequence[Screened], band: int, model: StateSpaceModel) -> list[Screened]:
-    """Laws to be refitted that a band of horizons shows, best first."""
-    own = [s for s in admitted if s.band == band]
-    standing = _standing(own, [_ratio(s) for s in own], model)
+def _entries(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
+    """Laws of one band of horizons that none of the others stands for, best first."""
+    standing = _standing(admitted, [s.ratio for s in admitted], model)
     return sorted(standing, key=lambda s: -score(s, model))
 
 
@@ -115,16 +113,17 @@ def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceMo
 
 def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
     """Best named law that each free function among the `chosen` contains: a refit may show that it is even with it."""
-    out = []
+    out: list[Screened] = []
     for free in chosen:
         named = [
             s
             for s in admitted
             if s.band == free.band
+            and not any(s is other for other in (*chosen, *out))
             and s.candidate.start.named
             and contains(free.candidate.start, s.candidate.start, model.system)
         ]
-        out += named[:1] if named and _ratio(named[0]) >= NAMED * _ratio(free) else []
+        out += named[:1] if named and named[0].ratio >= NAMED * free.ratio else []
     return out
 
 
@@ -137,22 +136,12 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
 
 def score(screened: Screened, model: StateSpaceModel) -> float:
     """Multiple of its bar that the share of a candidate reaches, times its prior odds; the larger the better."""
-    return _ratio(screened) * _odds(screened.candidate.start, model)
+    return screened.ratio * _odds(screened.candidate.start, model)
 
 
 def _odds(law: AbstractEffect, model: StateSpaceModel) -> float:
     remainder = rest_of(law, model) is not None or replaced(law, model) is not None
     return odds(free_signals(law), remainder=remainder)
-
-
-def _ratio(screened: Screened) -> float:
-    """Multiple of its bar that a share reaches."""
-    return screened.share.least / screened.bar
-
-
-def _reached(screened: Screened) -> bool:
-    """True for a share that reaches the bar of its law."""
-    return screened.share.least >= required(screened.bar, free_signals(screened.candidate.start))
 
 
 def _listed(screened: Screened) -> float:
@@ -167,17 +156,13 @@ def _fresh(law: AbstractEffect, model: StateSpaceModel) -> bool:
 
 
 def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
-    """The best candidate of every kind, best first."""
+    """The best candidate of every kind, by its listed share."""
     best: dict[Key, Screened] = {}
     for screened in every:
         key = key_of(screened.candidate.start)
-        if key not in best or _order(best[key]) < _order(screened):
+        if key not in best or best[key].rank < screened.rank:
             best[key] = screened
-    return sorted(best.values(), key=_order, reverse=True)
-
-
-def _order(screened: Screened) -> float:
-    return _ratio(screened) if screened.admissible else 0.0
+    return sorted(best.values(), key=_listed, reverse=True)
 
 
 def _log(case: Refit, context: SearchContext) -> None:
@@ -215,7 +200,7 @@ def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
     best: dict[Key, Disputed] = {}
     for one in every:
         folds, key = np.asarray(one.share.folds), key_of(one.candidate.start)
-        if not _reached(one) or agreed(one.share.folds, one.floor):
+        if one.share.least < required(one.bar, free_signals(one.candidate.start)) or agreed(one.share.folds, one.floor):
             continue
         held = seen.members[one.band]
         against = held[folds < 0].any(axis=0)

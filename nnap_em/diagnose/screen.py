@@ -16,9 +16,10 @@ from ..effects import Candidate, flat
 from ..em.shape import friction_prior
 from ..storage.journal import HERE, step
 from .folds import members, parts
+from .keys import free_signals
 from .losses import AbstractLoss, Linearised
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, Share, admissible
+from .verdict import CHANCE, Share, admissible, required
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
@@ -60,9 +61,24 @@ class Screened(NamedTuple):
     floor: float
     """Smallest share that counts at that band."""
     chance: float
-    """Largest share of any placebo at that band."""
+    """Largest share of any placebo at that band that the parts left out confirm."""
     independent: float
     """Number of independent errors."""
+
+    @property
+    def ratio(self) -> float:
+        """Multiple of its bar that the share reaches."""
+        return self.share.least / self.bar
+
+    @property
+    def reached(self) -> bool:
+        """True for an admissible share that reaches the bar of its law."""
+        return self.admissible and self.share.least >= required(self.bar, free_signals(self.candidate.start))
+
+    @property
+    def rank(self) -> tuple[bool, bool, float, float]:
+        """Order of candidates of one kind, and of the bands of a candidate: the first band that shows it counts."""
+        return self.admissible, self.reached, -float(self.band) if self.reached else 0.0, self.ratio
 
     @property
     def bar(self) -> float:
@@ -200,12 +216,12 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
 
 
 class _Band(NamedTuple):
-    """What the screen keeps of one band."""
+    """Shares of one band, of candidates and of placebos."""
 
     shares: Shares
     placebos: tuple[Shares, ...]
     information: Float[np.ndarray, "probe probe"]
-    """Gram matrix of the columns, in independent errors."""
+    """Gram matrix of the columns."""
     independent: float
     """Number of independent errors."""
     members: Bool[np.ndarray, "fold seq"]
@@ -213,11 +229,11 @@ class _Band(NamedTuple):
 
 
 _SHARES = Shares(HERE, HERE, HERE, HERE, HERE)
-_BAND = _Band(_SHARES, (_SHARES,) * SHIFTS, HERE, HERE, HERE)
+_BAND = _Band(_SHARES, (), HERE, HERE, HERE)
 
 
-@step(lambda loss, *_: (_BAND,) * len(loss.bands))
-def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]):
+@step(lambda loss, _, __, shifts: (_BAND._replace(placebos=(_SHARES,) * shifts),) * len(loss.bands))
+def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int) -> tuple[_Band, ...]:
     """The screen of every band.
 
     The seed of the placebos is fixed, so that the same data give the same chance level.
@@ -231,9 +247,9 @@ def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
         rng, of = np.random.default_rng(0), lambda one: project(one, fold, block, precision, pull)  # noqa: B023
         rows = of(found)
         real = shares(rows, candidates, timed)
-        moved = (of(shifted(found, len(pull), rng)) for _ in range(SHIFTS))
+        moved = (of(shifted(found, len(pull), rng)) for _ in range(shifts))
         placebos = tuple(shares(one, candidates, timed) for one in moved)
-        columns = (rows.columns / np.sqrt(rows.overlap)).astype(np.float32)
+        columns = rows.columns.astype(np.float32)
         independent, held = len(rows.error) / rows.overlap, members(fold, np.asarray((found.weight > 0).any(axis=2)))
         out.append(_Band(real, placebos, columns.T @ columns, independent, held))
     return tuple(out)
@@ -249,26 +265,20 @@ class Screen(NamedTuple):
     """Sequences that each fold holds, or pieces of, by band."""
 
 
-def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]) -> Screen:
+def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS) -> Screen:
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
 
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
-    bands = _bands(loss, fit, candidates)
+    bands = _bands(loss, fit, candidates, shifts)
     out = []
     for number, band in enumerate(bands):
         floor = loss.bars.floor(band.independent) / loss.left(fit)
         placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
         chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
         out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))
-    best = (max(same, key=_order) for same in zip(*out, strict=True))
+    best = (max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
     return Screen(tuple(best), tuple(band.information for band in bands), tuple(b.members for b in bands))
-
-
-def _order(screened: Screened) -> tuple[bool, bool, float]:
-    ratio = screened.share.least / screened.bar
-    shown = screened.admissible and ratio >= 1
-    return screened.admissible, shown, -float(screened.band) if shown else ratio
 
 
 def _screened(
@@ -281,7 +291,7 @@ def _screened(
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:
-    """Share of what the data say of the `chosen` candidate that each could not say in its place; 0: the same model."""
+    """Share of the information on the `chosen` candidate that each could not give in its place; 0: the same model."""
     candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
     where = spans(candidates)
     own = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]

@@ -1,5 +1,6 @@
 """Close the loop: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
 
+import functools
 import math
 from typing import Any, cast
 
@@ -21,13 +22,13 @@ from ..residual.undisturbed import disturbance_free
 from .context import EFFORT, Effort, Say, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, replaced, rest_of, words
-from .losses import MultiStep, OneStep, readings
+from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Closed, Step
 from .quantised import quantised
 from .rivals import apart
 from .rounds import Round, screening_round
 from .trial import Refit, fitted
-from .verdict import explains, needed
+from .verdict import Rejection, explains, needed
 
 
 def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -36,26 +37,30 @@ def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[S
     fit, whole = smooth(context, now, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
     context.say(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
-    if not fit.used.any() or len(now.found) >= context.effort.most:
+    added = sum(not effect.read_off for effect in now.model.effects)
+    if not fit.used.any() or added >= context.effort.most:
         return now
     found = screening_round(fit, context)
     steps.append(found.step)
-    return now if found.accepted is None else _with(now, found.accepted, _found(found, length), context)
+    return now if found.accepted is None else _with(now, found.accepted, _found(found, length, context.loss), context)
 
 
 def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
     """`now` with a refitted law; a named law whose remainder explains the larger part of both gives way to that."""
     context.say(f"  added {words(key_of(case.effect))}")
     m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, now.m_step.tie)  # under the old hold on noise
-    following = case.after._replace(m_step=m_step).because(-1, found)
-    place = rest_of(case.effect, now.model)
-    if place is None or replaced(case.effect, now.model) is not None:
+    following, rest = case.after._replace(m_step=m_step), rest_of(case.effect, now.model)
+    form = replaced(case.effect, now.model)
+    place = rest if form is None else form
+    law = None if place is None else now.found[place]
+    if law is None or (form is None and explains(law.removed, case.removed)):
+        return following.because(-1, found)
+    both = found._replace(removed=1 - (1 - law.removed) * (1 - case.removed))  # over the model without the older law
+    following = following.because(-1, both)
+    if form is not None:  # its place is taken already
         return following
-    law = now.found[place]
-    if law is None or explains(law.removed, case.removed):
-        return following
-    context.say(f"  {words(key_of(now.model.effects[place]))} was a part of it")
-    return following.without(place)
+    context.say(f"  {words(key_of(now.model.effects[cast(int, rest)]))} is a part of it, and is removed")
+    return following.without(cast(int, rest))
 
 
 def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
@@ -63,13 +68,13 @@ def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
     return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
 
 
-def _found(found: Round, length: int) -> Found:
-    """Why a law was accepted, and what the data cannot tell from it."""
-    case, many = cast(Refit, found.accepted), found.step.measure == MultiStep.measure
+def _found(found: Round, length: int, loss: AbstractLoss) -> Found:
+    """Evidence for an accepted law, with its equivalents."""
+    case = cast(Refit, found.accepted)
     screened, directions = case.screened, max(case.screened.directions, 1)
     p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * found.step.tried)
     left_out = screened.share.left_out
-    held_out, share = (math.nan, left_out) if many else (0.5 * left_out * screened.independent, math.nan)
+    held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
     return Found(screened.candidate, case.gain, held_out, p_value, length, found.equivalent, share, case.removed)
 
 
@@ -85,11 +90,12 @@ def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
         full = fitted(now, fit.path, fit, context.loss, context.effort.passes)
         lost = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
         least = int(np.argmin(lost))
-        floor = context.loss.bars.floor(_count(context, fit))
+        floor = context.loss.bars.floor(context.loss.count(fit))
         if needed(lost[least], floor):
             break
         name = words(key_of(now.model.effects[least]))
-        context.say(f"  {name} goes: without it {lost[least]:.1%} of the squared error is lost, {floor:.1%} counts")
+        reason = f"without it {lost[least]:.1%} of the squared error is lost, {floor:.1%} counts"
+        context.say(f"  {name} is removed: {reason if lost[least] > -math.inf else Rejection('impossible').sentence}")
         now = now.without(least)
     return now
 
@@ -113,10 +119,6 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
     return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
 
 
-def _count(context: SearchContext, fit) -> float:
-    return float(readings(fit.data, fit.used)) if isinstance(context.loss, OneStep) else 1.0
-
-
 def search(context: SearchContext) -> Closed:
     """Search for what the declared model lacks: by many steps first; then, where innovations are white, by one step."""
     before, data = context.before, context.data
@@ -135,7 +137,13 @@ def search(context: SearchContext) -> Closed:
         return Closed(before, before, (), tuple(steps))
     outcome = finished(_outcome(before, now, state), data)
     closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps))
-    return apart(closed, data) if white else closed
+    if not white:
+        return closed
+    try:
+        return apart(closed, data)
+    except FitError as error:
+        context.say(f"  equivalent laws could not be compared over the whole length ({error})")
+        return closed
 
 
 def _first(context: SearchContext) -> int:
@@ -161,6 +169,7 @@ def _search(
         searched.add(_names(now))
         more = _forward(context, now, length, steps)
         if _names(more) in searched:  # nothing new, or one law in the place of another and back
+            steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
             if length < longest:
                 length = longest
                 continue
@@ -170,7 +179,8 @@ def _search(
         try:
             now, state = more, extend(context, more, length) if more.found else None
         except FitError as error:
-            context.say(f"  with what was added no sequence can be followed to its end ({error}); it goes again")
+            context.say(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
+            steps[-1] = steps[-1]._replace(accepted=None)
             return now, state
         if _names(now) in searched:
             return now, state
@@ -193,20 +203,23 @@ def close_the_loop(
     data = jax.device_put(data)
     stages: Stages = {}
 
-    def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
-        stages[seen] = (state, used)
-        say(f"epoch {state.epoch}, horizon {seen * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+    def watch(seen: Stages, state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
+        seen[rows] = (state, used)
+        say(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
-    def fitted(part: Dataset) -> Identified:
-        stages.clear()
-        return identify(rig, part, key=key, watch=watch)
+    def identified(part: Dataset) -> Identified:
+        seen: Stages = {}
+        outcome = identify(rig, part, key=key, watch=functools.partial(watch, seen))
+        stages.clear()  # a fit that fails leaves the stages of the one before
+        stages.update(seen)
+        return outcome
 
     if len(data.t) < 2:
         say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
-    before = fitted(data)
+    before = identified(data)
     if white_readings(data):
         return search(SearchContext(before, stages, data, MultiStep(), effort, say))
-    before, data, touches, pieces = disturbance_free(fitted, before, data)
+    before, data, touches, pieces = disturbance_free(identified, before, data)
     if touches:
         say(f"{len(touches)} external disturbances: their rows are left out")
     closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces))

@@ -81,7 +81,7 @@ def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: Abst
 
 
 def _covariance(now: Hypothesis, hessian, place: int) -> np.ndarray:
-    """Of the parameters of an effect, all else integrated out."""
+    """Covariance of the parameters of an effect, all else integrated out."""
     prior, here = now.m_step.prior, blocks(now.model, now.m_step)[place]
     cov = np.linalg.inv(np.asarray(hessian))
     cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)[here]
@@ -89,7 +89,7 @@ def _covariance(now: Hypothesis, hessian, place: int) -> np.ndarray:
 
 
 def certainty(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
-    """How many standard deviations the strengths of the effect at `place` are from none, jointly [Wald 1943].
+    """Wald statistic of the strengths of the effect at `place`, jointly, in standard deviations [Wald 1943].
 
     Half its square is the log-likelihood that would be lost without the effect, to second order.
     """
@@ -102,5 +102,5 @@ def certainty(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -
 
 def _amplitude(now: Hypothesis, hessian, place: int = -1) -> float:
     """Standard deviations of the reported amplitude of an effect from zero."""
-    told = estimates(now.model.effects[place], _covariance(now, hessian, place), now.model.system).get("amplitude")
-    return told.value / told.std if told and told.std > 0 else np.inf
+    reported = estimates(now.model.effects[place], _covariance(now, hessian, place), now.model.system).get("amplitude")
+    return reported.value / reported.std if reported and reported.std > 0 else np.inf

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 CHANCE = 2.0
-"""Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three looks."""
+"""Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three rounds."""
 NAMED = 0.6
 """Prior odds of a free function to a named law, for every signal of the function, and of any law to the remainder of an
 accepted one: shares are multiplied by them, and bars divided."""
@@ -39,7 +39,7 @@ candidates removed .02 and .07 of the multi-step error."""
 
 
 class Bars(NamedTuple):
-    """What a share must reach, whatever chance can do."""
+    """Smallest share and smallest gain that count, whatever chance can do."""
 
     share: float
     """Smallest share that counts: what a model lacks for another reason looks like some law up to here."""
@@ -61,11 +61,11 @@ class Share(NamedTuple):
     """Part of the squared error that a candidate removes."""
 
     inside: float
-    """Of all of it, adjusted for the number of directions [Wherry 1931]."""
+    """Share of the whole squared error, adjusted for the number of directions [Wherry 1931]."""
     left_out: float
-    """Of the parts that its strengths were not fitted to: of motions, or of moments, whichever is less."""
+    """Smaller of the shares on motions and on moments that its strengths were not fitted to."""
     folds: tuple[float, ...]
-    """Of each part of motions; where it rises, relative to the error of an average part, if that is more."""
+    """Share on each part of motions; where the error rises, relative to an average part, if that holds more."""
 
     @property
     def least(self) -> float:

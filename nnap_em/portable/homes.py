@@ -225,7 +225,7 @@ REASONS: Mapping[str, str] = {
     "sensor_bias": "a sensor has no offset",
     "sensor_scale": "a sensor has no scale",
 }
-"""Why the others have no place, by name."""
+"""Reasons against a place for each other law, by name."""
 
 
 def file_springs(sheet: Sheet) -> Sheet:

@@ -1002,8 +1002,8 @@ MUTANTS = (
     Mutant(
         "one-step errors decide where innovations are not white",
         "diagnose/search.py",
-        "white = white_readings(data) and white_innovations(",
-        "white = white_readings(data) or white_innovations(",
+        "white = white_innovations(_outcome(context.before, now, state), context.data)",
+        "white = True",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
     Mutant(

@@ -255,8 +255,7 @@ def _rounds(monkeypatch, *laws):
 def test_laws_are_added_until_none_is_accepted(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.4, "air_drag": 0.3})
     _rounds(monkeypatch, _law("motor_gain", 0.5), _law("air_drag", 0.5))
-    steps: list[Step] = []
-    now, state = search._search(_context(), BARE, None, 9, steps)
+    now, state, steps = search._search(_context(), BARE, None, [9])
     assert _names(now.model) == ["motor_gain", "air_drag"] and state is not None
     assert [step.accepted is not None for step in steps] == [True, True, False]
     found = now.found[0]
@@ -267,8 +266,7 @@ def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
     """Accepted in every round, and needless in every backward pass."""
     _pretend(monkeypatch, {"motor_gain": 0.01})
     _rounds(monkeypatch, _law("motor_gain", 0.5), None, _law("motor_gain", 0.5), None)
-    steps: list[Step] = []
-    now, state = search._search(_context(), BARE, None, 9, steps)
+    now, state, steps = search._search(_context(), BARE, None, [9])
     assert now.found == () and state is None and len(steps) == 2
 
 
@@ -294,16 +292,29 @@ def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_ther
     assert search._first(_context(stages={4: (state, few), 9: (state, few)})) == 4
 
 
+def test_one_step_errors_are_searched_where_the_fit_was_short():
+    """The two shortest horizons of at most 150 rows, and one in the middle; the whole comes of itself."""
+    whole = DATA._replace(**{name: np.zeros((1, 500, *np.shape(getattr(DATA, name))[2:])) for name in ("t", "u", "y")})
+    context = _context(stages=dict.fromkeys([60, 96, 154, 246, 393, 500]))
+    context = context._replace(data=whole._replace(valid=np.ones((1, 500), bool)))
+    assert search._ladder(context) == [60, 96, 246]
+
+
 @pytest.mark.parametrize(
     ("white", "innovations", "losses"),
-    [(True, True, [MultiStep, OneStep]), (True, False, [MultiStep]), (False, True, [MultiStep])],
+    [(True, True, [OneStep]), (True, False, [OneStep, MultiStep]), (False, True, [MultiStep])],
 )
 def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, white, innovations, losses):
     ran, cut = [], []
 
-    def run(context, now, state, length, steps):
+    def run(context, now, state, lengths):
         ran.append(type(context.loss))
-        return now, state
+        one_step = isinstance(context.loss, OneStep)
+        return (_with("motor_gain"), _emstate(MODEL, 1.0), []) if one_step else (now, state, [])
+
+    def white_innovations(fitted, data):
+        assert fitted.m_step is not RULE  # of the outcome: what is missing colours those of the declared model
+        return innovations
 
     def disturbance_free(fit, fitted, data):
         cut.append(data)
@@ -313,10 +324,12 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "_search", run)
     monkeypatch.setattr(search, "quantised", lambda context, now: (now, None))
     monkeypatch.setattr(search, "white_readings", lambda data: white)
-    monkeypatch.setattr(search, "white_innovations", lambda fitted, data: innovations)
+    monkeypatch.setattr(search, "white_innovations", white_innovations)
+    monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
+    monkeypatch.setattr(search, "apart", lambda closed, data: closed)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     found = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
-    assert ran == losses and found.after is found.before
+    assert ran == losses and len(found.found) == (white and innovations)
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
 

@@ -19,7 +19,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
-from .context import EFFORT, Effort, Say, SearchContext, Stages, extend, smooth
+from .context import EFFORT, SHORT, Effort, Say, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, replaced, rest_of, words
 from .losses import AbstractLoss, MultiStep, OneStep
@@ -120,24 +120,21 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
 
 
 def search(context: SearchContext) -> Closed:
-    """Search for what the declared model lacks: by many steps first; then, where innovations are white, by one step."""
+    """Search for what the declared model lacks.
+
+    Where readings carry white noise, one-step errors are searched first, and the outcome is kept if its innovations are
+    white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors decide,
+    from the declared model on.
+    """
     before, data = context.before, context.data
-    steps: list[Step] = []
-    try:  # steps in a reading spoil the noise that all else leans on
-        now, state = quantised(context, context.declared)
-    except FitError as error:
-        context.say(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
-        now, state = context.declared, None
-    length = context.longest if state else _first(context)
-    now, state = _search(context, now, state, length, steps)
-    white = white_readings(data) and white_innovations(_outcome(before, now, state), data)
-    if white:
-        now, state = _search(context._replace(loss=OneStep()), now, state, context.longest, steps)
+    begun = _quantised(context)
+    found = _by_one_step(context, *begun) if white_readings(data) else None
+    now, state, steps = found or _search(context, *begun, [_first(context)])
     if not now.found or state is None:
         return Closed(before, before, (), tuple(steps))
     outcome = finished(_outcome(before, now, state), data)
     closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps))
-    if not white:
+    if found is None:
         return closed
     try:
         return apart(closed, data)
@@ -146,8 +143,42 @@ def search(context: SearchContext) -> Closed:
         return closed
 
 
+def _by_one_step(
+    context: SearchContext, now: Hypothesis, state: EMState | None
+) -> tuple[Hypothesis, EMState | None, list[Step]] | None:
+    """Outcome of a search by one-step errors; None where its innovations are not white, so that it proves nothing."""
+    now, state, steps = _search(context._replace(loss=OneStep()), now, state, _ladder(context))
+    white = white_innovations(_outcome(context.before, now, state), context.data)
+    if not white:
+        context.say(
+            "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
+        )
+    return (now, state, steps) if white else None
+
+
+def _quantised(context: SearchContext) -> tuple[Hypothesis, EMState | None]:
+    """The declared model with steps of readings as noise, which spoil the noise that all else leans on."""
+    try:
+        return quantised(context, context.declared)
+    except FitError as error:
+        context.say(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
+        return context.declared, None
+
+
+def _ladder(context: SearchContext) -> list[int]:
+    """Rows of the rounds by one-step errors: the two shortest horizons of the fit, and one in the middle.
+
+    Over the whole length a fit takes a strong effect for noise of the process, above all where a joint is hidden: on a
+    simulated arm a spring explains .17 of the one-step error over .6 s, .21 over 1 s, and nothing over 5 s.
+    """
+    longest = context.longest
+    short = [length for length in sorted(context.stages) if length < longest]
+    middle = [length for length in short if longest / 3 < length < 0.7 * longest]
+    return list(dict.fromkeys([length for length in short if length <= SHORT][:2] + middle[:1]))
+
+
 def _first(context: SearchContext) -> int:
-    """Rows of the first round: all, unless most sequences diverge before their end; then as many as most keep."""
+    """Rows of the first round by multi-step errors: all, or if most sequences diverge before, as many as most keep."""
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
     most = [length for length, share in followed.items() if share >= 0.5]
     return max(most, default=min(followed, default=context.longest))
@@ -158,33 +189,38 @@ def _outcome(before: Identified, now: Hypothesis, state: EMState | None) -> Iden
 
 
 def _search(
-    context: SearchContext, now: Hypothesis, state: EMState | None, length: int, steps: list[Step]
-) -> tuple[Hypothesis, EMState | None]:
-    """Forward selection and backward elimination by one loss, until neither changes anything."""
+    context: SearchContext, now: Hypothesis, state: EMState | None, lengths: list[int]
+) -> tuple[Hypothesis, EMState | None, list[Step]]:
+    """Forward selection and backward elimination by one loss, until neither changes anything.
+
+    The rounds look at `lengths` rows in turn, then, and after the first law at once, at all.
+    """
     searched: set[frozenset] = set()
+    steps: list[Step] = []
     longest = context.longest
+    ahead = [longest] if state else [*(length for length in lengths if length < longest), longest]
     while True:
+        length = ahead.pop(0)
         best = state.best if state else context.stages[length][0].best if length < longest else context.before.model
         now = now.refitted(cast(StateSpaceModel, best))
-        searched.add(_names(now))
         more = _forward(context, now, length, steps)
+        if more.found is now.found and ahead:
+            continue
+        searched.add(_names(now))
         if _names(more) in searched:  # nothing new, or one law in the place of another and back
             steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
-            if length < longest:
-                length = longest
-                continue
             more = _backward(context, now)
             if more.found is now.found:
-                return now, state
+                return now, state, steps
         try:
             now, state = more, extend(context, more, length) if more.found else None
         except FitError as error:
             context.say(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
-            return now, state
+            return now, state, steps
         if _names(now) in searched:
-            return now, state
-        length = longest
+            return now, state, steps
+        ahead = [longest]
 
 
 def close_the_loop(

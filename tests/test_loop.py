@@ -51,7 +51,7 @@ def test_two_effects_of_a_slide_through_the_command(tmp_path):
     report = json.loads((found / "report.json").read_text())
     _named_and_sized(report)
     _exact_to_the_interface(report, (found / "report.html").read_text())
-    _only_the_whole_is_looked_at(report["looks"])
+    _ends_over_the_whole_length(report["looks"])
     for side in ("before", "after"):
         _errors_of_predict(tmp_path, report, side)
 
@@ -67,9 +67,10 @@ def _named_and_sized(report):
     assert report["error"]["after"]["x"][3] < 0.3 * report["error"]["before"]["x"][3]
 
 
-def _only_the_whole_is_looked_at(looks):
-    """Most sequences are followed to their end, so that shorter horizons would only tell less."""
-    assert [look["horizon_s"] for look in looks] == pytest.approx([2.51] * len(looks))
+def _ends_over_the_whole_length(looks):
+    """The first law may be found at a short horizon; every round after it is over the whole length."""
+    assert len(looks) >= 2
+    assert [look["horizon_s"] for look in looks[1:]] == pytest.approx([2.51] * len(looks[1:]))
 
 
 def _exact_to_the_interface(report, page):

@@ -30,7 +30,7 @@ class GaussianSmoother(AbstractSmoother):
     @property
     def bytes_per_row(self) -> int:
         """Memory [B] that a row takes."""
-        return 8192  # measured for four states in 64 bits (docs/throughput.md)
+        return 8192  # measured for four states in 64 bits (docs/results/throughput.md)
 
     def tolerant(self) -> "GaussianSmoother":
         """With looser first passes."""

@@ -30,8 +30,8 @@ class ParticleSmoother(AbstractSmoother):
 
     @property
     def bytes_per_row(self) -> int:
-        """Memory [B] that a row takes."""
-        return self.guide.bytes_per_row + 64 * self.num_particles + 128 * self.num_paths  # measured: docs/results/throughput.md
+        """Memory [B] that a row takes, measured for docs/results/throughput.md."""
+        return self.guide.bytes_per_row + 64 * self.num_particles + 128 * self.num_paths
 
     def tolerant(self) -> "ParticleSmoother":
         """With a guide whose first passes are looser."""

@@ -36,7 +36,7 @@ def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Tu
 
 
 def carried_by(machine: Machine, layout: Layout, values: Mapping[str, Scalar]) -> list[Inertia]:
-    """What the frame of every joint carries; no number where a body is not physical, so that no fit goes there."""
+    """Body that the frame of every joint carries; no number where a body is not physical, so that no fit goes there."""
     found = [NOTHING] * len(layout.frames)
     for body, mount in zip(machine.bodies, layout.mounts, strict=True):
         if mount.joint < 0:
@@ -54,7 +54,8 @@ def mounted(mass: Scalar, centre: Three, own: Turn, mount: Mount) -> Inertia:
 
 
 def physical(mass: Scalar, own: Turn) -> Any:
-    """Whether some distribution of mass has this inertia: half its trace less itself is positive, and so is the mass.
+    """True where some distribution of mass has this inertia: half its trace less itself is positive, and so is the
+    mass.
 
     [Wensing, Kim & Slotine 2018, IEEE RA-L 3(1), eq. 12: the pseudo-inertia]  By leading minors, with a margin.
     """
@@ -86,7 +87,7 @@ def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
 
 
 def _told(body: Numbers) -> list[Scalar]:
-    """In the order of `names`."""
+    """Numbers in the order of `names`."""
     return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 
@@ -105,7 +106,7 @@ def with_load(tree: Any, place: int, at: Three, mass: Scalar) -> Any:
 
 
 def varied(machine: Machine) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:
-    """How a tree may differ: a load on every outermost body, at its first site, or else at its centre of mass."""
+    """Variations of a tree: a load on every outermost body, at its first site, or else at its centre of mass."""
     inner = {body.parent for body in machine.bodies}
     found = {}
     for place, body in enumerate(machine.bodies):

@@ -13,6 +13,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
+from nnap_em.portable.homes import HOMES, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -63,13 +64,20 @@ def commands() -> str:
 
 
 def effects() -> str:
-    """A row for each class of the catalogue: the law, its parameters, and how to confirm it on the machine."""
-    rows = ["| name | law | parameters | to be sure |", "| --- | --- | --- | --- |"]
+    """A row for each class of the catalogue: law, parameters, confirmation on the machine, place in an MJCF file."""
+    rows = ["| name | law | parameters | to be sure | in an MJCF file |", "| --- | --- | --- | --- | --- |"]
     for name, kind in catalogue.items():
         law = kind.meaning().rstrip(".").replace("|", BAR)
         units = ", ".join(f"`{parameter}` [{unit}]" for parameter, unit in kind.units.items())
-        rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} |")
+        rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} | {_place(name)} |")
     return "\n".join(rows)
+
+
+def _place(name: str) -> str:
+    """Place of a law in MuJoCo, or the reason why it has none."""
+    if name in HOMES:
+        return (HOMES[name].__doc__ or "").partition("\n")[0]
+    return f"None: {REASONS.get(name, 'no element of MuJoCo has this form')}."
 
 
 def folders() -> str:

@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import itertools
 import os
 import re
 from html import unescape
@@ -27,7 +28,8 @@ _ACCENTS = set("¨˙¯~^")
 
 def on_page_markdown(markdown: str, **_) -> str:
     """Put what is made from the code in the place of its marker."""
-    for marker, made in (("<!-- commands -->", commands), ("<!-- effects -->", effects), ("<!-- folders -->", folders)):
+    for made in (commands, effects, folders, verdict):
+        marker = f"<!-- {made.__name__} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, made())
     return markdown
@@ -78,6 +80,17 @@ def _place(name: str) -> str:
     if name in HOMES:
         return (HOMES[name].__doc__ or "").partition("\n")[0]
     return f"None: {REASONS.get(name, 'no element of MuJoCo has this form')}."
+
+
+def verdict() -> str:
+    """A row for each number that decides whether an effect enters a model or leaves it."""
+    body = ast.parse((ROOT / "nnap_em/diagnose/verdict.py").read_text()).body
+    rows = ["| number | value | meaning |", "| --- | --- | --- |"]
+    for number, text in itertools.pairwise(body):
+        if isinstance(number, ast.Assign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            value, meaning = ast.unparse(number.value), " ".join(str(text.value.value).split())
+            rows.append(f"| `{ast.unparse(number.targets[0])}` | {value} | {meaning.replace('|', BAR)} |")
+    return "\n".join(rows)
 
 
 def folders() -> str:

@@ -41,6 +41,8 @@ KIND = Kind(
 
 LATER = ("/unsaid", "/m_step/rough")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
+GROWN = ("/moment", "/point")
+"""Fields of effects that files from before they were there do not have: as an effect without them has."""
 
 
 MODEL, AFTER = "model.npz", "after.npz"
@@ -177,7 +179,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            return value if place in LATER else differs(place, "missing in the file")
+            later = place in LATER or ("/effects/" in place and place.endswith(GROWN))
+            return value if later else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":
@@ -191,7 +194,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        if plain(value) != (place in settings):
+        if plain(value) != (place in settings) and not place.endswith(GROWN):
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value
 

@@ -41,8 +41,6 @@ KIND = Kind(
 
 LATER = ("/unsaid", "/m_step/rough")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
-GROWN = ("/moment", "/point")
-"""Fields of effects that files from before they were there do not have: as an effect without them has."""
 
 
 MODEL, AFTER = "model.npz", "after.npz"
@@ -179,7 +177,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            later = place in LATER or ("/effects/" in place and place.endswith(GROWN))
+            later = place in LATER or ("/effects/" in place and value is None)  # a number that effects have had since
             return value if later else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
@@ -194,7 +192,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        if plain(value) != (place in settings) and not place.endswith(GROWN):
+        later = "/effects/" in place and place not in settings  # as the effect has it by default
+        if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value
 

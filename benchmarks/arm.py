@@ -2,6 +2,7 @@
 
     python benchmarks/arm.py [--joints 6] [--seeds 3] [--first 0] [--imu]
     python benchmarks/arm.py --lacks payload --out OUT      # `nnap-em diagnose` on logs of an arm with a payload
+    python benchmarks/arm.py --lacks off_axis --out OUT     # 2.8 kg, its centre .25 m off the axis of joint 6
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
 of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
@@ -43,6 +44,8 @@ NOISE = 1e-3
 """Of the readings [rad]."""
 IMU = {"gyro": 0.005, "accelerometer": 0.05}
 """Of the sensors at the hand [rad/s, m/s^2]."""
+HAND = (0.0, 0.0, 0.05)
+"""In the frame of the last body [m]."""
 BANDWIDTH = 12.0
 """Of the controller [rad/s]."""
 
@@ -73,13 +76,20 @@ class Lack(NamedTuple):
 
     payload: float = 0.0
     """At the hand [kg]."""
+    away: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of the payload from the hand [m]; where it is not 0, the controller is one of computed torque."""
     late: int = 0
     """Steps of the plant by which the input of joint 3 is late."""
     spring: float = 0.0
     """At joint 5 [N m/rad]."""
 
 
-LACKS = {"payload": Lack(payload=0.4), "late": Lack(late=2 * FINE), "spring": Lack(spring=0.8)}
+LACKS = {
+    "payload": Lack(payload=0.4),
+    "off_axis": Lack(payload=2.8, away=(0.2, -0.15, 0.06)),
+    "late": Lack(late=2 * FINE),
+    "spring": Lack(spring=0.8),
+}
 
 
 def machine(joints: int, *, imu: bool) -> str:
@@ -112,10 +122,13 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
     lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
     model = plant(text)
     if lack.payload:
-        load = f'<body pos="0 0 0.05"><inertial pos="0 0 0" mass="{lack.payload}" diaginertia="1e-6 1e-6 1e-6"/></body>'
+        place = " ".join(f"{x:.6g}" for x in np.add(HAND, lack.away))
+        load = f'<body pos="{place}"><inertial pos="0 0 0" mass="{lack.payload}" diaginertia="1e-6 1e-6 1e-6"/></body>'
         model_true = plant(text.replace('<site name="hand"', load + '<site name="hand"'))
     else:
         model_true = model
+    if any(lack.away):
+        model = model_true  # the controller knows the load, as on a robot that is told its payload
     inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
     t = DT * np.arange(ROWS)
     u, x = np.zeros((SEQUENCES, ROWS, dof)), np.zeros((SEQUENCES, ROWS, 2 * dof))
@@ -133,7 +146,8 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
             known.qpos[:], known.qvel[:] = data.qpos, data.qvel
             mujoco.mj_forward(model, known)
             miss, slip = goal[k] - data.qpos, rate[k] - data.qvel
-            u[s, k] = known.qfrc_bias + inertia * (BANDWIDTH**2 * miss + 1.4 * BANDWIDTH * slip)
+            wish = BANDWIDTH**2 * miss + 1.4 * BANDWIDTH * slip
+            u[s, k] = known.qfrc_bias + (_mass(model, known) @ wish if any(lack.away) else inertia * wish)
             data.ctrl[:], data.qfrc_applied[:] = u[s, k], law(data.qvel)
             mujoco.mj_forward(model_true, data)
             felt[s, k] = data.sensordata
@@ -155,10 +169,16 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
 
 def _inertia(model: mujoco.MjModel) -> np.ndarray:
     """Of every joint at zero [kg m^2]."""
-    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    return np.diag(_mass(model, data))
+
+
+def _mass(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Mass matrix at the state of `data`."""
+    mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    return np.diag(mass)
+    return mass
 
 
 def declared(folder: Path, joints: int, *, imu: bool = False) -> Rig:

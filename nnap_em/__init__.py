@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from .design.experiment import Design, design_experiment
     from .design.limits import DesignError
     from .diagnose.compare import CompareError, Comparison, compare
-    from .diagnose.findings import findings
+    from .diagnose.findings import Finding, findings
     from .diagnose.outcome import Closed
     from .diagnose.search import close_the_loop
-    from .em.check import Finding, check
+    from .em.check import CheckResult, check
     from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
     from .em.predict import Prediction, horizon_errors, predict, smooth
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AbstractSystem",
+    "CheckResult",
     "Closed",
     "CompareError",
     "Comparison",
@@ -99,13 +100,13 @@ __all__ = [
     "write_urdf",
 ]
 _homes = {
-    "em.check": ("Finding", "check"),
+    "em.check": ("CheckResult", "check"),
     "data.dataset": ("DataError", "Dataset", "pad"),
     "data.logs": ("DataWarning", "Logs", "read_logs"),
     "design.experiment": ("Design", "design_experiment"),
     "design.limits": ("DesignError",),
     "diagnose.compare": ("CompareError", "Comparison", "compare"),
-    "diagnose.findings": ("findings",),
+    "diagnose.findings": ("Finding", "findings"),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),
     "portable.c99": ("write_c",),

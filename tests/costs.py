@@ -29,6 +29,8 @@ SECONDS = {
     "test_effects.py": 32,
     "test_import.py": 31,
     "test_shapes.py": 30,
+    "test_payload.py": 30,
+    "test_load_friction.py": 60,
     "test_blackbox.py": 29,
     "test_traced.py": 27,
     "test_predict.py": 25,

@@ -813,8 +813,8 @@ MUTANTS = (
     Mutant(
         "a load in the middle",
         "systems/bodies.py",
-        "moved = scaled(mass / total, away)",
-        "moved = scaled(0.0, away)",
+        "add(scaled(mass, spot.point), moment)",
+        "moment",
         f"{MACHINES}payload_is_a_point_mass_at_the_site",
     ),
     Mutant(

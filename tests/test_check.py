@@ -14,7 +14,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
-from nnap_em.em.check import Finding, check, gramian, torques
+from nnap_em.em.check import CheckResult, check, gramian, torques
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems import specs
 from nnap_em.systems.acrobot import table_i
@@ -95,7 +95,7 @@ def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
     assert np.abs(bias[0, 2]) < 1e-9
     assert np.max(np.abs(bias[:, 2])) == pytest.approx(2 * 9.81 * 0.4, rel=1e-3)
 
-    def torque(factor: float) -> Finding:
+    def torque(factor: float) -> CheckResult:
         data = Dataset(t[None], factor * bias[None, :, 2:3], y[None], np.ones((1, ROWS), bool))
         return next(f for f in torques(rig, system, data, measure_scales(rig, system, data)) if f.subject == "torque")
 

@@ -238,6 +238,51 @@ def test_payload_is_a_point_mass_at_the_site(tmp_path):
         np.testing.assert_allclose(loaded.bias(q, v), data.qfrc_bias, atol=1e-9)
 
 
+@pytest.mark.parametrize("place", [*OWN, 3, 6], ids=lambda p: p.name if isinstance(p, Path) else f"arm{p}")
+def test_a_payload_of_any_mass_and_centre_moves_the_machine_as_in_mujoco(place, tmp_path):
+    """A body of .7 kg with its centre off the axis, added by MuJoCo's own model editing to the body of the joint."""
+    path = place if isinstance(place, Path) else tmp_path / "arm.xml"
+    if not isinstance(place, Path):
+        path.write_text(arm(place))
+    system, mass, away = tree(path), 0.7, np.array([0.21, -0.12, 0.08])
+    for joint, spot in system.spots.items():
+        effect = catalogue["payload"](jnp.asarray(mass), jnp.asarray(mass * away), spot.point, joint=joint)
+        centre = np.asarray(spot.point) + away
+        np.testing.assert_allclose([effect.values()[f"centre_{axis}"] for axis in "xyz"], centre, rtol=1e-12)
+        loaded = effect.physics(system, jnp.zeros(()))
+        model = _hung(path, system.machine.bodies[spot.body].name, mass, centre)
+        for data in _states(model):
+            q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+            np.testing.assert_allclose(loaded.mass(q), _full(model, data), atol=1e-10)
+            np.testing.assert_allclose(loaded.bias(q, v), data.qfrc_bias - data.qfrc_spring, atol=1e-10, rtol=1e-12)
+
+
+def _hung(path: Path, body: str, mass: float, centre: np.ndarray) -> mujoco.MjModel:
+    """The machine of a file with a point mass on one of its bodies."""
+    text = re.sub(r"(?s)<visual>.*?</visual>", "", path.read_text()) if path.suffix == ".urdf" else path.read_text()
+    spec = mujoco.MjSpec.from_string(text)
+    more = spec.body(body).add_body(name="load", pos=centre)
+    more.mass, more.ipos, more.inertia, more.explicitinertial = mass, [0, 0, 0], [1e-15] * 3, True
+    return spec.compile()
+
+
+def test_a_load_of_no_mass_is_a_shift_of_the_centre_and_breaks_nothing(tmp_path):
+    (tmp_path / "arm.xml").write_text(arm(3))
+    system, q, v = tree(tmp_path / "arm.xml"), jnp.asarray([0.3, -0.8, 1.1]), jnp.asarray([1.0, 2.0, -3.0])
+
+    def forces(numbers):
+        effect = catalogue["payload"](numbers[0], numbers[1:], system.spots[3].point, joint=3)
+        told = jnp.stack(list(effect.values().values()))
+        return jnp.concatenate([effect.physics(system, jnp.zeros(())).bias(q, v), told])
+
+    still = forces(jnp.zeros(4))
+    np.testing.assert_allclose(still[:3], system.bias(q, v), atol=1e-12)
+    slopes = jax.jacfwd(forces)(jnp.zeros(4))
+    assert bool(jnp.isfinite(slopes).all())
+    moved = forces(1e-6 * jnp.asarray([1.0, 2.0, -1.0, 0.5])) - still
+    np.testing.assert_allclose(moved[:3], 1e-6 * slopes[:3] @ jnp.asarray([1.0, 2.0, -1.0, 0.5]), atol=1e-9)
+
+
 def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_path):
     rig = read_rig(_rig(tmp_path, arm(2), model="[model.uncertain]\nlink2.mass = {std = 0.1}"), specs)
     late = catalogue["input_delay"].of(0.004, joint=2)

@@ -16,6 +16,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.effects import catalogue
 from nnap_em.em.identify import Identified, begin
 from nnap_em.em.predict import smooth
 from nnap_em.em.store import fingerprint, load, read, save
@@ -94,6 +95,23 @@ def _rewrite(path: Path, change) -> None:
         digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes())
     checksum = np.frombuffer(digest.digest(), np.uint8)
     np.savez(path, header=np.frombuffer(text, np.uint8), sha256=checksum, **arrays)
+
+
+def test_a_payload_of_a_file_from_before_it_had_a_centre_is_read(tmp_path):
+    path, rig = tmp_path / "model.npz", RIGS["arm"]
+    law = catalogue["payload"](jnp.asarray(0.04), joint=2)
+    save(path, begin(rig, _data(rig), key=jax.random.key(5), effects=(law,)))
+
+    def older(header, arrays):
+        for part in (header["leaves"], header["settings"]):
+            for place in [place for place in part if place.endswith(("0/moment", "0/point"))]:
+                del part[place]
+        for name in ("moment", "point"):
+            del header["effects"][0]["parts"][name]
+
+    _rewrite(path, older)
+    (effect,) = load(path).model.effects
+    assert float(effect.values()["mass"]) == 0.04 and effect.moment is None
 
 
 @pytest.mark.parametrize("name", RIGS)

@@ -58,12 +58,11 @@ def refit(
     used: Bool[np.ndarray, " seq"],
     *,
     passes: int = 5,
-    noise: bool = True,
 ) -> Trial:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
 
-    The process and reading noise stay as they are in the first passes, while the path finds its place: what they would
-    then be taught is the way there, and they are slow to forget. Without `noise` they stay in all.
+    The process and reading noise stay as they are in the first passes, while the path finds its place: they would fit
+    the way there, and their estimates decay slowly.
     """
     still = eqx.tree_at(lambda r: r.stride, m_step, jnp.zeros_like(m_step.stride))
     core = m_step.core(model)
@@ -76,7 +75,7 @@ def refit(
 
     best, stride, here, goal = None, 1.0, core, core
     for count in range(passes):
-        rule = m_step if noise and count >= HELD else still
+        rule = m_step if count >= HELD else still
         proposal, smoothed, loglik, hessian = program(rule, core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:

@@ -3,9 +3,13 @@
 from functools import partial
 from typing import ClassVar
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from .base import Around, Candidate, JointEffect, Scalar, known, one
+from .base import Around, Candidate, JointEffect, Scalar, a, known, one
 
 
 def varieties(around: Around, name: str) -> list[tuple[int, float]]:
@@ -31,11 +35,46 @@ class Variation(JointEffect):
 
 
 class Payload(Variation):
-    """A point mass at the tip."""
+    """A point mass: at the tip or, on a body of a machine file, at its centre, which is estimated with it.
+
+    In place of the centre c its first moment mass (c - point) about a known point is fitted: forces are linear in it.
+    """
 
     name: ClassVar[str] = "payload"
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
-    units: ClassVar[dict[str, str]] = {"mass": "kg"}
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "centre_x": "m", "centre_y": "m", "centre_z": "m"}
+    moment: Float[Array, "3"] | None = None
+    """First moment about the point [kg m]; None: the mass is at the tip."""
+    point: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
+    """In the frame of the body [m]."""
+
+    @classmethod
+    def candidates(cls, around):
+        spots = around.system.spots
+        anywhere = [_anywhere(cls, joint, spot) for joint, spot in spots.items()]
+        return [c for c in super().candidates(around) if c.start.joint not in spots] + anywhere
+
+    def values(self):
+        if self.moment is None:
+            return {"mass": self.amount}
+        away = self.moment / jnp.where(self.amount == 0, 1.0, self.amount)
+        return {"mass": self.amount} | {f"centre_{axis}": self.point[i] + away[i] for i, axis in enumerate("xyz")}
+
+    def physics(self, system, time):
+        if self.moment is None:
+            return system.vary(self.name, self.joint, self.amount)
+        return system.loaded(self.joint, self.amount, self.moment)
+
+
+def _anywhere(kind: type[Payload], joint: int, spot) -> Candidate:
+    """A load of unknown mass and centre: four strengths."""
+
+    def make(mass: float, moment: np.ndarray) -> Payload:
+        return kind(a(mass), jnp.asarray(moment, float), spot.point, joint=joint)
+
+    size = spot.mass * spot.length
+    probes = (make(0.05 * spot.mass, np.zeros(3)), *(make(0.0, 0.05 * size * row) for row in np.eye(3)))
+    return Candidate(make(0.0, np.zeros(3)), probes, make(spot.mass, np.full(3, size)))
 
 
 class LinkInertia(Variation):

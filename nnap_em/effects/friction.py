@@ -1,6 +1,7 @@
 """Friction that changes: with the position, with time, with the load."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -8,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import Candidate, JointEffect, Scalar, a, input_of, known, one, pair
+from .base import Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
 
 
 class PositionDependentFriction(JointEffect):
@@ -73,16 +74,42 @@ class FrictionDrift(JointEffect):
 
 
 class LoadFriction(JointEffect):
-    """Coulomb friction -mu |u| sign(w) that grows with the torque u through the gear."""
+    """Friction of a gear that grows with the torques through it: that of the motor u, and that of the load c.
+
+    -(|mu u + mu_load c| + (|mu_stribeck u + mu_load_stribeck c| + square) e^-(w / stribeck_velocity)^2) sign(w),
+    where c is gravity and what rotation adds. [Duclusaud, Passault, Padois & Ly 2025, "Extended Friction Models for the
+    Physics Simulation of Servo Actuators", M3 to M6]  The order from plain to rich is
+
+        mu |u|, or mu |u + c| (M3)  <  its Stribeck part (M4), or both sides apart  <  both (M5)  <  the square (M6).
+
+    Each form holds those before it, and is tried once one of them is found.  M1 and M2 are static maps of velocity: the
+    learned friction holds them.  The exponent 2 of the Stribeck part is fixed; they fit it.
+    """
 
     name: ClassVar[str] = "load_friction"
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Lift and lower a weight slowly: the torques differ by twice the friction, at each weight."
-    units: ClassVar[dict[str, str]] = {"mu": "-"}
+    units: ClassVar[dict[str, str]] = {
+        **dict.fromkeys(("mu", "mu_load", "mu_stribeck", "mu_load_stribeck"), "-"),
+        "stribeck_velocity": "rad/s",
+        **dict.fromkeys(("square_motor", "square_load"), "1/(N m)"),
+    }
     above_zero: ClassVar[str] = "mu"
     mu: Scalar
     knee: Scalar = known()
     """Rate over which the sign is smoothed [rad/s]."""
+    load: Scalar | None = None
+    """Share of the load's torque; None: that of the motor's or, unless `whole`, none."""
+    stribeck: Scalar | None = None
+    load_stribeck: Scalar | None = None
+    log_velocity: Scalar | None = None
+    """[log rad/s]"""
+    square_motor: Scalar | None = None
+    """Of the motor's torque where the load drives [1/(N m)]."""
+    square_load: Scalar | None = None
+    """Of the load's torque where the motor drives [1/(N m)]."""
+    whole: bool = eqx.field(static=True, default=False, kw_only=True)
+    """True where motor and load count alike while no number of their own says otherwise."""
     names: tuple[str, str] = eqx.field(static=True, kw_only=True)
     """Of the input and of the rate."""
 
@@ -91,8 +118,49 @@ class LoadFriction(JointEffect):
         out = []
         for j, _ in around.driven:
             knee, names = a(0.02 * float(around.speed[j - 1])), (around.column(j), around.system.rates[j - 1])
-            out.append(one(partial(cls, knee=knee, names=names, joint=j), 0.0, 0.05, 0.5))
+            for whole in (False, True):
+                make = partial(cls, knee=knee, whole=whole, names=names, joint=j)
+                out.append(one(make, 0.0, 0.05, 0.5))
         return out
+
+    def richer(self, around):
+        apart, falls = self.load is not None, self.stribeck is not None
+        if not falls:
+            both = [self._with_stribeck(share * float(around.speed[self.joint - 1])) for share in (0.05, 0.15, 0.4)]
+            return [_grown(self, form) for form in both] + ([] if apart else [_grown(self, self._with_load())])
+        if not apart:
+            return [_grown(self, self._with_load())]
+        if self.square_load is not None:
+            return []
+        squared = replace(self, square_motor=a(0.0), square_load=a(0.0))
+        return [_grown(self, squared, 1 / float(around.torque[self.joint - 1]))]
+
+    def _with_stribeck(self, velocity: float) -> "LoadFriction":
+        more = replace(self, stribeck=a(0.0), log_velocity=a(math.log(velocity)))
+        return more if self.load is None else replace(more, load_stribeck=a(0.0))
+
+    def _with_load(self) -> "LoadFriction":
+        share = 1.0 if self.whole else 0.0
+        apart = replace(self, load=share * self.mu)
+        return apart if self.stribeck is None else replace(apart, load_stribeck=share * self.stribeck)
+
+    def values(self):
+        mu, load, stribeck, load_stribeck = self._shares()
+        told = {"mu": mu, "mu_load": load, "mu_stribeck": stribeck, "mu_load_stribeck": load_stribeck}
+        if self.log_velocity is not None:
+            told["stribeck_velocity"] = jnp.exp(self.log_velocity)
+        told |= {"square_motor": self.square_motor, "square_load": self.square_load}
+        return {name: value for name, value in told.items() if value is not None}
+
+    def _shares(self) -> tuple[Scalar | None, ...]:
+        """Of motor and load, steady and at rest; None: no such number."""
+        shares: list[Scalar | None] = []
+        for own, its in ((self.mu, self.load), (self.stribeck, self.load_stribeck)):
+            shares += [own, own if its is None and self.whole else its]
+        return tuple(shares)
+
+    def possible(self):
+        return float(self.mu) + (0.0 if self.load is None else float(self.load)) > 0
 
     def inputs_named(self):
         return self.names
@@ -100,5 +168,39 @@ class LoadFriction(JointEffect):
     def signals(self, system):
         return input_of(self.joint), system.rates[self.joint - 1]
 
+    def level(self, motor: Scalar, load: Scalar, rate: Scalar) -> Scalar:
+        """Size of the friction at the torques of motor and load [N m] and at a rate [rad/s]."""
+        total = _through(motor, load, self.mu, self.load, whole=self.whole)
+        if self.stribeck is None or self.log_velocity is None:
+            return total
+        more = _through(motor, load, self.stribeck, self.load_stribeck, whole=self.whole)
+        if self.square_motor is not None and self.square_load is not None:
+            driving = jnp.where(
+                jnp.abs(motor) > jnp.abs(load), self.square_load * load**2, self.square_motor * motor**2
+            )
+            more = more + jnp.where(motor * load > 0, driving, 0.0)
+        return total + more * jnp.exp(-((rate * jnp.exp(-self.log_velocity)) ** 2))
+
     def force(self, scene, memory):
-        return self.at(scene, -self.mu * jnp.abs(self.own(scene.drive)) * jnp.tanh(self.own(scene.v) / self.knee))
+        motor, rate = self.own(scene.drive), self.own(scene.v)
+        meets = self.whole or self.load is not None
+        load = self.own(scene.system.bias(scene.q, scene.v)) if meets else jnp.zeros_like(motor)
+        return self.at(scene, -self.level(motor, load, rate) * jnp.tanh(rate / self.knee))
+
+
+def _through(motor: Scalar, load: Scalar, share: Scalar, load_share: Scalar | None, *, whole: bool) -> Scalar:
+    """Friction of a share of the torques through a gear [N m]; `load` is what the motor holds up."""
+    if load_share is not None:
+        return jnp.abs(share * motor + load_share * load)
+    return share * jnp.abs(motor + load if whole else motor)
+
+
+def _grown(old: LoadFriction, start: LoadFriction, size: float = 1.0) -> Candidate:
+    """A form with some numbers more, each of them a strength but the Stribeck velocity."""
+    new = [name for name in fields(start) if getattr(old, name) is None and name != "log_velocity"]
+    numbers = {name: getattr(start, name) for name in fields(start)}
+    probes = tuple(replace(start, **{name: numbers[name] + 0.05 * size}) for name in new)
+    wide = {name: a(0.5 * (size if name.startswith("square") else 1.0)) for name in numbers}
+    if start.log_velocity is not None:
+        wide["log_velocity"] = a(0.7)
+    return Candidate(start, probes, replace(start, **wide))

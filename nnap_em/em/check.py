@@ -31,8 +31,8 @@ POSES = 256
 _WIDTH = 1.0  # s, of the readings that must determine the state
 
 
-class Finding(NamedTuple):
-    """The answer to one question, in plain words."""
+class CheckResult(NamedTuple):
+    """Result of one check of a data set, in plain words."""
 
     mark: str
     """`ok`, `look` (it may do, but look at it) or `bad` (a fit would be in vain)."""
@@ -52,8 +52,8 @@ class Along(NamedTuple):
     """Jacobian of the time derivative of the state [1/s]."""
 
 
-def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[Finding]:
-    """Every finding on a data set, or what is missing where there is too little of it; nothing is fitted."""
+def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[CheckResult]:
+    """Results of all checks of a data set, or what is missing where there is too little of it; nothing is fitted."""
     data = Dataset(*(np.asarray(part) for part in train.data))
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
     if amount[0].mark == BAD:
@@ -61,7 +61,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     try:
         problem = begin(rig, data, key=key)
     except RigError:
-        return [Finding(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
+        return [CheckResult(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
@@ -96,7 +96,7 @@ def _mark(look: object, bad: object = False) -> str:
     return BAD if bad else LOOK if look else OK
 
 
-def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[Finding]:
+def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
     rows = data.valid.sum(axis=1)
     few = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
     short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
@@ -104,14 +104,14 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[Finding]:
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, few)
     said = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield Finding(mark, "length", "; ".join(filter(None, (said, few or little, short, long))))
+    yield CheckResult(mark, "length", "; ".join(filter(None, (said, few or little, short, long))))
     if test is None:
-        yield Finding(LOOK, "test", "no test sequences: no prediction error will be reported")
+        yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
     else:
-        yield Finding(OK, "test", f"{len(test.files)} test sequences, none of them in train")
+        yield CheckResult(OK, "test", f"{len(test.files)} test sequences, none of them in train")
 
 
-def _missing(train: Logs, rig: Rig) -> Iterator[Finding]:
+def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
     y, valid = np.asarray(train.data.y), np.asarray(train.data.valid)
     for i, name in enumerate(rig.measured):
         gone = np.isnan(y[..., i]) & valid
@@ -119,24 +119,24 @@ def _missing(train: Logs, rig: Rig) -> Iterator[Finding]:
         worst = int(np.argmax(gone.sum(axis=1) / valid.sum(axis=1)))
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
         text += f", most in {train.files[worst]}" if share else ""
-        yield Finding(_mark(share > 0.2, share > 0.75), "missing", text)
+        yield CheckResult(_mark(share > 0.2, share > 0.75), "missing", text)
 
 
-def _rough(train: Logs) -> Iterator[Finding]:
+def _rough(train: Logs) -> Iterator[CheckResult]:
     """Readings masked on reading, and their share of each column."""
     total = int(np.asarray(train.data.valid).sum())
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
         here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
         count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
         text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
-        yield Finding(
+        yield CheckResult(
             _mark(True, count > 0.3 * total),
             "rough",
             f"{text}, most in {max(here, key=lambda entry: entry.amount).file}",
         )
 
 
-def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[Finding]:
+def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
     """Samples per period of the fastest eigenvalue, and how much a velocity changes between two."""
     rate = along.rate[:, ::10].reshape(-1, *along.rate.shape[-2:])
     fastest = np.max(np.abs(np.linalg.eigvals(rate[np.isfinite(rate).all(axis=(1, 2))])), initial=0.0)
@@ -147,10 +147,10 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[Finding]:
     said += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
     mark = _mark(per < 10 or turn > 0.1, per < 5 or turn > 0.3)
     mend = "" if mark == OK else "; sample faster, or look at the units of dt and of the parameters"
-    yield Finding(mark, "sampling", said + mend)
+    yield CheckResult(mark, "sampling", said + mend)
 
 
-def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[Finding]:
+def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
     for i, name in enumerate(rig.measured):
         unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
         seen, spread = reading_noise(signal), float(np.nanstd(signal))
@@ -160,17 +160,17 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[Finding]
         drowned = "; the motion hardly rises above it: move more, or look at the units" if loud else ""
         if declared is None:
             text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
-            yield Finding(_mark(loud, loud and alone), "noise", text)
+            yield CheckResult(_mark(loud, loud and alone), "noise", text)
             continue
         ratio = seen / declared
         how = f"{name}: declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
         tame = "; the log was filtered, or less is true" if ratio < 0.1 else ""
         wild = "; declare more, or leave it out to have it estimated" if ratio > 3 else ""
         mark = _mark(tame or wild or loud, (loud and alone) or ratio > 30)
-        yield Finding(mark, "noise", how + tame + wild + drowned)
+        yield CheckResult(mark, "noise", how + tame + wild + drowned)
 
 
-def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[Finding]:
+def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = _loads_along(rig, system, data)
     needed = gravity + mass * scales.acceleration
@@ -182,11 +182,11 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
-        yield Finding(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
+        yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     for text in at_stops(rig, data):
-        yield Finding(LOOK, "range", text)
+        yield CheckResult(LOOK, "range", text)
     for text in sentences(felt(rig, system)):
-        yield Finding(LOOK, "untold", text)
+        yield CheckResult(LOOK, "untold", text)
     kept = untold(rig, system, data)
     if kept:
         told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
@@ -194,7 +194,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
             "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
             f"kept as declared is {told}, and all else is relative to that"
         )
-        yield Finding(_mark(True, False), "scale", text)
+        yield CheckResult(_mark(True, False), "scale", text)
 
 
 def _loads_along(
@@ -223,7 +223,7 @@ def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, 
     return jax.vmap(lambda q: (jnp.diag(system.mass(q)), system.bias(q, still)))(q)
 
 
-def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[Finding]:
+def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[CheckResult]:
     """Velocities that each joint visits: range, both directions, passages through rest."""
     dof = len(model.system.coordinates)
     for joint in range(dof):
@@ -234,7 +234,7 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         inner = v[np.isfinite(v)]
         noise = rig.noise_std.get(name, 0.0) if name in rig.measured else 0.0
         if top <= 3 * noise or top < 1e-9:
-            yield Finding(
+            yield CheckResult(
                 BAD, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
             )
             continue
@@ -251,7 +251,7 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
             (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
         ]
         said = [mend for holds, mend in mends if holds]
-        yield Finding(_mark(said and rig.friction), "motion", "; ".join([text, *said]))
+        yield CheckResult(_mark(said and rig.friction), "motion", "; ".join([text, *said]))
 
 
 def _velocity(
@@ -276,7 +276,7 @@ def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
     return int(np.count_nonzero(np.diff(sign)))
 
 
-def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[Finding]:
+def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[CheckResult]:
     """Observability of the state from readings alone, by the Gramian sum Phi' C' R^-1 C Phi along the logs.
 
     [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
@@ -292,7 +292,9 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
         if last >= 2 and np.isfinite(along.transition[i, :last]).all():
             grams.append(gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale))
     if not grams:
-        yield Finding(BAD, "states", "the declared model cannot follow the logs; look at units, signs and parameters")
+        yield CheckResult(
+            BAD, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
+        )
         return
     values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
     known = np.median([np.sqrt(np.diag(np.linalg.inv(gram + np.eye(len(names))))) for gram in grams], axis=0)
@@ -305,7 +307,7 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     text += f"; they do not tell {', '.join(dark)}" if dark else ""
     text += f"; they hardly tell {', '.join(weak)}" if weak else ""
     text += ": measure more of the state, or move so that the hidden joint shakes the rest" if spoilt else ""
-    yield Finding(_mark(dark or weak, spoilt), "states", text)
+    yield CheckResult(_mark(dark or weak, spoilt), "states", text)
 
 
 def gramian(

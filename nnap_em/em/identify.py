@@ -133,7 +133,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     data = jax.device_put(data)
     if white_readings(data):
         return fitted
-    posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
+    posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
     if used.sum() < PARTS:
         return fitted
@@ -144,11 +144,11 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         falls.append(ratio(before, errors(trial, fitted.m_step.prior, path, data, JUDGED), part == out))
     if np.mean(falls) < 1 - FALLS:
         model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True)
-        posterior = e_step(model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
     now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    told = widened(*now, key=jax.random.key(0))
+    told = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
     return fitted._replace(state=fitted.state._replace(hessian=told.hessian), unsaid=told.unsaid)
 
 

@@ -48,7 +48,7 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
 
 def smooth(fitted: Identified, data: Dataset) -> Posterior:
     """p(x_k | all y) of every sequence by the smoother of the fit; one that draws gives the same each time."""
-    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=jax.random.key(0))
+    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
 
 
 def show(model, state: Gaussian, seq: Dataset) -> Gaussian:

@@ -177,7 +177,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            return value if place in LATER else differs(place, "missing in the file")
+            later = place in LATER or ("/effects/" in place and value is None)  # a number that effects have had since
+            return value if later else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":
@@ -191,7 +192,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        if plain(value) != (place in settings):
+        later = "/effects/" in place and place not in settings  # as the effect has it by default
+        if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value
 

@@ -16,7 +16,6 @@ from ..em.identify import Identified
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_text
-from ..systems.bodies import numbers
 from ..systems.tree import Tree
 from .actuator import actuator
 from .export import ExportError
@@ -218,7 +217,7 @@ def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.El
         for j, joint in enumerate(machine.joints):
             if joint.body == i:
                 ET.SubElement(own, "joint", _joint(sheet, joint, sheet.joints[j], mobility[j]))
-        mass, centre, inertia = numbers(body, sheet.system.values)
+        mass, centre, inertia = sheet.system.body_numbers(i)
         if float(mass) > 0:
             full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
             ET.SubElement(own, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))

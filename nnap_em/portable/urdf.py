@@ -10,7 +10,6 @@ from .. import __version__
 from ..data.machine import Joint
 from ..em.identify import Identified
 from ..storage.files import replace_text
-from ..systems.bodies import numbers
 from ..systems.tree import Tree
 from .friction import SHARE, friction_forms
 from .homes import placed
@@ -86,7 +85,7 @@ def _body(root: ET.Element, sheet: Sheet, i: int, parent: str, pose: np.ndarray)
         ET.SubElement(element, "child", link=body.name)
         pose = np.eye(4)
     link = ET.SubElement(root, "link", name=body.name)
-    mass, centre, inertia = numbers(body, sheet.system.values)
+    mass, centre, inertia = sheet.system.body_numbers(i)
     if float(mass) > 0:
         place = pose @ np.array([*map(float, centre), 1.0])
         _inertial(link, float(mass), place[:3], np.array([[float(x) for x in row] for row in inertia]))

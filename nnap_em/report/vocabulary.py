@@ -3,7 +3,7 @@
 MEANINGS = {
     "torsional_spring": "A joint is pulled back to a rest position, as by a cable or a spring.",
     "base_tilt": "The base is not level: gravity points in another direction than declared.",
-    "payload": "There is more mass at the tip than declared.",
+    "payload": "A body carries more mass than declared.",
     "link_inertia": "A link is harder (or easier) to spin than declared.",
     "link_length": "A link is longer (or shorter) than declared.",
     "center_of_mass": "The centre of mass of a link is not where declared.",
@@ -34,7 +34,12 @@ MEANINGS = {
 WORDS = {
     "torsional_spring": {"k": "stiffness", "theta0": "rest position"},
     "base_tilt": {"angle": "tilt"},
-    "payload": {"mass": "added mass"},
+    "payload": {
+        "mass": "added mass",
+        "centre_x": "its centre along x of the body",
+        "centre_y": "its centre along y",
+        "centre_z": "its centre along z",
+    },
     "link_inertia": {"dI": "added inertia"},
     "link_length": {"dl": "added length"},
     "center_of_mass": {"dlc": "shift outwards"},

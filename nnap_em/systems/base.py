@@ -28,6 +28,9 @@ class AbstractSystem(eqx.Module):
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {}
     """Variations of a body: (effect, joint) to (system, amount) -> system and system -> typical amount."""
 
+    spots: ClassVar[dict[int, Any]] = {}
+    """Places of a load of any mass and centre, by the joint that carries it, counted from 1: `bodies.Spot`."""
+
     sensors: ClassVar[dict[str, str]] = {}
     """Columns of sensors that are read beside coordinates and rates, in the order of `senses`, and their SI units."""
 
@@ -119,6 +122,10 @@ class AbstractSystem(eqx.Module):
     def vary(self, kind: str, joint: int, amount: Float[Array, ""]) -> "AbstractSystem":
         """The machine with one body changed by `amount` (an entry of `variations`)."""
         return self.variations[kind, joint][0](self, amount)
+
+    def loaded(self, joint: int, mass: Float[Array, ""], moment: Float[Array, "3"]) -> "AbstractSystem":
+        """The machine with a load: mass [kg] and first moment [kg m] about the spot of a joint (one of `spots`)."""
+        raise KeyError(joint)
 
     def tip(self, q: Float[Array, " dof"]) -> Float[Array, " axis"] | None:
         """Place of the tip [m], where the machine has one that air could brake."""

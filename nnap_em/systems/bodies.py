@@ -1,19 +1,22 @@
 """Bodies of a machine file with what is estimated about them, as the joints carry them."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..data.machine import AXES, OF_BODY, PAIRS, Body, Machine
 from .frames import Layout, Mount
 from .pseudo_inertia import Numbers, stepped
-from .recursion import NOTHING, Inertia, inertia, united
-from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed
+from .recursion import NOTHING, Inertia, carried, inertia, united
+from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed, times, transposed
 
 MARGIN = 1e-9
 """Share by which an inertia may leave the physical ones: rounding, and rods that have none about their axis."""
+SLIGHT = 1e-3
+"""Share of a typical mass below which a load has no inertia about its spot."""
 
 
 def names(body: Body) -> list[str]:
@@ -35,16 +38,23 @@ def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Tu
     return at("mass", body.mass), (x, y, z), ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
-def carried_by(machine: Machine, layout: Layout, values: Mapping[str, Scalar]) -> list[Inertia]:
-    """Body that the frame of every joint carries; no number where a body is not physical, so that no fit goes there."""
+def carried_by(
+    machine: Machine, layout: Layout, values: Mapping[str, Scalar], loads: Mapping[int, Inertia]
+) -> list[Inertia]:
+    """Body that the frame of every joint carries; no number where a body is not physical, so that no fit goes there.
+
+    `loads`, by place of the body, are added to the bodies.
+    """
     found = [NOTHING] * len(layout.frames)
-    for body, mount in zip(machine.bodies, layout.mounts, strict=True):
+    for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
             continue
         mass, centre, own = numbers(body, values)
         if any(name.startswith(f"{body.name}.") for name in values):
             mass = jnp.where(physical(mass, own), mass, jnp.nan)
         found[mount.joint] = united(found[mount.joint], mounted(mass, centre, own, mount))
+        if place in loads:
+            found[mount.joint] = united(found[mount.joint], carried(loads[place], mount.place, mount.turn))
     return found
 
 
@@ -91,31 +101,70 @@ def _told(body: Numbers) -> list[Scalar]:
     return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 
-def with_load(tree: Any, place: int, at: Three, mass: Scalar) -> Any:
-    """A point mass at a place of a body, as other mass, centre and inertia of that body."""
-    body = tree.machine.bodies[place]
-    old, centre, own = numbers(body, tree.values)
-    total = old + mass
-    away = subtract(at, centre)
-    moved = scaled(mass / total, away)
-    own = summed(own, about(scaled(0.5 * old * mass / total, away), away))
-    centre = add(centre, moved)
-    told = [total, *centre, *(own[i][j] for i, j in PAIRS)]
-    values = dict(zip(names(body), map(jnp.asarray, told), strict=True))
-    return replace(tree, values={**tree.values, **values})
+class Spot(NamedTuple):
+    """Place of a load on the body of a joint, and its typical size."""
+
+    body: int
+    """Place of the body among all."""
+    point: tuple[float, float, float]
+    """Place of a load without a first moment, in the frame of the body [m]."""
+    mass: float
+    """Mean mass of a moving body [kg]."""
+    length: float
+    """Longest distance from a joint to what it carries [m]."""
 
 
-def varied(machine: Machine) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:
-    """Variations of a tree: a load on every outermost body, at its first site, or else at its centre of mass."""
-    inner = {body.parent for body in machine.bodies}
-    found = {}
-    for place, body in enumerate(machine.bodies):
-        joints = [j for j, joint in enumerate(machine.joints, 1) if joint.body == place]
-        if place in inner or not joints:
+def spots(machine: Machine, layout: Layout) -> dict[int, Spot]:
+    """Every outermost joint, counted from 1, with its spot: the first site of its bodies, else its centre of mass."""
+    inner = {frame.before for frame in layout.frames}
+    moving = [(body, mount) for body, mount in zip(machine.bodies, layout.mounts, strict=True) if mount.joint >= 0]
+    mass = sum(body.mass for body, _ in moving) / max(len(layout.frames), 1)
+    length = _longest(layout, moving)
+    out = {}
+    for j in range(len(layout.frames)):
+        if j in inner:
             continue
-        at = next((spot.place for spot in machine.spots if spot.body == place), body.centre)
-        found["payload", joints[-1]] = (
-            lambda tree, mass, place=place, at=at: with_load(tree, place, at, mass),
-            lambda tree, body=body: numbers(body, tree.values)[0],
-        )
-    return found
+        place = machine.joints[j].body
+        mount, body = layout.mounts[place], machine.bodies[place]
+        sites = sorted((s for s in machine.spots if layout.mounts[s.body].joint == j), key=lambda s: s.body != place)
+        points = [_moved(s.place, layout.mounts[s.body], mount) if s.body != place else s.place for s in sites]
+        out[j + 1] = Spot(place, next(iter(points), body.centre), mass, length)
+    return out
+
+
+def _moved(point: Three, inside: Mount, to: Mount) -> tuple[float, float, float]:
+    """A point of one body in the frame of another that the same joint carries."""
+    away = subtract(add(inside.place, apply(inside.turn, point)), to.place)
+    x, y, z = map(float, apply(transposed(to.turn), away))
+    return x, y, z
+
+
+def _longest(layout: Layout, moving: Sequence[tuple[Body, Mount]]) -> float:
+    """Longest distance from a joint to the next one, or to the mass of what it carries [m]."""
+    lengths = [float(np.linalg.norm(frame.place)) for frame in layout.frames if frame.before >= 0]
+    for body, mount in moving:
+        if body.mass > 0:
+            centre = np.asarray(mount.place) + np.asarray(mount.turn) @ np.asarray(body.centre)
+            lengths.append(math.sqrt(float(centre @ centre) + 0.5 * float(np.trace(body.inertia)) / body.mass))
+    return max(lengths, default=0.0)
+
+
+def load(spot: Spot, mass: Scalar, moment: Three) -> Inertia:
+    """A point mass in the frame of a body, about its origin, by its mass and its first moment about a spot.
+
+    With h = mass (c - point) its second moment is linear but for |h|^2 / mass.  That share fades out below `SLIGHT` of
+    the typical mass, where a first moment alone means a centre of mass that is not as declared.
+    """
+    least = SLIGHT * spot.mass
+    inverse = mass / jnp.square(jnp.maximum(jnp.abs(mass), least))
+    own = about(scaled(times(0.5, inverse), moment), moment)
+    second = summed(summed(about(scaled(times(0.5, mass), spot.point), spot.point), about(moment, spot.point)), own)
+    return Inertia(mass, add(scaled(mass, spot.point), moment), second)
+
+
+def with_load(body: tuple[Scalar, Three, Turn], more: Inertia) -> tuple[Scalar, Three, Turn]:
+    """Mass, centre and inertia about it of a body with a load."""
+    whole = united(inertia(*body), more)
+    centre = scaled(1.0 / whole.mass, whole.moment)
+    steiner = about(scaled(-0.5, whole.moment), centre)
+    return whole.mass, centre, summed(whole.second, steiner)

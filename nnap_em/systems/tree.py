@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, unpacked
 from ..data.units import quantities
 from .base import AbstractSystem
-from .bodies import carried_by, kept_physical, varied
+from .bodies import Spot, carried_by, kept_physical, load, numbers, spots, with_load
 from .frames import laid
-from .recursion import composite, motions, newton_euler, posed, solved
+from .recursion import Inertia, composite, motions, newton_euler, posed, solved, united
 from .sensing import seen
-from .spatial import Scalar, minus, plus, times
+from .spatial import Scalar, Three, Turn, minus, plus, times
 
 KNEE = 0.01
 """Velocity at which dry friction of the file has three quarters of its size [rad/s or m/s]."""
@@ -35,6 +35,8 @@ class Tree(AbstractSystem):
     values: dict[str, Float[Array, ""]]
     """Numbers that are not the file's, under their names in `[model.uncertain]`."""
     joints: tuple[int, ...] = eqx.field(static=True)
+    loads: dict[int, Inertia] = eqx.field(default_factory=dict)
+    """Loads of bodies beside their own mass, by their place, about the origins of their frames."""
 
     @classmethod
     def declared(cls, parameters, joints, machine):
@@ -80,8 +82,30 @@ class Tree(AbstractSystem):
 
     @property
     def variations(self) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A load on the outermost bodies, at their first site."""
-        return varied(self.machine)
+        """A point mass at the spot of every outermost joint."""
+        return {
+            ("payload", joint): (
+                lambda tree, mass, joint=joint: tree.loaded(joint, mass, jnp.zeros(3, mass.dtype)),
+                lambda _, spot=spot: spot.mass,
+            )
+            for joint, spot in self.spots.items()
+        }
+
+    @property
+    def spots(self) -> dict[int, Spot]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Places of a load, by the joint that carries it."""
+        return spots(self.machine, laid(self.text))
+
+    def loaded(self, joint, mass, moment):
+        spot = self.spots[joint]
+        more = load(spot, mass, (moment[0], moment[1], moment[2]))
+        held = self.loads.get(spot.body)
+        return replace(self, loads={**self.loads, spot.body: more if held is None else united(held, more)})
+
+    def body_numbers(self, place: int) -> tuple[Scalar, Three, Turn]:
+        """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a body with its load, in the body's frame."""
+        own = numbers(self.machine.bodies[place], self.values)
+        return with_load(own, self.loads[place]) if place in self.loads else own
 
     def __str__(self) -> str:
         numbers = {name: float(value) for name, value in self.values.items()}
@@ -121,7 +145,7 @@ class Tree(AbstractSystem):
         return posed(laid(self.text).frames, [minus(q[i], joint.zero) for i, joint in enumerate(self.machine.joints)])
 
     def _bodies(self):
-        return carried_by(self.machine, laid(self.text), self.values)
+        return carried_by(self.machine, laid(self.text), self.values, self.loads)
 
     def _mass(self, poses) -> list[list[Scalar]]:
         rows = composite(laid(self.text).frames, poses, self._bodies())

@@ -1,0 +1,59 @@
+"""A rod on a hinge with a motor, its motion in NumPy: code that shares nothing with the library."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Rig, read_rig
+from nnap_em.systems import specs
+
+GRAVITY, MASS, LENGTH, INERTIA = 9.81, 1.2, 0.25, 0.01
+"""Of the rod: its centre [m] below the axis, its inertia about it [kg m^2]."""
+DT, ROWS, SEQUENCES = 0.02, 150, 6
+NOISE = (1e-3, 1e-2)
+"""Of the readings [rad, rad/s]."""
+FILE = f"""<mujoco><compiler angle="radian"/><worldbody><body name="rod"><joint name="hinge" axis="0 -1 0"/>
+<inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
+<site name="tip" pos="0 0 -0.4"/></body></worldbody><actuator><motor name="tau" joint="hinge"/></actuator></mujoco>"""
+Level = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Size of a friction [N m] by torque of the motor, torque of the weight, and rate."""
+
+
+def logs(seed: int, *, mass: float = 0.0, at: tuple[float, float] = (0.0, 0.0), level: Level | None = None) -> Dataset:
+    """Sums of sines as torques, 20 Runge-Kutta steps a sample; a point mass at (x, z) hangs on the rod."""
+    rng, h, (x, z) = np.random.default_rng(seed), DT / 20, at
+    t = DT * np.arange(ROWS)
+    tones = rng.uniform(1.0, 9.0, (SEQUENCES, 3, 1)), rng.uniform(0, 2 * np.pi, (SEQUENCES, 3, 1))
+    u = rng.uniform(0.5, 2.5, (SEQUENCES, 1)) * np.sum(np.sin(tones[0] * t + tones[1]), axis=1)
+    inertia = INERTIA + MASS * LENGTH**2 + mass * (x**2 + z**2)
+
+    def rate(state, u):
+        q, v = state
+        weight = GRAVITY * (mass * (x * np.cos(q) - z * np.sin(q)) + MASS * LENGTH * np.sin(q))
+        friction = 0.05 * v + (0.1 + (level(u, weight, v) if level else 0.0)) * np.tanh(v / 0.1)
+        return np.stack([v, (u - weight - friction) / inertia])
+
+    y, state = np.zeros((SEQUENCES, ROWS, 2)), np.stack([rng.uniform(-1, 1, SEQUENCES), np.zeros(SEQUENCES)])
+    for k in range(ROWS):
+        y[:, k] = state.T
+        for _ in range(20):
+            a = rate(state, u[:, k])
+            b = rate(state + 0.5 * h * a, u[:, k])
+            c = rate(state + 0.5 * h * b, u[:, k])
+            state = state + h / 6 * (a + 2 * b + 2 * c + rate(state + h * c, u[:, k]))
+    y = y + rng.normal(size=y.shape) * NOISE
+    return Dataset(np.tile(t, (SEQUENCES, 1)), u[..., None], y, np.ones((SEQUENCES, ROWS), bool))
+
+
+def rig(folder: Path) -> Rig:
+    """The rod as its file declares it, without what `logs` adds."""
+    (folder / "rod.xml").write_text(FILE)
+    (folder / "rig.toml").write_text(
+        'format = 1\nname = "rod"\n[model]\ntype = "mjcf"\nfile = "rod.xml"\nfriction = "unknown"\n'
+        f'[sampling]\ndt = {DT}\ninput_hold = "zero-order"\nclock = "sequence"\n'
+        '[measurement]\ncolumns = ["hinge", "dhinge"]\n'
+        f"[measurement.noise_std]\nhinge = {NOISE[0]}\ndhinge = {NOISE[1]}\n"
+    )
+    return read_rig(folder / "rig.toml", specs)

@@ -1,0 +1,131 @@
+"""Friction of gears that grows with their torques: each form in closed form, special cases, the finder on a joint."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rod
+
+from nnap_em import close_the_loop, findings
+from nnap_em.effects import Around, fields
+from nnap_em.effects.base import a
+from nnap_em.effects.friction import LoadFriction
+from nnap_em.em.identify import begin
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+
+KNEE = 0.1
+MOTOR = LoadFriction(a(0.2), a(KNEE), names=("u", "dhinge"), joint=1)
+M3 = replace(MOTOR, whole=True)
+M4 = replace(M3, stribeck=a(0.3), log_velocity=a(np.log(0.6)))
+APART = replace(MOTOR, load=a(0.05))
+M5 = replace(APART, stribeck=a(0.3), load_stribeck=a(0.1), log_velocity=a(np.log(0.6)))
+M6 = replace(M5, square_motor=a(0.04), square_load=a(0.07))
+
+
+def _dip(v):
+    return np.exp(-((v / 0.6) ** 2))
+
+
+def _square(u, c):
+    """Of the smaller torque while it is dragged along; none where both pull the same way."""
+    return np.where(u * c > 0, np.where(np.abs(u) > np.abs(c), 0.07 * c**2, 0.04 * u**2), 0.0)
+
+
+FORMS = {
+    "motor": (MOTOR, lambda u, c, v: 0.2 * np.abs(u)),
+    "M3": (M3, lambda u, c, v: 0.2 * np.abs(u + c)),
+    "M4": (M4, lambda u, c, v: (0.2 + 0.3 * _dip(v)) * np.abs(u + c)),
+    "apart": (APART, lambda u, c, v: np.abs(0.2 * u + 0.05 * c)),
+    "M5": (M5, lambda u, c, v: np.abs(0.2 * u + 0.05 * c) + np.abs(0.3 * u + 0.1 * c) * _dip(v)),
+    "M6": (
+        M6,
+        lambda u, c, v: np.abs(0.2 * u + 0.05 * c) + (np.abs(0.3 * u + 0.1 * c) + _square(u, c)) * _dip(v),
+    ),
+}
+"""A law and its level [N m] as Duclusaud et al. have it, with their external torque as minus the weight."""
+
+
+@pytest.fixture
+def model(tmp_path) -> StateSpaceModel:
+    """The rod, which turns about level: its weight at an angle is known in closed form."""
+    return begin(rod.rig(tmp_path), rod.logs(0), key=jax.random.key(0)).state.model
+
+
+def _forces(law: LoadFriction, model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
+    """Of a law [N m] at angles, rates and torques."""
+
+    def force(q, v, u):
+        scene = model.scene(jnp.stack([q, v]), Inputs(u[None], u[None], a(0.0), a(0.0)))
+        return law.force(scene, jnp.zeros(0))[0]
+
+    return np.asarray(jax.jit(jax.vmap(force))(*jnp.asarray(states.T)))
+
+
+def _states(count: int = 400) -> np.ndarray:
+    """Angles, rates and torques."""
+    return np.random.default_rng(0).normal(size=(count, 3)) * [2.0, 1.0, 3.0]
+
+
+@pytest.mark.parametrize(("law", "level"), FORMS.values(), ids=FORMS)
+def test_a_form_is_that_of_the_paper(law, level, model):
+    q, v, u = (states := _states()).T
+    weight = rod.GRAVITY * rod.MASS * rod.LENGTH * np.sin(q)
+    np.testing.assert_allclose(_forces(law, model, states), -level(u, weight, v) * np.tanh(v / KNEE), atol=1e-12)
+    assert law.possible() and set(law.values()) <= set(law.units)
+
+
+@pytest.mark.parametrize(
+    ("plain", "rich"),
+    [
+        (MOTOR, replace(MOTOR, load=a(0.0))),
+        (M3, replace(M3, load=a(0.2))),
+        (M3, replace(M4, stribeck=a(0.0))),
+        (M4, replace(M4, load=a(0.2), load_stribeck=a(0.3))),
+        (APART, replace(M5, stribeck=a(0.0), load_stribeck=a(0.0))),
+        (M5, replace(M6, square_motor=a(0.0), square_load=a(0.0))),
+    ],
+    ids=["motor in apart", "M3 in apart", "M3 in M4", "M4 in M5", "apart in M5", "M5 in M6"],
+)
+def test_a_rich_form_holds_the_plain_one(plain, rich, model):
+    states = _states()
+    np.testing.assert_allclose(_forces(rich, model, states), _forces(plain, model, states), atol=1e-14)
+
+
+def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
+    """Every richer form begins as the one before it, has a number more, and the last has none behind it."""
+    states, seen, ahead = _states(20), [], [c.start for c in LoadFriction.candidates(around_rod)]
+    while ahead:
+        law = ahead.pop()
+        seen.append(law)
+        for candidate in law.richer(around_rod):
+            assert len(fields(candidate.start)) > len(fields(law))
+            assert jax.tree.structure(candidate.spread) == jax.tree.structure(candidate.start)
+            np.testing.assert_allclose(_forces(candidate.start, model, states), _forces(law, model, states), atol=1e-14)
+            for probe in candidate.probes:
+                assert np.abs(_forces(probe, model, states) - _forces(law, model, states)).max() > 1e-4
+            ahead.append(candidate.start)
+    assert max(len(fields(law)) for law in seen) == len(fields(M6))
+
+
+@pytest.fixture
+def around_rod(model):
+    """What a search knows of the rod."""
+    one = np.ones(1)
+    return Around(
+        model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,
+        (0.0, 3.0), 3.0, False, True, ("u",),
+    )  # fmt: skip
+
+
+def test_torques_of_motor_and_load_apart_are_found_on_one_joint(tmp_path):
+    """The law by the motor's torque alone is found first, then the share of the load's."""
+    data = rod.logs(0, level=lambda u, c, v: np.abs(0.15 * u + 0.05 * c))
+    (found,) = findings(close_the_loop(rod.rig(tmp_path), data, key=jax.random.key(0)))
+    assert found.effect.name == "load_friction" and found.effect.joint == 1
+    assert set(found.parameters) == {"mu", "mu_load"}
+    for name, truth in (("mu", 0.15), ("mu_load", 0.05)):
+        told = found.parameters[name]
+        assert told.value == pytest.approx(truth, rel=0.05)
+        assert abs(told.value - truth) < 4 * told.std

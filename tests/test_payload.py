@@ -1,0 +1,25 @@
+"""A load of unknown mass and centre on a machine from a file, found in logs of a motion in closed form."""
+
+import jax
+import pytest
+import rod
+
+from nnap_em import close_the_loop, findings
+from nnap_em.effects import catalogue
+
+MASS, PLACE = 0.5, (0.15, -0.3)
+"""Of what hangs on the rod [kg], and where in the plane of its motion [m]."""
+
+
+def test_mass_and_centre_of_a_load_on_one_joint_are_found(tmp_path):
+    """Weight and inertia of a hinge give mass and centre in the plane of its motion; along the axis nothing is seen."""
+    data = rod.logs(0, mass=MASS, at=PLACE)
+    closed = close_the_loop(rod.rig(tmp_path), data, key=jax.random.key(0))
+    (found,) = findings(closed)
+    assert found.effect.name == "payload" and found.effect.joint == 1
+    told = found.parameters
+    for name, truth, within in (("mass", MASS, 0.1 * MASS), ("centre_x", PLACE[0], 0.02), ("centre_z", PLACE[1], 0.02)):
+        assert told[name].value == pytest.approx(truth, abs=within)
+        assert abs(told[name].value - truth) < 4 * told[name].std < 4 * within
+    assert told["centre_y"].std > 0.2  # nobody knows
+    assert told.keys() == catalogue["payload"].units.keys()

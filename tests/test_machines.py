@@ -287,7 +287,8 @@ def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_pa
     rig = read_rig(_rig(tmp_path, arm(2), model="[model.uncertain]\nlink2.mass = {std = 0.1}"), specs)
     late = catalogue["input_delay"].of(0.004, joint=2)
     prior = ParameterPrior(("link2.mass", "0.delay"), jnp.asarray([2.0, 0.0]), jnp.asarray([0.1, 0.01]))
-    model = SimpleNamespace(system=build_system(rig), effects=(late,))
+    system = build_system(rig)
+    model = SimpleNamespace(system=system, effects=(late,), parameter=system.parameter)
     told = Told(np.zeros((4, 4)))
     fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
     design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
@@ -374,7 +375,7 @@ def test_what_no_motion_feels_is_told(tmp_path):
     assert found.together == (("link1.mass", "link1.inertia.zz", "joint1.armature"),)  # one axis, upright
     uncertain = "[model.uncertain]\nlink1.com.z = {std=0.1}\nlink2.mass = {std=0.1}"
     rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
-    assert felt(rig, build_system(rig)) == (("link1.com.z",), ())
+    assert felt(rig, build_system(rig)) == (("link1.com.z",), (), ())
     assert "no motion feels link1.com.z" in sentences(felt(rig, build_system(rig)))[0]
 
 
@@ -432,8 +433,6 @@ BAD = {
         _one(rest="<tendon><fixed name='t'><joint joint='a' coef='1'/></fixed></tendon>"),
         "", "1 tendons; put their springs and motors on joints",
     ),
-    "position servo": (_actuator("<position name='p' joint='a' kp='3'/>"), "", "actuator 'p' is a servo"),
-    "velocity servo": (_actuator("<velocity name='p' joint='a' kv='3'/>"), "", "actuator 'p' is a servo"),
     "muscle": (_actuator("<muscle name='p' joint='a' lengthrange='0 1'/>"), "", "actuator 'p' is a muscle"),
     "state": (_actuator("<intvelocity name='p' joint='a' kp='3' actrange='-1 1'/>"), "", "actuator 'p' has a state"),
     "two motors": (_actuator(SECOND), "", r"m and n drive one joint, 'a'; name one of them in \[input\] columns"),
@@ -458,7 +457,7 @@ BAD = {
         _one(HINGE + WEIGHT + TWO.replace('"b2"', '"da"')), "", "'da' is called as the rate of joint 'a'; rename",
     ),
     "same name twice": (_one(HINGE + WEIGHT + TWO.replace('"b2"', '"a"')), "", "a name of its own"),
-    "motor called as its joint": (_actuator("<motor name='a' joint='a'/>"), "", "'a' is a state, and no torque; give"),
+    "motor called as its joint": (_actuator("<motor name='a' joint='a'/>"), "", "'a' is a state, and no torque"),
     "fluid": (_one(rest="<option density='1000'/>"), "", "bodies move in a fluid; set density and viscosity to 0"),
     "gravity compensation": (
         '<mujoco><worldbody><body name="b" gravcomp="1">' + HINGE + WEIGHT + "</body></worldbody></mujoco>",

@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Sense, of_body, packed, states
+from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sense, of_body, packed, states
 from .mjcf import Part, read_machine
-from .rig import Declared, RigWarning, SystemSpec, Told, flat, nearest
+from .rig import Declared, RigWarning, SystemSpec, Told, flat, kinds_of, nearest
+from .servo import TORQUE, Drive, read_drives
+from .servo import keys as drive_keys
+from .servo import named as drive_numbers
 
 OF_JOINT = ("armature", "stiffness")
 _FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
@@ -32,10 +35,20 @@ def declare(root: Any) -> Told:
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
     _say_left_out(root, machine)
-    columns, joints, gears, motored = _inputs(machine, root)
+    columns, joints, motored = _inputs(machine, root)
+    motors = {motor.name: motor for motor in machine.motors} if motored else {}
+    given = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
+    drives = read_drives(root.table("input", absent={}), columns, given)
+    gears = tuple(_gear(motors.get(column), drives[column]) for column in columns)
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
-    parameters = dict(_parameters(machine, model))
-    return Told(spec, parameters, columns, joints, packed(machine._replace(gears=gears, motored=motored)))
+    parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
+    machine = packed(machine._replace(gears=gears, motored=motored))
+    return Told(spec, parameters, columns, joints, machine, kinds_of(drives))
+
+
+def _gear(motor: Motor | None, drive: Drive) -> float:
+    """Gear of a motor of the kind in the file; an input of another kind in rig.toml acts on the joint itself."""
+    return 1.0 if motor is None or (drive.kind != TORQUE and motor.kind != drive.kind) else motor.gear
 
 
 def _part(model: Any) -> Part:
@@ -89,38 +102,38 @@ def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
                 yield sense
 
 
-def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], tuple[float, ...], bool]:
-    """Columns, the joint that each drives, counted from 1, its gear, and whether they are the motors of the file."""
+def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
+    """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
     motors = {motor.name: motor for motor in machine.motors}
     if not motors and "input" not in root.items:
         found = f"{machine.file} has no actuator"
         mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
         root.refuse("input", found, mend)
     table = root.table("input", absent={})
-    table.check((), ("columns", "joints"))
+    table.check((), drive_keys(table))
     columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
     for column in columns:
         if column in ("time", *machine.states):
             mend = "give the motor another name than the joint's, or name torque columns and joints in [input]"
-            table.refuse("columns", f"{column!r} is a state, and no torque", mend)
+            table.refuse("columns", f"{column!r} is a state, and no torque or command", mend)
     if "joints" in table.items:
         joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
         if len(joints) != len(columns):
             table.refuse("joints", f"found {len(joints)} joints for {len(columns)} columns")
-        gears, motored = (1.0,) * len(columns), False
+        motored = False
     else:
         for column in columns:
             if column not in motors:
                 mend = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
                 table.refuse("columns", f"{column!r} is no motor of {machine.file}", mend)
         joints = tuple(motors[column].joint + 1 for column in columns)
-        gears, motored = tuple(motors[column].gear for column in columns), True
+        motored = True
     for joint in joints:
         if joints.count(joint) > 1:
             found = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
             found += f", {machine.joints[joint - 1].name!r}"
             table.refuse("columns", found, "name one of them in [input] columns, and log their sum")
-    return columns, joints, gears, motored
+    return columns, joints, motored
 
 
 def _place(machine: Machine, table: Any, joint: Any) -> int:

@@ -4,6 +4,7 @@ import json
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+from .servo import TORQUE
 from .units import state_unit
 
 Vector = tuple[float, float, float]
@@ -68,11 +69,15 @@ class Joint(NamedTuple):
 
 
 class Motor(NamedTuple):
-    """An actuator whose input is a torque: gear times the input acts on the joint."""
+    """An actuator: gear times the input acts on the joint, or gear times the torque that a servo makes of it."""
 
     name: str
     joint: int
     gear: float
+    kind: str = TORQUE
+    """Kind of `servo.KINDS`."""
+    numbers: tuple[tuple[str, float], ...] = ()
+    """Numbers of the servo, by their keys."""
 
 
 class Gauge(NamedTuple):

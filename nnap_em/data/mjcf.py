@@ -13,6 +13,7 @@ import numpy as np
 from .locked import NOTHING, groups, lock
 from .machine import SENSE_UNITS, Body, Gauge, Joint, Machine, Motor, Rotation, Sense, Spot, Vector
 from .rig import RigError, RigWarning, nearest
+from .servo import TORQUE
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
 
@@ -450,15 +451,22 @@ def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
     gain, bias, state, acts = (
         int(getattr(model, f"actuator_{kind}type")[i]) for kind in ("gain", "bias", "dyn", "trn")
     )
-    mend = "log the torque that it gives and make it <motor>, or take it out and name torque columns in [input]"
+    mend = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
     if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or state == int(mujoco.mjtDyn.mjDYN_MUSCLE):
         yield f"actuator {name!r} is a muscle", mend
     elif state != int(mujoco.mjtDyn.mjDYN_NONE):
-        yield f"actuator {name!r} has a state of its own", mend
-    elif bias != int(mujoco.mjtBias.mjBIAS_NONE):
-        yield f"actuator {name!r} is a servo (position, velocity or damper)", mend
-    elif gain != int(mujoco.mjtGain.mjGAIN_FIXED):
-        yield f"actuator {name!r} has a gain that is not fixed", mend
+        lag = "log the goal that it has integrated and make it <position>" if _integrates(model, i) else _LAG
+        yield f"actuator {name!r} has a state of its own", lag
+    elif bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
+        yield f"actuator {name!r} has a bias that is not affine", mend
+    elif gain not in (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)):
+        yield f"actuator {name!r} has a gain that is neither fixed nor affine", mend
+    elif (found := _drive(model, i)) is None:
+        mend = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
+        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", mend
+    elif found[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
+        mend = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
+        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", mend
     elif acts not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
         yield f"actuator {name!r} drives no joint", "let every motor drive a joint"
 
@@ -526,8 +534,63 @@ def _motors(model: Any, part: Part) -> Iterator[Motor]:
     for i in range(getattr(model, "nactuator", model.nu)):
         if not _moves(model, i, held):
             continue
-        gain = float(model.actuator_gainprm[i][0]) * float(model.actuator_gear[i][0])
-        yield Motor(model.actuator(i).name or f"u{i + 1}", int(model.actuator_trnid[i][0]), gain)
+        kind, numbers = _drive(model, i) or (TORQUE, {})
+        gear = float(model.actuator_gear[i][0])
+        if kind == TORQUE:  # its limits are not taken: the log has the torque as it was
+            gear, numbers = gear * float(model.actuator_gainprm[i][0]), {}
+        elif limits := _limits(model, i):
+            numbers |= {"limit": limits[1]}
+        name = model.actuator(i).name or f"u{i + 1}"
+        yield Motor(name, int(model.actuator_trnid[i][0]), gear, kind, tuple(numbers.items()))
+
+
+_LAG = "take the lag out of it (timeconst, dyntype): the fit can find one, as actuator_lag"
+
+
+def _integrates(model: Any, i: int) -> bool:
+    return int(model.actuator_dyntype[i]) == int(_mujoco().mjtDyn.mjDYN_INTEGRATOR)
+
+
+def _drive(model: Any, i: int) -> tuple[str, dict[str, float]] | None:
+    """The kind and numbers of an actuator without a state: force = gain u + bias, both affine in position and rate.
+
+    None where the gain is no constant, and not the rate alone (`<damper>`).
+    [MuJoCo documentation, Computation, Actuation model]
+    """
+    mujoco = _mujoco()
+    gain, bias = (np.asarray(getattr(model, f"actuator_{part}prm")[i][:3], float) for part in ("gain", "bias"))
+    if int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED):
+        gain = gain * [1.0, 0.0, 0.0]
+    if int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE):
+        bias = np.zeros(3)
+    more = _late(model, i) | ({"bias": float(bias[0])} if bias[0] else {})
+    kp, kd = (float(0.0 - x) for x in bias[1:])
+    if not np.any(gain[1:]):
+        if not np.any(bias) and not more:
+            return TORQUE, {}
+        if kp == gain[0] > 0:
+            return "position", {"kp": kp, "kd": kd, **more}
+        if kp == 0 and kd == gain[0] > 0:
+            return "velocity", {"kv": kd, **more}
+        return "affine", {"gain": float(gain[0]), "kp": kp, "kd": kd, **more}
+    if not np.any(gain[:2]) and gain[2] < 0 and not np.any(bias[1:]):
+        return "damper", {"kv": float(-gain[2]), **more}
+    return None
+
+
+def _late(model: Any, i: int) -> dict[str, float]:
+    """The delay of an actuator [s], by a buffer of commands."""
+    delay = float(np.ravel(getattr(model, "actuator_delay", np.zeros(i + 1))[i])[0])
+    return {"delay": delay} if delay > 0 else {}
+
+
+def _limits(model: Any, i: int) -> tuple[float, float] | None:
+    """Limits of what an actuator gives before its gear: its own, and those of all actuators of its joint."""
+    joint, gear = int(model.actuator_trnid[i][0]), float(model.actuator_gear[i][0])
+    own = [model.actuator_forcerange[i]] if model.actuator_forcelimited[i] else []
+    if model.jnt_actfrclimited[joint]:
+        own.append(np.sort(np.asarray(model.jnt_actfrcrange[joint]) / gear))
+    return (max(float(x[0]) for x in own), min(float(x[1]) for x in own)) if own else None
 
 
 def _gauges(model: Any) -> Iterator[Gauge]:

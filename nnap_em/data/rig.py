@@ -15,6 +15,10 @@ from typing import Any, NamedTuple, NoReturn
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds
 from .machine import machine_unit, unpacked
+from .servo import TORQUE, Drive, key_of, read_drives
+from .servo import keys as drive_keys
+from .servo import lines as drive_lines
+from .servo import named as drive_numbers
 from .units import parameter_unit, quantities, with_names
 
 _FRICTION = {"unknown": True, "none": False}
@@ -35,6 +39,7 @@ _MEND = {  # how the line of a key or table should look
     "actuated_joint": "actuated_joint = 2 (or a table [input] with columns and joints)",
     "columns": 'a list of different names, columns = ["theta1", "dtheta1"]',
     "joints": "a list of different joints, one per column, joints = [1, 2]",
+    "kind": 'kind = "position" (a servo that is given a position), or kind = "torque"',
     "dt": "a number above 0, dt = 0.01 (s)",
     "input_hold": 'input_hold = "zero-order"',
     "mean": "both numbers, { mean = 0.2, std = 0.02 }",
@@ -86,6 +91,7 @@ class Told(NamedTuple):
     input_columns: tuple[str, ...]
     input_joints: tuple[int, ...]
     machine: str = ""
+    input_kinds: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,10 +111,32 @@ class Rig:
     start: Mapping[str, Declared]
     limits: Bounds = UNBOUNDED  # what it may be asked to do; what is absent: as far as the logs went
     machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
+    input_kinds: tuple[str, ...] = ()  # of `servo.KINDS`, one per column; none given: all are torques
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """The kind of every input column."""
+        return dict(zip(self.input_columns, self.input_kinds or (TORQUE,) * len(self.input_columns), strict=True))
+
+    @property
+    def bodies(self) -> dict[str, Declared]:
+        """The parameters of the machine, without those of its drives."""
+        return {name: value for name, value in self.parameters.items() if key_of(name, self.kinds) is None}
 
     def unit(self, name: str) -> str:
         """The SI unit of a parameter or state."""
+        if (key := key_of(name, self.kinds)) is not None:
+            return (
+                key.unit if self._turns(name.rpartition(".")[0]) else key.unit.replace("N m", "N").replace("rad", "m")
+            )
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
+
+    def _turns(self, column: str) -> bool:
+        """True where an input drives an angle; without a file, as far as the names of what is read tell."""
+        joint = self.input_joints[self.input_columns.index(column)] - 1
+        if self.machine:
+            return not unpacked(self.machine).joints[joint].slide
+        return not all(parameter_unit(name).startswith("m") for name in self.measured)
 
     def pairs(self) -> list[tuple[str, str]] | None:
         """Every coordinate with its rate, where the names do not tell: the rate of x is dx."""
@@ -121,7 +149,10 @@ class Rig:
         return with_names(text, [coordinate for coordinate, _ in self.pairs() or ()])
 
     def __str__(self) -> str:
-        inputs = [f"{name} on joint {j}" for name, j in zip(self.input_columns, self.input_joints, strict=True)]
+        words = {name: "" if kind == TORQUE else f" ({kind})" for name, kind in self.kinds.items()}
+        inputs = [
+            f"{name}{word} on joint {j}" for (name, word), j in zip(words.items(), self.input_joints, strict=True)
+        ]
         noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}
         reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
         lines = [
@@ -167,19 +198,23 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         start={state: start.declared(state) for state in start.items},
         limits=read_bounds(root.table("limits", absent={}), told.input_columns, spec.states),
         machine=told.machine,
+        input_kinds=told.input_kinds,
     )
 
 
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    told = [f"{key} = {value}    # {rig.unit(key)}" for key, value in parameters.items()]
+    told = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
     lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else told
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
     lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
-    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]    # N m, or N on a slide"]
+    unit = "" if rig.input_kinds else "    # N m, or N on a slide"
+    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
     lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
+    units = {key: f"{value}    # {rig.unit(key)}" for key, value in parameters.items()}
+    lines += drive_lines(rig.kinds, units, toml_text)
     lines += [
         "",
         "[sampling]",
@@ -279,6 +314,10 @@ class _Table:
             self.refuse(key, mend=f"write a finite number, {key} = 0.2")
         return float(value)
 
+    def quantity(self, key: str) -> Declared:
+        """A number (trusted) or { mean, std }."""
+        return self.declared(key) if isinstance(self.value(key), dict) else Declared(self.number(key), 0.0)
+
     def positive(self, key: str) -> float:
         value = self.number(key)
         if value <= 0:
@@ -315,7 +354,7 @@ def _parse(path: Path) -> dict[str, object]:
 
 def _parameter(model: _Table, key: str) -> Declared:
     """A number (trusted) or { mean, std }. Inertias may be negative: fits about the joint, moved to the centre, are."""
-    value = model.declared(key) if isinstance(model.items[key], dict) else Declared(model.number(key), 0.0)
+    value = model.quantity(key)
     unit = parameter_unit(key)
     if unit == "kg" and value.mean <= 0:
         model.refuse(key, mend="write a mass above 0 [kg]")
@@ -333,27 +372,36 @@ def _declared(root: _Table, spec: SystemSpec) -> Told:
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
     parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
-    return Told(spec, parameters, *_input(root, model, spec))
+    columns, joints, drives = _input(root, model, spec)
+    return Told(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
 
 
-def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """The torque columns and the joint that each drives."""
+def kinds_of(drives: Mapping[str, Drive]) -> tuple[str, ...]:
+    """The kind of every column; nothing where all are torques."""
+    kinds = tuple(drive.kind for drive in drives.values())
+    return () if set(kinds) <= {TORQUE} else kinds
+
+
+def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], tuple[int, ...], dict[str, Drive]]:
+    """The input columns, the joint that each drives, and what makes torque of them."""
+    drives: dict[str, Drive] = {}
     if "input" in root.items:
         table, key = root.table("input"), "joints"
-        table.check(("columns", "joints"))
+        table.check(("columns",), drive_keys(table))
         columns, joints = table.distinct("columns", str), table.distinct("joints", int)
+        drives = read_drives(table, columns)
         if len(columns) != len(joints):
             table.refuse(key, f"found {len(joints)} joints for {len(columns)} columns")
         for column in columns:
             if column in ("time", *spec.states):
-                table.refuse("columns", f"{column!r} is no torque", "name the torque columns only")
+                table.refuse("columns", f"{column!r} is no input", "name torque columns only, or commands of servos")
     else:
         table, key, columns = model, "actuated_joint", ("u",)
         joint = model.value(key)
         joints = (joint,) if type(joint) is int else model.refuse(key)
     if not all(1 <= joint <= spec.joints for joint in joints):
         table.refuse(key, mend=f"joints count from 1 to {spec.joints}")
-    return columns, joints
+    return columns, joints, drives
 
 
 def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict[str, float]]:

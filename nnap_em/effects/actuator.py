@@ -33,8 +33,8 @@ class MotorGain(InputEffect):
     def values(self):
         return {"gain": 1 + self.excess}
 
-    def input(self, u, dt):
-        return (1 + self.excess) * u
+    def drive(self, torque):
+        return (1 + self.excess) * torque
 
 
 class DeadZone(InputEffect):
@@ -52,8 +52,8 @@ class DeadZone(InputEffect):
         grid = (0.03, 0.08, 0.15, 0.25, 0.4)
         return [one(partial(cls, joint=j), 0.0, s * size, 0.3 * size) for j, size in around.driven for s in grid]
 
-    def input(self, u, dt):
-        return u - jnp.clip(u, -self.width, self.width)
+    def drive(self, torque):
+        return torque - jnp.clip(torque, -self.width, self.width)
 
 
 class Saturation(InputEffect):
@@ -73,8 +73,8 @@ class Saturation(InputEffect):
         grid = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)
         return [one(partial(cls, joint=j), 2 * size, s * size, 0.2 * size) for j, size in around.driven for s in grid]
 
-    def input(self, u, dt):
-        return jnp.clip(u, -self.limit, self.limit)
+    def drive(self, torque):
+        return jnp.clip(torque, -self.limit, self.limit)
 
 
 class OneSidedLoss(InputEffect):
@@ -100,8 +100,8 @@ class OneSidedLoss(InputEffect):
     def possible(self):
         return 0 < float(self.loss) < 1
 
-    def input(self, u, dt):
-        return u - self.side * self.loss * jnp.maximum(self.side * u, 0.0)
+    def drive(self, torque):
+        return torque - self.side * self.loss * jnp.maximum(self.side * torque, 0.0)
 
 
 class InputDelay(JointEffect):

@@ -225,8 +225,12 @@ class AbstractEffect(eqx.Module):
         return jnp.ones(self.memory)
 
     def input(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
-        """What reaches the joint of the commanded input, mean over each sample."""
+        """What reaches the drive of the commanded input, mean over each sample: what takes time."""
         return u
+
+    def drive(self, torque: Float[Array, "*time"]) -> Float[Array, "*time"]:
+        """What reaches the joint of the torque of its drive, at one moment [N m, or N]."""
+        return torque
 
     def physics(self, system: AbstractSystem, time: Scalar) -> AbstractSystem:
         """The machine as it truly is."""

@@ -11,8 +11,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig, RigError
+from ..data.servo import KINDS, TORQUE
+from ..model import hooks
 from ..model.friction import FrictionNetwork, NoFriction
-from ..model.state_space import StateSpaceModel
+from ..model.servo import Servo, unlimited
+from ..model.state_space import SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
@@ -46,7 +49,7 @@ def build_system(rig: Rig) -> AbstractSystem:
 
     Raises RigError where its mass matrix is not positive definite.
     """
-    values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.parameters.items()}
+    values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.bodies.items()}
     system = systems[rig.system].declared(values, rig.input_joints, rig.machine)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(system.coordinates)))
     if np.linalg.eigvalsh(np.asarray(_masses(system, jnp.asarray(q, float)))).min() <= 0:
@@ -57,6 +60,48 @@ def build_system(rig: Rig) -> AbstractSystem:
 @eqx.filter_jit
 def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof dof"]:
     return jax.vmap(system.mass)(q)
+
+
+def build_servos(rig: Rig) -> tuple[Servo, ...]:
+    """The declared drives, at the mean of what is uncertain; none where all inputs are torques."""
+    numbers = {name: jnp.asarray(rig.parameters[name].mean, float) for name in {*rig.parameters} - {*rig.bodies}}
+
+    def servo(column: str, kind: str) -> Servo:
+        there = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
+        return Servo(column, kind, {key: numbers[f"{column}.{key}"] for key in there})
+
+    return tuple(servo(*pair) for pair in rig.kinds.items()) if rig.input_kinds else ()
+
+
+STIFF, MOST_STEPS = 0.5, 64
+"""Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
+bears 2.8, and the most steps of a sample."""
+
+
+def servo_rate(system: AbstractSystem, servos: tuple[Servo, ...]) -> float:
+    """Fastest eigenvalue of the machine under its servos at rest in some poses [1/s]: of their stiffness and damping.
+
+    Of M a = -K q - D v, K and D the slopes of the torques.
+    """
+    if not servos:
+        return 0.0
+    dof = len(system.coordinates)
+    q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
+    slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
+    state = np.concatenate([np.concatenate([np.zeros((32, dof, dof)), np.tile(np.eye(dof), (32, 1, 1))], 2), slopes], 1)
+    return float(np.max(np.abs(np.linalg.eigvals(state))))
+
+
+@eqx.filter_jit
+def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof state"]:
+    """Derivatives of the accelerations that the servos give by position and rate, under a unit of what is fed."""
+    fed, still = jnp.ones(len(servos)), jnp.zeros(q.shape[1])
+
+    def one(q):
+        force = lambda x, v: system.drive(hooks.driven((), servos, system, fed, x, v))  # noqa: E731
+        return jnp.linalg.solve(system.mass(q), jnp.concatenate(jax.jacfwd(force, (0, 1))(q, still), axis=1))
+
+    return jax.vmap(one)(q)
 
 
 def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
@@ -91,7 +136,10 @@ LAG = 5
 
 
 def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
-    """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy."""
+    """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy.
+
+    The torque of a servo, which nobody logs, is taken to be what the accelerations need.
+    """
     dof = len(system.coordinates)
     y, u = np.asarray(data.y), np.asarray(data.u)
     speed, acceleration = np.full(dof, np.nan), np.full(dof, np.nan)
@@ -113,8 +161,9 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
         energy = np.nanmean(scale**2 * mass) if np.any(np.isfinite(scale)) else 1.0
         scale[np.isnan(scale)] = np.sqrt(energy / mass[np.isnan(scale)])
     drive = np.zeros(dof)
-    for i, joint in enumerate(rig.input_joints):
-        drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
+    for i, (joint, kind) in enumerate(zip(rig.input_joints, rig.kinds.values(), strict=True)):
+        given = abs(system.gears[i]) * np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
+        drive[joint - 1] = given if kind == TORQUE else mass[joint - 1] * acceleration[joint - 1]
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 
@@ -144,7 +193,7 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
 
 def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     """The model that EM starts from: declared physics, a small random friction network, noise as large as motion."""
-    system = build_system(rig)
+    system, servos = build_system(rig), build_servos(rig)
     scales = measure_scales(rig, system, data)
     states = system.coordinates + system.rates
     start, open_ = start_prior(rig, system, data, scales)
@@ -168,6 +217,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         log_r=jnp.asarray(2 * np.log(np.hypot(noise, shaken))),
         measured=tuple(places),
         dt=rig.dt,
+        substeps=min(max(SUBSTEPS, math.ceil(servo_rate(system, servos) * rig.dt / STIFF)), MOST_STEPS),
+        servos=servos or None,
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
     prior = ParameterPrior(

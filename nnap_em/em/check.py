@@ -12,12 +12,23 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset, horizon
 from ..data.logs import Logs
 from ..data.rig import Rig, RigError
+from ..data.servo import TORQUE
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
+from .build import (
+    LAG,
+    MOST_STEPS,
+    NO_MACHINE,
+    STIFF,
+    Scales,
+    build_servos,
+    measure_scales,
+    reading_noise,
+    servo_rate,
+)
 from .felt import felt, sentences
 from .identify import begin
 from .scale import untold
@@ -63,6 +74,8 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     except RigError:
         return [CheckResult(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
+    if stiff := list(_stiff(rig, system)):
+        return [*amount, *stiff]
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
     rows = min(data.valid.shape[1], round(SECONDS / rig.dt) + 1)
@@ -174,8 +187,12 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = _loads_along(rig, system, data)
     needed = gravity + mass * scales.acceleration
+    servos = build_servos(rig)
+    yield from drives(rig, system, data, needed, gravity)
     inputs = np.moveaxis(np.asarray(data.u), -1, 0)
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
+        if rig.kinds[name] != TORQUE:
+            continue
         unit = system.force_unit(joint)
         given = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = given / needed[joint - 1]
@@ -185,7 +202,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     for text in at_stops(rig, data):
         yield CheckResult(LOOK, "range", text)
-    for text in sentences(felt(rig, system)):
+    for text in sentences(felt(rig, system, servos)):
         yield CheckResult(LOOK, "untold", text)
     kept = untold(rig, system, data)
     if kept:
@@ -195,6 +212,44 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
             f"kept as declared is {told}, and all else is relative to that"
         )
         yield CheckResult(_mark(True, False), "scale", text)
+
+
+def drives(
+    rig: Rig,
+    system: AbstractSystem,
+    data: Dataset,
+    needed: Float[np.ndarray, " dof"],
+    gravity: Float[np.ndarray, " dof"],
+) -> Iterator[CheckResult]:
+    """Limits and delays of the declared servos against the logs."""
+    servos, length = build_servos(rig), float(data.valid.sum(axis=1).min()) * rig.dt
+    for i, (servo, joint) in enumerate(zip(servos, rig.input_joints, strict=False)):
+        name, unit = servo.column, system.force_unit(joint)
+        if not servo.feeds_back:
+            continue
+        limit, gear = float(servo.values.get("limit", np.inf)), abs(system.gears[i])
+        weight, whole = gravity[joint - 1] / gear, needed[joint - 1] / gear
+        text = f"{name}: a {servo.kind} servo"
+        text += f", limited to {limit:.3g} {unit}; " if np.isfinite(limit) else "; "
+        text += f"gravity and inertia of joint {joint} ask for {whole:.3g}, gravity alone for {weight:.3g} {unit}"
+        low, delay = limit < 0.9 * weight, float(servo.values.get("delay", 0.0))
+        if low:
+            text += f": the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
+        if late := delay > 0.2 * length:
+            text += f"; a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
+        yield CheckResult(_mark(low or limit < whole or late, limit < 0.5 * weight), "servo", text)
+        if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
+            yield CheckResult(
+                LOOK, "servo", f"{name}: its command never changes, so that it shows no gain and no delay"
+            )
+
+
+def _stiff(rig: Rig, system: AbstractSystem) -> Iterator[CheckResult]:
+    """A servo that no integration step of a sample can follow."""
+    steps = servo_rate(system, build_servos(rig)) * rig.dt / STIFF
+    if steps > MOST_STEPS:
+        text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
+        yield CheckResult(BAD, "servo", f"{text}: look at the units of its gains, or sample faster")
 
 
 def _loads_along(

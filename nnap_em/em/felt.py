@@ -8,10 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.rig import Rig
+from ..model import hooks
+from ..model.servo import Servo, unlimited
 from ..systems import AbstractSystem
 
 LEAST = 1e-6
 """Share of a parameter's own column that must be left when those of the others are taken out of it."""
+_MOMENTS = ("delay", "limit")
 
 
 class Felt(NamedTuple):
@@ -21,21 +24,37 @@ class Felt(NamedTuple):
     """Numbers that no motion depends on."""
     together: tuple[tuple[str, ...], ...]
     """Groups of which motions depend on fewer combinations than members."""
+    rubbed: tuple[str, ...] = ()
+    """Numbers of servos that the learned friction of their joint can take the place of."""
 
 
-def felt(rig: Rig, system: AbstractSystem) -> Felt:
+def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Felt:
     """Base parameters: combinations of uncertain parameters that the inverse dynamics M(q) a + c(q, v) depends on.
 
     [Gautier & Khalil 1990, IEEE Trans. Robotics and Automation 6(3): base parameters]  By the null space of its
-    derivatives at random states, each in declared standard deviations.
+    derivatives at random states, each in declared standard deviations.  With servos, whose torques nobody logs, it is
+    M(q) a + c(q, v) - tau(u, q, v), at the accelerations that the servos give, and without what a learned friction of
+    the joints holds, too.  Delays and limits are identified by moments, if at all, and are left out.
     """
     names = [name for name, declared in rig.parameters.items() if declared.std > 0]
+    names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]
     if not names:
         return Felt((), ())
-    columns = _columns(system, names) * np.asarray([rig.parameters[name].std for name in names])[None, :]
+    columns, friction = _columns(system, servos, names)
+    columns = columns * np.asarray([rig.parameters[name].std for name in names])[None, :]
     size = np.linalg.norm(columns, axis=0)
-    never = [i for i in range(len(names)) if size[i] <= LEAST * size.max(initial=0.0)]
-    left = [i for i in range(len(names)) if i not in never]
+    rubbed: list[int] = []
+    if servos and rig.friction:
+        columns = columns - friction @ np.linalg.lstsq(friction, columns, rcond=None)[0]
+        rubbed = [
+            i for i, left in enumerate(np.linalg.norm(columns, axis=0)) if left <= LEAST * size[i] and size[i] > 0
+        ]
+        size = np.where(np.isin(np.arange(len(names)), rubbed), 0.0, size)
+    gone = [i for i in range(len(names)) if size[i] <= LEAST * size.max(initial=0.0)]
+    never = [i for i in gone if i not in rubbed]
+    left = [i for i in range(len(names)) if i not in gone]
+    if not left:
+        return Felt(tuple(names[i] for i in never), (), tuple(names[i] for i in rubbed))
     _, values, rows = np.linalg.svd(columns[:, left] / size[left], full_matrices=True)
     rank = int(np.sum(values > LEAST * values.max(initial=1e-300)))
     shared = np.abs(rows[rank:].T @ rows[rank:])
@@ -47,21 +66,41 @@ def felt(rig: Rig, system: AbstractSystem) -> Felt:
             group |= other
         groups.append(group)
     together = tuple(tuple(names[left[i]] for i in sorted(group)) for group in groups)
-    return Felt(tuple(names[i] for i in never), together)
+    return Felt(tuple(names[i] for i in never), together, tuple(names[i] for i in rubbed))
 
 
-def _columns(system: AbstractSystem, names: list[str]) -> Float[np.ndarray, "row param"]:
-    """Derivatives of the inverse dynamics at random states by the parameters."""
+def _columns(
+    system: AbstractSystem, servos: tuple[Servo, ...], names: list[str]
+) -> tuple[Float[np.ndarray, "row param"], Float[np.ndarray, "row curve"]]:
+    """Derivatives of the inverse dynamics at random states by the parameters, and functions of each joint's rate."""
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v, a = (jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, dof)), float) for _ in range(3))
+    u = jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, len(system.joints))), float)
+    servos = tuple(unlimited(servo) for servo in servos)
+    own = [name for name in names if any(name == f"{s.column}.{key}" for s in servos for key in s.values)]
 
-    def force(values):
-        changed = system.with_parameters(dict(zip(names, values, strict=True)))
-        return jax.vmap(lambda q, v, a: changed.mass(q) @ a + changed.bias(q, v))(q, v, a).ravel()
+    def driven(system, servos, q, v, u):
+        if not servos:
+            return jnp.zeros_like(q)
+        fed = jnp.stack([servo.fed(u[i][None], 1.0)[0] for i, servo in enumerate(servos)])
+        return system.drive(hooks.driven((), servos, system, fed, q, v))
 
-    values = [system.parameter(name) for name in names]
-    slopes = jax.jit(jax.jacfwd(force))(values)
-    return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1)
+    def force(values, a):
+        told = dict(zip(names, values, strict=True))
+        changed = system.with_parameters({name: value for name, value in told.items() if name not in own})
+        now = tuple(servo.with_values({name: told[name] for name in own}) for servo in servos)
+        needed = lambda q, v, a, u: changed.mass(q) @ a + changed.bias(q, v) - driven(changed, now, q, v, u)  # noqa: E731
+        return jax.vmap(needed)(q, v, a, u).ravel()
+
+    numbers = {f"{servo.column}.{key}": value for servo in servos for key, value in servo.values.items()}
+    values = [numbers[name] if name in own else system.parameter(name) for name in names]
+    if servos:
+        given = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
+        a = jax.jit(jax.vmap(given))(q, v, u)
+    slopes = jax.jit(jax.jacfwd(force))(values, a)
+    powers = np.asarray(v)[:, :, None] ** np.arange(4)
+    curves = np.einsum("rjp,ij->rijp", powers, np.eye(dof)).reshape(q.size, -1)
+    return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves
 
 
 def sentences(found: Felt) -> list[str]:
@@ -69,6 +108,9 @@ def sentences(found: Felt) -> list[str]:
     out = []
     if found.never:
         out.append(f"no motion feels {', '.join(found.never)}: kept as declared; take out what you do not doubt")
+    if found.rubbed:
+        text = f"motions cannot tell {', '.join(found.rubbed)} from the learned friction of the joint"
+        out.append(f"{text}: kept as declared, and friction is what is left; write a number where you know one")
     for group in found.together:
         text = f"motions tell {', '.join(group)} only in combination"
         out.append(f"{text}: along the rest they keep what is declared, and their std says so")

@@ -10,19 +10,19 @@ class ParameterPrior(eqx.Module):
     """Physical parameters to be estimated, with the declared prior; estimated in its standard deviations."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    """Names of the system, "m2" or "forearm.mass", or of an effect by its place, "0.k"."""
+    """Names of the system, "m2" or "forearm.mass", of a servo, "goal.kp", or of an effect by its place, "0.k"."""
     mean: Float[Array, " param"]
     std: Float[Array, " param"]
 
     @property
     def declared(self) -> tuple[str, ...]:
-        """Those of the system, which stand first."""
+        """Those of the system and its servos, which stand first."""
         return tuple(name for name in self.names if not name.partition(".")[0].isdigit())
 
     def places(self, model) -> list:
         """The parameters in the model."""
         return [
-            getattr(model.effects[int(at)], own) if at.isdigit() else model.system.parameter(name)
+            getattr(model.effects[int(at)], own) if at.isdigit() else model.parameter(name)
             for name, (at, _, own) in ((name, name.partition(".")) for name in self.names)
         ]
 

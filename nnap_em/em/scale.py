@@ -21,11 +21,11 @@ def untold(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
     with them. That number is free as long as a change of the uncertain parameters multiplies M and c. Of the change
     that is the least in declared standard deviations, the parameter that moves by the most of them is held; and so on.
     """
-    if np.any(np.asarray(data.u)[np.asarray(data.valid)]):
-        return ()
+    if rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
+        return ()  # the gains of servos are numbers of the machine, and `felt` looks at these
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v = (jnp.asarray(rng.uniform(-3.0, 3.0, (16, dof))) for _ in range(2))
-    names = [name for name, declared in rig.parameters.items() if declared.std > 0]
+    names = [name for name, declared in rig.bodies.items() if declared.std > 0]
 
     def terms(values):
         changed = system.with_parameters(dict(zip(names, values, strict=True)))

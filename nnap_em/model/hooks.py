@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..systems.base import AbstractSystem
+from .servo import Servo
 
 Effects = Sequence[AbstractEffect]
 
@@ -14,12 +15,46 @@ Effects = Sequence[AbstractEffect]
 def reaching(
     effects: Effects, system: AbstractSystem, u: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
-    """What reaches the joints of the commanded inputs of a sequence [N m]."""
+    """What reaches the joints of the commanded torques of a sequence [N m]."""
     for effect in effects:
         if effect.joint in system.joints:
             i = system.joints.index(effect.joint)
-            u = u.at[:, i].set(effect.input(u[:, i], dt))
+            u = u.at[:, i].set(effect.drive(effect.input(u[:, i], dt)))
     return u
+
+
+def fed(
+    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, u: Float[Array, "time input"], dt: float
+) -> Float[Array, "time input"]:
+    """What the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`)."""
+    columns = []
+    for i, (joint, servo) in enumerate(zip(system.joints, servos, strict=True)):
+        column = servo.fed(u[:, i], dt)
+        before = servo.before(column)
+        for effect in effects:
+            if effect.joint == joint:
+                column = before + effect.input(column - before, dt)
+        columns.append(column)
+    return jnp.stack(columns, axis=1)
+
+
+def driven(
+    effects: Effects,
+    servos: Sequence[Servo],
+    system: AbstractSystem,
+    u: Float[Array, " input"],
+    q: Float[Array, " dof"],
+    v: Float[Array, " dof"],
+) -> Float[Array, " input"]:
+    """Torque of every drive at one moment, with the effects that take none [N m, before the gear]."""
+    torques = []
+    for i, (joint, gear, servo) in enumerate(zip(system.joints, system.gears, servos, strict=True)):
+        torque = servo.torque(u[i], gear * q[joint - 1], gear * v[joint - 1])
+        for effect in effects:
+            if effect.joint == joint:
+                torque = effect.drive(torque)
+        torques.append(torque)
+    return jnp.stack(torques)
 
 
 def machine(effects: Effects, system: AbstractSystem, time: Scalar) -> AbstractSystem:

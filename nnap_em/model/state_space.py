@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,15 +17,19 @@ from ..numerics.ode import apart, integrate
 from ..systems.base import AbstractSystem
 from . import hooks
 from .base import AbstractModel
+from .servo import Servo
+
+SUBSTEPS = 2
+"""Integration steps of one sample where nothing asks for more."""
 
 
 class Inputs(NamedTuple):
     """What acts on a machine from outside, in every row or in one."""
 
     u: Float[Array, "*time input"]
-    """What reaches the joints [N m, or N]."""
+    """What reaches the joints [N m, or N]; with servos what commands set in them (`Servo.fed`)."""
     before: Float[Array, "*time input"]
-    """What reached the joints one row before; 0 in the first row."""
+    """That one row before; 0 in the first row."""
     time: Float[Array, "*time"]
     """The clock in the middle of the step [s]."""
     age: Float[Array, "*time"]
@@ -56,9 +60,11 @@ class StateSpaceModel(AbstractModel):
     """Places in `system.readable` of what is read, in the order of y."""
     dt: float = eqx.field(static=True)
     """Sample interval [s]."""
-    substeps: int = eqx.field(static=True, default=2)
+    substeps: int = eqx.field(static=True, default=SUBSTEPS)
     effects: tuple[AbstractEffect, ...] = ()
     """What the declared physics lacks."""
+    servos: tuple[Servo, ...] | None = None
+    """What makes torque of every input; None where the inputs are torques."""
 
     def __str__(self) -> str:
         names = self.system.readable
@@ -74,7 +80,11 @@ class StateSpaceModel(AbstractModel):
 
     def inputs(self, seq: Dataset) -> Inputs:
         """What acts from outside in every row, as the effects have it."""
-        u, t = hooks.reaching(self.effects, self.system, jnp.asarray(seq.u), self.dt), jnp.asarray(seq.t)
+        u, t = jnp.asarray(seq.u), jnp.asarray(seq.t)
+        if self.servos:
+            u = hooks.fed(self.effects, self.servos, self.system, u, self.dt)
+        else:
+            u = hooks.reaching(self.effects, self.system, u, self.dt)
         return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1])
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
@@ -82,7 +92,8 @@ class StateSpaceModel(AbstractModel):
         dof = len(self.system.coordinates)
         q, v = x[:dof], x[dof : 2 * dof]
         system = hooks.machine(self.effects, self.system, u.time)
-        return Scene(system, q, v, system.drive(u.u), u.time, self.unknown(v), self.unknown)
+        torque = hooks.driven(self.effects, self.servos, system, u.u, q, v) if self.servos else u.u
+        return Scene(system, q, v, system.drive(torque), u.time, self.unknown(v), self.unknown)
 
     def rate(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> Float[Array, " state"]:
         """Time derivative of the state under inputs u and an extra generalised force [N m]."""
@@ -101,6 +112,14 @@ class StateSpaceModel(AbstractModel):
         """Mean of the state one sample later."""
         extra = jnp.zeros(len(self.system.coordinates), x.dtype) if force is None else force
         return integrate(lambda x: self.slopes(x, u, extra), x, self.dt, self.steps)
+
+    def parameter(self, name: str) -> Any:
+        """A declared parameter by its name in the rig: of a servo, "goal.kp", or of the machine."""
+        column, _, key = name.rpartition(".")
+        for servo in self.servos or ():
+            if servo.column == column and key in servo.values:
+                return servo.values[key]
+        return self.system.parameter(name)
 
     @property
     def steps(self) -> int:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
 from .. import __version__
 from ..effects import AbstractEffect
@@ -16,7 +15,7 @@ from ..model.state_space import StateSpaceModel
 from ..systems.tree import Tree
 from . import acting
 from .export import literal, unrolled
-from .homes import of_command
+from .homes import takes_time
 
 
 class Acting(NamedTuple):
@@ -38,14 +37,14 @@ def actuator(
     """
     rig, system = fitted.rig, model.system
     assert isinstance(system, Tree)
-    laws = tuple(effect for effect, _ in homeless if _momentary(effect, model.dt))
+    laws = tuple(effect for effect, _ in homeless if _momentary(effect))
     dof, driven = len(system.coordinates), [motor for motor in motors if motor.joint + 1 in system.joints]
 
     def command(u):
         for effect in laws:
             for i, motor in enumerate(driven):
                 if effect.joint == motor.joint + 1:
-                    u = u.at[i].set(effect.input(u[i][None], model.dt)[0])
+                    u = u.at[i].set(effect.drive(u[i]))
         return (u,)
 
     def torque(q, v, drive, time):
@@ -88,12 +87,6 @@ It needs NumPy only:
     return Acting("\n\n".join(parts), laws)
 
 
-def _momentary(effect: AbstractEffect, dt: float) -> bool:
+def _momentary(effect: AbstractEffect) -> bool:
     """True for a law without states that changes no body and no command over time."""
-    if effect.memory or type(effect).physics is not AbstractEffect.physics:
-        return False
-    if not of_command(effect):
-        return True
-    sizes = np.array([-3.0, -1.0, -0.1, 0.0, 0.1, 1.0, 3.0])
-    alone = [float(effect.input(jnp.asarray([u]), dt)[0]) for u in sizes]
-    return bool(np.allclose(np.asarray(effect.input(jnp.asarray(sizes), dt)), alone, rtol=1e-12, atol=1e-12))
+    return not (effect.memory or takes_time(effect) or type(effect).physics is not AbstractEffect.physics)

@@ -34,7 +34,7 @@ def write_draws(fitted: Identified, out: Path, count: int, *, key: PRNGKeyArray)
         row: dict[str, float] = {"draw": i}
         for name, form in zip(drawn.system.coordinates, forms, strict=True):
             row |= {f"{name}.{what}": getattr(form, what) for what in FrictionForm._fields[:5]}
-        row |= {name: float(drawn.system.parameter(name)) for name in paths.prior.declared}
+        row |= {name: float(drawn.parameter(name)) for name in paths.prior.declared}
         for effect in drawn.effects:
             at = effect.joint or effect.channel or "all"
             row |= {f"{effect.name}.{at}.{name}": float(value) for name, value in effect.values().items()}

@@ -21,6 +21,7 @@ from ..report.tables import write_json
 from ..storage.files import replace_bytes, replace_text
 from ..systems import AbstractSystem
 from . import program as portable
+from .homes import of_command
 from .unroll import Source, UnrollError, unroll
 
 PARAMETERS, PREDICTOR, STEP = "parameters.json", "predictor.py", "model.stablehlo"
@@ -100,8 +101,10 @@ def predictor(fitted: Identified) -> str:
     Raises ExportError where the model has an effect that NumPy cannot follow.
     """
     rig, model, prior = fitted.rig, fitted.model, fitted.m_step.prior
+    if model.servos:
+        raise ExportError("its inputs are commands of servos, which have no exported form yet; use nnap-em predict")
     for effect in model.effects:
-        if type(effect).input is not AbstractEffect.input:
+        if of_command(effect):
             raise ExportError(f"the effect {effect.name!r} changes the inputs over time; use {STEP}")
     x, u, z = jnp.zeros(len(_states(model))), jnp.zeros(_width(model)), prior.read(model)
     force = jnp.zeros(len(model.system.coordinates))

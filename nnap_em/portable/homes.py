@@ -51,6 +51,11 @@ def _home(effect: AbstractEffect) -> Home:
 
 def of_command(effect: AbstractEffect) -> bool:
     """True for a law of what reaches a joint of the command."""
+    return takes_time(effect) or type(effect).drive is not AbstractEffect.drive
+
+
+def takes_time(effect: AbstractEffect) -> bool:
+    """True for a law of the command over time."""
     return type(effect).input is not AbstractEffect.input
 
 

@@ -108,6 +108,8 @@ def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
     if not isinstance(system, Tree):
         reason = f"the machine {fitted.rig.system!r} is built in, and has no file to be written back to"
         raise ExportError(f'{reason}; declare it by type = "mjcf" and its file')
+    if model.servos:
+        raise ExportError("its inputs are commands of servos, which are not written yet; write --urdf or --c instead")
     true = hooks.machine(model.effects, system, jnp.zeros(()))
     assert isinstance(true, Tree)
     return true

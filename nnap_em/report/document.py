@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from .. import __version__
 from ..data.logs import Logs
+from ..data.servo import TORQUE
 from ..em.felt import felt, sentences
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
@@ -31,7 +32,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
-        "untold": sentences(felt(fitted.rig, system)),
+        "untold": sentences(felt(fitted.rig, system, fitted.model.servos or ())),
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),
@@ -51,9 +52,10 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
 
 
 def visited(fitted: Identified, velocity: Float[np.ndarray, "sample dof"], train: Logs) -> list[dict[str, Any]]:
-    """Range of velocity of every joint, and of the torque of its drive if it has one, that holds 99 of 100 rows."""
+    """Range of velocity of every joint, and of the torque of its drive if that is logged, that holds 99 of 100 rows."""
     system, u = fitted.model.system, np.asarray(train.data.u)[np.asarray(train.data.valid)]
-    load = {joint: gear * u[:, i] for i, (joint, gear) in enumerate(zip(system.joints, system.gears, strict=True))}
+    drives = zip(system.joints, system.gears, fitted.rig.kinds.values(), strict=True)
+    load = {joint: gear * u[:, i] for i, (joint, gear, kind) in enumerate(drives) if kind == TORQUE}
     ends = lambda values: np.percentile(values, INNER).tolist()  # noqa: E731
     return [
         {"joint": j, "velocity": ends(velocity[:, j - 1]), "load": ends(load[j]) if j in load else None}

@@ -1,0 +1,138 @@
+"""Drives in rig.toml: an input is a torque, or the command of a servo with a law of its own."""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
+
+TORQUE = "torque"
+"""The kind of a column that is the torque itself [N m, or N on a slide]."""
+
+
+class Key(NamedTuple):
+    """A number of a servo."""
+
+    unit: str
+    """Unit on a rotary joint."""
+    needed: bool = False
+    """True where no servo is one without it."""
+    least: float | None = None
+    """The smallest value that is possible; None: any."""
+    open: bool = False
+    """True where the smallest value itself is not possible."""
+
+
+def _gain(unit: str) -> Key:
+    return Key(unit, needed=True, least=0.0, open=True)
+
+
+_COMMON = {"bias": Key("N m"), "limit": Key("N m", least=0.0, open=True), "delay": Key("s", least=0.0)}
+KINDS: Mapping[str, Mapping[str, Key]] = {
+    TORQUE: {},
+    "position": {"kp": _gain("N m/rad"), "kd": Key("N m s/rad", least=0.0), **_COMMON},
+    "velocity": {"kv": _gain("N m s/rad"), **_COMMON},
+    "voltage": {"k": _gain("N m/A"), "R": _gain("ohm"), **_COMMON},
+    "damper": {"kv": _gain("N m s/rad"), **_COMMON},
+    "affine": {"gain": Key("N m", needed=True), "kp": Key("N m/rad"), "kd": Key("N m s/rad"), **_COMMON},
+}
+"""The kinds of an input and the numbers of each; `model/servo.py` has their laws."""
+KEYS = tuple(dict.fromkeys(key for keys in KINDS.values() for key in keys))
+RESERVED = ("columns", "joints", "kind", *KEYS)
+"""Keys of [input]: a column that is called so can have no table of its own."""
+_LINE = 'kind = "position"'
+
+
+class Drive(NamedTuple):
+    """The kind of an input, and its numbers, of class `Declared`, by their keys."""
+
+    kind: str
+    numbers: Mapping[str, Any]
+
+
+def read_drives(table: Any, columns: Collection[str], given: Mapping[str, Drive] | None = None) -> dict[str, Drive]:
+    """The drive of every column of the table [input]; `given` are those of a machine file.
+
+    Keys of [input] hold for every column that has such a number, those of [input.COLUMN] for one.
+    Refused are unknown kinds and keys, a servo without its gain, and numbers that no drive has.
+    """
+    _refuse_unknown(table, columns)
+    drives = {column: _drive(table, column, (given or {}).get(column, Drive(TORQUE, {}))) for column in columns}
+    kinds = {drive.kind for drive in drives.values()}
+    for key in table.items:
+        if key in KEYS and not any(key in KINDS[kind] for kind in kinds):
+            found = f"no input has a {key} (kinds: {', '.join(sorted(kinds)) or 'none'})"
+            table.refuse(key, found, f"write {_LINE} beside it, or take it out")
+    return drives
+
+
+def _drive(table: Any, column: str, given: Drive) -> Drive:
+    """The drive of one column, by its own table, then by [input], then by the file."""
+    own = table.table("" if column in RESERVED else column, absent={})
+    own.check((), ("kind", *KEYS))
+    kind = _kind(own) or _kind(table) or given.kind
+    for key in own.items:
+        if key != "kind" and key not in KINDS[kind]:
+            own.refuse(key, f"an input of kind {kind!r} has no {key}", _possible(kind))
+    numbers = dict(given.numbers) if given.kind == kind else {}
+    for place in (table, own):
+        numbers |= {key: _number(place, key, about) for key, about in KINDS[kind].items() if key in place.items}
+    for key, about in KINDS[kind].items():
+        if about.needed and key not in numbers:
+            found = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
+            mend = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
+            (own if own.items else table).refuse(key, found, mend)
+    return Drive(kind, numbers)
+
+
+def keys(table: Any) -> tuple[str, ...]:
+    """Keys of [input] and tables of single columns in it, which `read_drives` checks."""
+    return (*RESERVED, *(key for key, value in table.items.items() if isinstance(value, dict)))
+
+
+def _refuse_unknown(table: Any, columns: Collection[str]) -> None:
+    """A table of a column that is not there."""
+    for key, value in table.items.items():
+        if isinstance(value, dict) and key not in (*columns, *RESERVED):
+            found = f"no input column is called {key!r}"
+            mend = "name it in columns and its joint in joints, or take the table out"
+            table.refuse(key, found, f"{mend}; columns are {', '.join(columns) or 'none'}")
+
+
+def _kind(table: Any) -> str | None:
+    return table.choice("kind", KINDS) if "kind" in table.items else None
+
+
+def _possible(kind: str) -> str:
+    keys = ", ".join(KINDS[kind])
+    return f"possible are {keys}" if keys else f"write {_LINE} if it is the command of a servo"
+
+
+def _number(table: Any, key: str, about: Key) -> Any:
+    """A number that such a drive can have."""
+    value = table.quantity(key)
+    if about.least is not None and (value.mean < about.least or (about.open and value.mean == about.least)):
+        bound = f"a number above {about.least:g}" if about.open else f"{about.least:g} or more"
+        table.refuse(key, f"found {value.mean:g}", f"write {bound} [{about.unit}]")
+    if key == "gain" and value.mean == 0:
+        table.refuse(key, "found 0", "write the torque of a unit of the command [N m]")
+    return value
+
+
+def named(drives: Mapping[str, Drive]) -> dict[str, Any]:
+    """The numbers of all drives by the names that parameters have: the column, a dot, the key."""
+    return {f"{column}.{key}": value for column, drive in drives.items() for key, value in drive.numbers.items()}
+
+
+def key_of(name: str, kinds: Mapping[str, str]) -> Key | None:
+    """Key of a parameter of the drives of some columns; None for one of the machine."""
+    column, _, key = name.rpartition(".")
+    return KINDS[kinds[column]].get(key) if column in kinds else None
+
+
+def lines(columns: Mapping[str, str], values: Mapping[str, str], text: Any) -> Iterator[str]:
+    """The tables of rig.toml for columns and their kinds; `values` are all parameters as TOML, `text` quotes a name."""
+    for column, kind in columns.items():
+        if kind == TORQUE:
+            continue
+        yield from ("", f"[input.{text(column)}]", f"kind = {text(kind)}")
+        for key in KINDS[kind]:
+            if f"{column}.{key}" in values:
+                yield f"{key} = {values[f'{column}.{key}']}"

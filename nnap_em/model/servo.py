@@ -1,0 +1,87 @@
+"""What turns a command into torque: the law of a drive that feels the position and rate of its joint."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..effects.actuator import InputDelay
+from ..effects.base import Scalar
+
+Values = Mapping[str, Scalar]
+
+
+class Law(NamedTuple):
+    """A torque [N m, or N on a slide] in two parts: what the command sets, then what position and rate make of it."""
+
+    feed: Callable[[Values, Float[Array, " time"]], Float[Array, " time"]]
+    """Of the command u, row by row."""
+    torque: Callable[[Values, Scalar, Scalar, Scalar], Scalar]
+    """Of what was fed, the coordinate q and the rate v, at one moment."""
+
+
+LAWS: Mapping[str, Law] = {
+    "torque": Law(lambda p, u: u, lambda p, fed, q, v: fed),
+    "position": Law(lambda p, u: p["kp"] * u, lambda p, fed, q, v: fed - p["kp"] * q - p.get("kd", 0.0) * v),
+    "velocity": Law(lambda p, u: p["kv"] * u, lambda p, fed, q, v: fed - p["kv"] * v),
+    "voltage": Law(lambda p, u: p["k"] / p["R"] * u, lambda p, fed, q, v: fed - p["k"] ** 2 / p["R"] * v),
+    "damper": Law(lambda p, u: p["kv"] * u, lambda p, fed, q, v: -fed * v),
+    "affine": Law(lambda p, u: p["gain"] * u, lambda p, fed, q, v: fed - p.get("kp", 0.0) * q - p.get("kd", 0.0) * v),
+}
+"""By the kinds of `data/servo.py`; without bias, limit and delay, which all have but the torque itself.
+
+    position   kp (u - q) - kd v            velocity   kv (u - v)
+    voltage    k (u - k v) / R              damper     -kv u v
+    affine     gain u - kp q - kd v         [MuJoCo documentation, Computation, Actuation model: affine gain and bias]
+"""
+
+
+class Servo(eqx.Module):
+    """A drive in the terms of its law: torque(t) = clip(law(u(t - delay), q(t), v(t)) + bias, -limit, limit).
+
+    Coordinate and rate are those of the motor's side of a gear, the torque acts there, too. Before the first row the
+    command stood as in it; a torque was 0.
+    """
+
+    column: str = eqx.field(static=True)
+    """Of the command."""
+    kind: str = eqx.field(static=True)
+    values: dict[str, Scalar]
+    """Numbers by their keys in rig.toml, in the units of `data/servo.py`; what is not there is none."""
+
+    def with_values(self, values: Mapping[str, Scalar]) -> "Servo":
+        """The drive with other numbers, those of `values` that are its own, by their names in the rig ("goal.kp")."""
+        own = {key: values.get(f"{self.column}.{key}", value) for key, value in self.values.items()}
+        return replace(self, values=own)
+
+    @property
+    def feeds_back(self) -> bool:
+        """True where the torque depends on the motion."""
+        return self.kind != "torque"
+
+    def fed(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
+        """What the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m]."""
+        if "delay" in self.values:
+            first = u[:1]
+            u = first + InputDelay(self.values["delay"], joint=0).input(u - first, dt)
+        return LAWS[self.kind].feed(self.values, u)
+
+    def before(self, fed: Float[Array, " time"]) -> Float[Array, " 1"]:
+        """What was set before the first row."""
+        return fed[:1] if self.feeds_back else jnp.zeros_like(fed[:1])
+
+    def torque(self, fed: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        """Torque at one moment [N m, or N], at a coordinate [rad, or m] and a rate."""
+        torque = LAWS[self.kind].torque(self.values, fed, q, v) + self.values.get("bias", 0.0)
+        if "limit" not in self.values:
+            return torque
+        limit = jnp.maximum(self.values["limit"], 0.0)
+        return jnp.clip(torque, -limit, limit)
+
+
+def unlimited(servo: Servo) -> Servo:
+    """The servo as if its torque had no limit."""
+    return replace(servo, values={key: value for key, value in servo.values.items() if key != "limit"})

@@ -1,0 +1,395 @@
+"""Servos as inputs: their torque is that of MuJoCo's actuators, what is declared comes back, mistakes have a mend."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.logs import Logs
+from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
+from nnap_em.data.servo import KINDS
+from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
+from nnap_em.em.build import build, build_servos, build_system
+from nnap_em.em.check import BAD, LOOK, OK, check
+from nnap_em.em.felt import felt, sentences
+from nnap_em.em.identify import identify, parameter_table
+from nnap_em.em.store import load, save
+from nnap_em.model.servo import LAWS, Servo
+from nnap_em.model.state_space import with_effects
+from nnap_em.portable.export import ExportError, export
+from nnap_em.systems import specs
+
+BODY = '<inertial pos="0 0 -.2" mass=".5" diaginertia=".002 .002 .002"/>'
+TWO = f"""<mujoco><worldbody><body name="b"><joint name="a" axis="0 1 0"/>{BODY}
+  <body name="c" pos="0 0 -.4"><joint name="rail" type="slide" axis="1 0 0"/>{BODY}</body></body></worldbody>
+  <actuator>%s</actuator></mujoco>"""
+ACTUATORS = {
+    "position": '<position name="goal" joint="a" kp="12" kv=".3"/>',
+    "velocity": '<velocity name="goal" joint="a" kv=".7"/>',
+    "damper": '<damper name="goal" joint="a" kv=".7" ctrlrange="0 5"/>',
+    "affine": '<general name="goal" joint="a" gainprm="3" biastype="affine" biasprm=".2 -5 -.1"/>',
+    "position on a slide": '<position name="goal" joint="rail" kp="12" kv=".3"/>',
+    "behind a gear": '<position name="goal" joint="a" kp="12" kv=".3" gear="3"/>',
+    "limited": '<position name="goal" joint="a" kp="12" kv=".3" gear="-3" forcerange="-30 30"/>',
+    "limited at its joint": '<velocity name="goal" joint="a" kv="9" gear="2"/>',
+    "general as a servo": '<general name="goal" joint="a" gainprm="9" biastype="affine" biasprm="0 -9 -1"/>',
+    "offset": '<general name="goal" joint="a" gainprm="9" biastype="affine" biasprm=".5 -9 -1"/>',
+}
+RIG = """format = 1
+name = "bench"
+[model]
+type = "{type}"
+{model}
+friction = "unknown"
+{input}
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = [{read}]
+"""
+PENDULUM = "m = 0.5\nlc = 0.2\nI = 0.002\ng = 9.81"
+
+
+def _rig(path: Path, given: str, *, model: str = PENDULUM, kind: str = "pendulum", read: str = '"theta1"') -> Rig:
+    (path / "rig.toml").write_text(RIG.format(type=kind, model=model, input=given, read=read))
+    return read_rig(path / "rig.toml", specs)
+
+
+def _servo(path: Path, lines: str, **model) -> Rig:
+    return _rig(path, f'[input]\ncolumns = ["goal"]\njoints = [1]\n{lines}', **model)
+
+
+def _of_file(path: Path, actuators: str, given: str = "", more: str = "") -> Rig:
+    (path / "machine.xml").write_text((TWO % actuators).replace('axis="0 1 0"', f'axis="0 1 0" {more}'))
+    return _rig(path, given, model='file = "machine.xml"', kind="mjcf", read='"a", "rail"')
+
+
+def _logs(u: np.ndarray, y: np.ndarray | None = None, dt: float = 0.01) -> Dataset:
+    """Sequences of the commands u, batched; readings 0 where there are none."""
+    t = np.broadcast_to(dt * np.arange(u.shape[1]), u.shape[:2])
+    return Dataset(t, u, np.zeros((*u.shape[:2], 1)) if y is None else y, np.ones(u.shape[:2], bool))
+
+
+def _model(rig: Rig, effects=()):
+    swing = np.sin(np.arange(40.0))[None, :, None]
+    u, y = (np.repeat(swing, len(names), axis=2) for names in (rig.input_columns, rig.measured))
+    data = _logs(u, 0.1 * y)
+    return with_effects(build(rig, data, key=jax.random.key(0)).model, effects)
+
+
+def _row(model, u: float):
+    seq = _logs(np.full((1, 4, 1), u))
+    return jax.tree.map(lambda a: a[-1], model.inputs(jax.tree.map(lambda a: jnp.asarray(a[0]), seq)))
+
+
+@pytest.mark.parametrize("name", ACTUATORS)
+def test_a_servo_of_a_file_gives_the_force_of_mujoco(tmp_path, name):
+    more = 'actuatorfrcrange="-15 15"' if name == "limited at its joint" else ""
+    rig = _of_file(tmp_path, ACTUATORS[name], more=more)
+    model, own = _model(rig), mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml"))
+    data, rng, seen = mujoco.MjData(own), np.random.default_rng(0), []
+    for _ in range(12):
+        data.qpos[:], data.qvel[:] = rng.uniform(-2.0, 2.0, (2, 2))
+        data.ctrl[0] = rng.uniform(0.0, 3.0)
+        mujoco.mj_forward(own, data)
+        x = jnp.concatenate([jnp.asarray(data.qpos), jnp.asarray(data.qvel)])
+        drive = model.scene(x, _row(model, float(data.ctrl[0]))).drive
+        np.testing.assert_allclose(drive, data.qfrc_actuator, atol=1e-10)
+        seen.append(np.abs(data.qfrc_actuator).max())
+    assert rig.input_kinds == (name if name in KINDS else "velocity" if "at its joint" in name else rig.input_kinds[0],)
+    assert len(set(np.round(seen, 9))) > 1
+
+
+def test_every_kind_has_a_law():
+    assert set(LAWS) == set(KINDS)
+
+
+def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
+    """m x'' = kp (u - x): x = u (1 - cos(w t)) from rest at 0, at 4 rad per sample, by as many steps as that asks for.
+
+    Tolerance: the fourth-order method at STIFF = .5 loses (w h)^5 / 120 of the phase in a step.
+    """
+    rig = _servo(tmp_path, 'kind = "position"\nkp = 160000.0', model="m = 1.0", kind="slide", read='"x"')
+    model = _model(dataclasses.replace(rig, friction=False))
+    w, rows = 400.0, 12
+    row = _row(model, 0.5)
+    x, found = jnp.zeros(2), []
+    for _ in range(rows):
+        found.append(x[0])
+        x = model.transition(x, row)
+    assert model.steps == 9
+    np.testing.assert_allclose(found, 0.5 * (1 - np.cos(w * 0.01 * np.arange(rows))), atol=0.02)
+
+
+def test_a_late_command_is_that_of_earlier_rows_and_stood_before_the_first(tmp_path):
+    u = np.cumsum(np.random.default_rng(0).normal(size=(1, 20, 1)), axis=1)
+    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(u))
+    late = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0\ndelay = 0.03')).inputs(seq)
+    np.testing.assert_allclose(late.u, 3.0 * np.concatenate([np.repeat(seq.u[:1], 3, axis=0), seq.u[:-3]]), rtol=1e-12)
+    np.testing.assert_allclose(late.before[1:], late.u[:-1])
+    undeclared = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0'), (InputDelay.of(0.03, joint=1),))
+    np.testing.assert_allclose(undeclared.inputs(seq).u, late.u, rtol=1e-12)
+
+
+def test_laws_of_a_moment_act_on_the_torque_of_a_servo(tmp_path):
+    plain = _servo(tmp_path, 'kind = "position"\nkp = 3.0\nkd = 0.5')
+    x, u = jnp.asarray([0.4, -1.0]), 2.0
+    torque = 3.0 * (u - 0.4) + 0.5
+    laws = [
+        (MotorGain.of(-0.2, joint=1), 0.8 * torque),
+        (DeadZone.of(0.3, joint=1), torque - 0.3),
+        (Saturation.of(1.5, joint=1), 1.5),
+    ]
+    for law, expected in laws:
+        model = _model(plain, (law,))
+        np.testing.assert_allclose(model.scene(x, _row(model, u)).drive, [expected], rtol=1e-12)
+
+
+def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
+    k, r = 0.3, 2.0
+    driven = _model(_servo(tmp_path, f'kind = "voltage"\nk = {k}\nR = {r}\nlimit = 0.4\nbias = 0.01'))
+    servo = _model(_servo(tmp_path, f'kind = "velocity"\nkv = {k * k / r}\nlimit = 0.4\nbias = 0.01'))
+    for u, v in ((3.0, 1.0), (-0.2, 2.0), (9.0, -4.0)):
+        x = jnp.asarray([0.1, v])
+        there = [m.scene(x, _row(m, w)).drive for m, w in ((driven, u), (servo, u / k))]
+        np.testing.assert_allclose(*there, rtol=1e-12)
+
+
+def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
+    """Laws of the input give a torque column the same beside a servo and without one."""
+    text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
+    model = "m1 = 0.3\nm2 = 0.25\nl1 = 0.2\nl2 = 0.2\nlc1 = 0.1\nlc2 = 0.1\nI1 = 0.001\nI2 = 0.001\ng = 9.81"
+    both = _rig(tmp_path, text + '[input.goal]\nkind = "position"\nkp = 3.0', model=model, kind="acrobot")
+    assert both.input_kinds == ("position", "torque")
+    laws = (InputDelay.of(0.013, joint=1), MotorGain.of(0.1, joint=1))
+    rng = np.random.default_rng(1)
+    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2))))
+    x = jnp.asarray(rng.normal(size=4))
+    there = _model(both, laws)
+    alone = _model(_rig(tmp_path, text, model=model, kind="acrobot"), laws)
+    for k in (0, 1, 7):
+        rows = [jax.tree.map(lambda a, k=k: a[k], m.inputs(seq)) for m in (there, alone)]
+        one, two = (m.scene(x, row).drive[0] for m, row in zip((there, alone), rows, strict=True))
+        np.testing.assert_allclose(one, two, rtol=1e-12)
+
+
+# --- what is declared
+
+
+def test_numbers_of_a_column_stand_before_those_of_all(tmp_path):
+    text = """[input]
+columns = ["goal1", "goal2"]
+joints = [1, 2]
+kind = "position"
+kp = { mean = 8.0, std = 2.0 }
+delay = 0.02
+[input.goal2]
+kind = "velocity"
+kv = 0.4
+delay = { mean = 0.01, std = 0.005 }
+"""
+    model = "m1 = 0.3\nm2 = 0.25\nl1 = 0.2\nl2 = 0.2\nlc1 = 0.1\nlc2 = 0.1\nI1 = 0.001\nI2 = 0.001\ng = 9.81"
+    rig = _rig(tmp_path, text, model=model, kind="acrobot")
+    assert rig.kinds == {"goal1": "position", "goal2": "velocity"}
+    numbers = {name: value for name, value in rig.parameters.items() if name not in rig.bodies}
+    assert numbers == {
+        "goal1.kp": Declared(8.0, 2.0),
+        "goal1.delay": Declared(0.02, 0.0),
+        "goal2.kv": Declared(0.4, 0.0),
+        "goal2.delay": Declared(0.01, 0.005),
+    }
+    assert set(rig.bodies) == {"m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g"}
+    assert (rig.unit("goal1.kp"), rig.unit("goal2.kv"), rig.unit("goal2.delay")) == ("N m/rad", "N m s/rad", "s")
+    assert "goal1 (position) on joint 1, goal2 (velocity) on joint 2" in str(rig)
+    write_rig(rig, tmp_path / "rig.toml")
+    assert read_rig(tmp_path / "rig.toml", specs) == rig
+
+
+def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
+    rig = _of_file(tmp_path, ACTUATORS["limited"], "[input]\nkp = { mean = 10.0, std = 3.0 }")
+    assert rig.kinds == {"goal": "position"}
+    assert rig.parameters == {
+        "goal.kp": Declared(10.0, 3.0),
+        "goal.kd": Declared(0.3, 0.0),
+        "goal.limit": Declared(30.0, 0.0),
+    }
+    assert build_system(rig).gears == (-3.0,)
+    write_rig(rig, tmp_path / "rig.toml")
+    assert read_rig(tmp_path / "rig.toml", specs) == rig
+    rail = _of_file(tmp_path, ACTUATORS["position on a slide"])
+    assert (rail.unit("goal.kp"), rail.unit("goal.kd")) == ("N/m", "N s/m")
+
+
+def test_a_motor_of_a_file_may_be_declared_a_servo_of_its_joint(tmp_path):
+    motor = '<motor name="goal" joint="a" gear="50"/>'
+    rig = _of_file(tmp_path, motor, '[input]\nkind = "position"\nkp = 5.0')
+    assert (rig.kinds, build_system(rig).gears) == ({"goal": "position"}, (1.0,))
+    write_rig(rig, tmp_path / "rig.toml")
+    assert read_rig(tmp_path / "rig.toml", specs) == rig
+    assert build_system(_of_file(tmp_path, motor)).gears == (50.0,)
+
+
+BAD_LINES = {
+    "no gain": ('kind = "position"', r"\[input\] kp: missing: the input 'goal' of kind 'position' needs its kp; write"),
+    "no kind": ("kp = 3.0", r"\[input\] kp: no input has a kp \(kinds: torque\); write kind = \"position\""),
+    "unknown kind": ('kind = "positon"\nkp = 3.0', "'positon'; did you mean 'position'"),
+    "a kind that is no text": ("kind = 3", 'found 3; write kind = "position"'),
+    "negative gain": ('kind = "position"\nkp = -3.0', r"found -3; write a number above 0 \[N m/rad\]"),
+    "no torque": ('kind = "position"\nkp = 3.0\nlimit = 0.0', r"limit: found 0; write a number above 0 \[N m\]"),
+    "early": ('kind = "position"\nkp = 3.0\ndelay = -0.01', r"delay: found -0.01; write 0 or more \[s\]"),
+    "of another kind": (
+        '[input.goal]\nkind = "velocity"\nkp = 3.0',
+        r"\[input.goal\] kp: an input of kind 'velocity' has no kp; possible are kv, bias",
+    ),
+    "a joint without input": (
+        '[input.elbow]\nkind = "position"\nkp = 3.0',
+        "no input column is called 'elbow'; name it in columns and its joint in joints",
+    ),
+    "misspelt": ('kind = "position"\nkp = 3.0\ndelya = 0.1', "delya: unknown table or key; did you mean 'delay'"),
+    "half a pair": ('kind = "position"\nkp = { mean = 3.0 }', r"\[input.kp\] std: missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_LINES)
+def test_a_mistake_is_refused_with_its_mend(tmp_path, case):
+    lines, message = BAD_LINES[case]
+    with pytest.raises(RigError, match=message) as error:
+        _servo(tmp_path, lines)
+    assert str(tmp_path / "rig.toml") in str(error.value)
+
+
+BAD_FILES = {
+    "muscle": ("<muscle name='goal' joint='a' lengthrange='0 1'/>", "actuator 'goal' is a muscle; log the torque"),
+    "integrated": (
+        "<intvelocity name='goal' joint='a' kp='3' actrange='-1 1'/>",
+        "'goal' has a state of its own; log the goal that it has integrated and make it <position>",
+    ),
+    "lag": ("<position name='goal' joint='a' kp='3' timeconst='.1'/>", "a state of its own; take the lag out of it"),
+    "gain by position": (
+        "<general name='goal' joint='a' gaintype='affine' gainprm='1 2 0'/>",
+        "the gain of actuator 'goal' changes with position",
+    ),
+    "one-sided": (
+        "<position name='goal' joint='a' kp='3' forcerange='-1 2'/>",
+        r"limited to -1 \.\.\. 2; make it symmetric about 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_an_actuator_without_a_place_is_refused_with_its_mend(tmp_path, case):
+    line, message = BAD_FILES[case]
+    with pytest.raises(RigError, match=message):
+        _of_file(tmp_path, line)
+
+
+# --- what cannot be told
+
+
+def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
+    free = PENDULUM.replace("m = 0.5", "m = { mean = 0.5, std = 0.1 }")
+    free = free.replace("I = 0.002", "I = { mean = 0.002, std = 0.001 }")
+    lines = 'kind = "position"\nkp = { mean = 9.0, std = 3.0 }\nkd = { mean = 0.2, std = 0.1 }\n'
+    rig = _servo(tmp_path, lines + "delay = { mean = 0.01, std = 0.01 }\nlimit = { mean = 3.0, std = 1.0 }", model=free)
+    found = felt(rig, build_system(rig), build_servos(rig))
+    assert found.rubbed == ("goal.kd",)
+    assert [set(group) for group in found.together] == [{"m", "I", "goal.kp"}]
+    assert "cannot tell goal.kd from the learned friction of the joint" in " ".join(sentences(found))
+    known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
+    assert felt(known, build_system(known), build_servos(known)) == ((), (), ("goal.kd",))
+    bare = dataclasses.replace(known, friction=False)
+    assert felt(bare, build_system(bare), build_servos(bare)) == ((), (), ())
+
+
+@pytest.mark.parametrize(
+    ("line", "mark", "said"),
+    [
+        ("limit = 0.2", BAD, "the limit is too low; write a higher one"),
+        ("limit = 30.0", OK, "a position servo, limited to 30 N m"),
+        ("delay = 1.0", LOOK, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
+    ],
+)
+def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, mark, said):
+    rig = _servo(tmp_path, f'kind = "position"\nkp = 12.0\nkd = 0.4\n{line}')
+    t = 0.01 * np.arange(200)
+    y = 1.2 * np.sin(6.0 * t)[None, :, None]
+    train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
+    found = [each for each in check(rig, train, None, key=jax.random.key(0)) if each.subject == "servo"]
+    assert [each.mark for each in found] == [mark]
+    assert said in found[0].text
+
+
+def test_check_says_that_a_gain_is_too_stiff_for_the_samples(tmp_path):
+    rig = _servo(tmp_path, 'kind = "position"\nkp = 1.0e8\nkd = 0.4')
+    t = 0.01 * np.arange(200)
+    y = 1.2 * np.sin(6.0 * t)[None, :, None]
+    train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
+    found = [each.text for each in check(rig, train, None, key=jax.random.key(0)) if each.mark == BAD]
+    assert any(re.search("stiffest servo would need .* integration steps of a sample, and gets 64", x) for x in found)
+
+
+# --- the fit
+
+
+KP, DELAY = 12.0, 0.017
+
+
+def _friction(v: float) -> float:
+    return -(0.15 + 0.1 * np.exp(-((v / 0.4) ** 2))) * np.tanh(v / 0.05) - 0.05 * v
+
+
+def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner: int = 10) -> Dataset:
+    """Logs of MuJoCo's own position servo at a pendulum with friction, its command late by `DELAY`."""
+    actuator = f'<position name="goal" joint="a" kp="{KP}" kv=".25"/>'
+    body = f'<worldbody><body><joint name="a" axis="0 1 0"/>{BODY}</body></worldbody>'
+    option = f'<option timestep="{0.01 / inner}" integrator="RK4"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}{body}<actuator>{actuator}</actuator></mujoco>")
+    rng, t = np.random.default_rng(seed), 0.01 * np.arange(rows)
+    commands, readings = [], []
+    for _ in range(sequences):
+        size, period, phase = rng.uniform((0.15, 0.5, 0.0), (0.5, 3.0, 6.0), (3, 3)).T[..., None]
+        u = np.sum(size * np.sin(2 * np.pi * t / period + phase), axis=0)
+        u = u + np.repeat(rng.uniform(-0.6, 0.6, rows // 100), 100)
+        data, y = mujoco.MjData(model), []
+        data.qpos[0] = u[0]
+        for k in range(rows):
+            y.append(data.qpos[0] + 0.001 * rng.normal())
+            for j in range(inner):
+                data.ctrl[0] = u[max(0, int(np.floor(k + (j + 1e-6) / inner - DELAY / 0.01)))]
+                data.qfrc_applied[0] = _friction(data.qvel[0])
+                mujoco.mj_step(model, data)
+        commands.append(u)
+        readings.append(y)
+    return _logs(np.asarray(commands)[..., None], np.asarray(readings)[..., None])
+
+
+def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
+    """Within 5 % and 1 ms, friction to .08 of its size; what is stored is the same, and is not exported."""
+    lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'
+    rig = _servo(tmp_path, lines)
+    fit = identify(rig, _simulated(tmp_path, 0), key=jax.random.key(0), epochs=12)
+    found = parameter_table(fit)
+    assert abs(found["goal.kp"][0] / KP - 1) < 0.05
+    assert abs(found["goal.delay"][0] - DELAY) < 1e-3
+    v = np.linspace(-3.0, 3.0, 61)
+    curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
+    assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
+    save(tmp_path / "model.npz", fit)
+    again = load(tmp_path / "model.npz")
+    assert parameter_table(again) == found and again.rig == rig
+    with pytest.raises(ExportError, match="its inputs are commands of servos"):
+        export(again, tmp_path / "out")
+
+
+def test_a_servo_with_other_numbers_keeps_its_own():
+    servo = Servo("goal", "position", {"kp": jnp.asarray(1.0), "kd": jnp.asarray(2.0)})
+    other = servo.with_values({"goal.kp": jnp.asarray(3.0), "elbow.kd": jnp.asarray(4.0)})
+    assert (float(other.values["kp"]), float(other.values["kd"])) == (3.0, 2.0)

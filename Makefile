@@ -26,11 +26,13 @@ test: lint docs
 check: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/python tests/prose.py
 	$(BIN)/pyright & types=$$!; $(BIN)/pytest $(PYTEST_FLAGS) --durations 3 -m "not slow and not large" && wait $$types
 
 lint: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/python tests/prose.py
 	$(BIN)/pyright
 
 docs: .venv/.test

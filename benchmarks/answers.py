@@ -1,6 +1,6 @@
 """How long the first and a later run of a command take, and what they compile: the time of the one who waits for it.
 
-    python benchmarks/answers.py --table docs/answers.md [FOLDER ...]     # half an hour on two idle cores
+    python benchmarks/answers.py --table docs/results/answers.md [FOLDER ...]     # half an hour on two idle cores
 
 Simulated rigs, and the data sets in the folders.  Each command runs twice in a process of its own: with no program at
 hand (an empty cache), then with those of the first run.

@@ -1,4 +1,4 @@
-"""Simulation-based calibration of the friction bands: a table of docs/trust.md.
+"""Simulation-based calibration of the friction bands: the table of docs/results/calibration.md.
 
 python benchmarks/calibration.py [--draws 100]
 

@@ -3,7 +3,7 @@
     python benchmarks/design.py friction --seeds 5 --out OUT     # some three minutes a seed, half a core
     python benchmarks/design.py apart --seeds 5 --out OUT        # half an hour a seed; --quick is shorter
     python benchmarks/design.py friction --rate 4 --out OUT      # torque may change 4 times as fast as in the logs
-    python benchmarks/design.py table --out OUT                  # the tables of docs/design.md
+    python benchmarks/design.py table --out OUT                  # the tables of docs/results/design.md
 
 friction: an acrobot whose joint 1 is measured alone, 30 s of sines.  Then 30 s more, designed or of the same sines: how
 wide is the friction band near rest (the lowest fifth of the velocities in the first logs) as stated, and how far is it

@@ -1,4 +1,4 @@
-"""Coverage of test recordings by simulations of posterior draws: a table of docs/machines.md.
+"""Coverage of test recordings by simulations of posterior draws: a table of docs/results/machines.md.
 
 python benchmarks/draws.py [--draws 64] [--seeds 10]
 

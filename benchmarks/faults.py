@@ -1,6 +1,6 @@
 """How many faults a run survives: killed at random moments and resumed, does it end with the numbers of no fault?
 
-    python benchmarks/faults.py --faults 40 --table docs/faults.md     # some ten minutes on one core
+    python benchmarks/faults.py --faults 40 --table docs/results/faults.md     # some ten minutes on one core
 
 A run is killed (SIGKILL, or SIGINT as by Ctrl-C) at a moment drawn from the length of an unbroken run, and started
 again with --resume, until it ends before the next fault comes.  Its faults count as survived if all numbers, to the

@@ -1,4 +1,4 @@
-"""How well the friction of the paper's acrobot is found when only joint 1 is seen: the table of docs/identify.md.
+"""Friction of the paper's acrobot, identified from joint 1 alone: the tables of docs/results/identify.md.
 
     python benchmarks/identify.py [--seeds 5] [--test 100] [--smoother cubature particle] [--start-std 0.5]
 

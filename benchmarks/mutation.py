@@ -1,4 +1,4 @@
-"""Every place of `tests/mutants.py` broken in turn: a table of docs/trust.md.
+"""Every place of `tests/mutants.py` broken in turn: the table of docs/results/mutants.md.
 
 python benchmarks/mutation.py [--share 1/1]
 """

@@ -1,4 +1,4 @@
-"""Friction of the simulated slide and pendulum, position read and force driven: the second table of docs/identify.md.
+"""Friction of a simulated slide and pendulum, position read: last table of docs/results/identify.md.
 
 python benchmarks/one_dof.py [--seeds 5]
 """

@@ -3,7 +3,7 @@
     python benchmarks/planted.py list
     python benchmarks/planted.py make dfki_c1-spring2-strong --out out/case
     python benchmarks/planted.py run --out out/planted [--split look] [--share 1/2] ['dfki_c1-*' ...]
-    python benchmarks/planted.py table out/planted [--out docs/planted_table.md]
+    python benchmarks/planted.py table out/planted [--out docs/results/planted_table.md]
 
 `run` leaves one JSON file a case, with truth and report; a case that has one is not run again.
 

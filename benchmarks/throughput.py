@@ -1,4 +1,4 @@
-"""How fast the smoothers are, beside their peers and beside the limit of the machine: docs/throughput.md.
+"""How fast the smoothers are, beside their peers and beside the limit of the machine: docs/results/throughput.md.
 
     python benchmarks/throughput.py [--quick] [--only filter growth ...]
 
@@ -224,18 +224,18 @@ Not measured: other models, devices other than the CPU, and peers in other langu
 
 
 def main() -> None:
-    """Run what is asked for and write docs/throughput.md, or print a quick run."""
+    """Run what is asked for and write docs/results/throughput.md, or print a quick run."""
     kinds = [*titles, "growth", "cores", "epoch", "import"]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small size of everything, to see that it runs")
     parser.add_argument("--only", nargs="+", choices=kinds, default=kinds)
-    parser.add_argument("--out", type=Path, help="of the text; the whole of a full run goes to docs/throughput.md")
+    parser.add_argument("--out", type=Path, help="of the text; that of a full run goes to docs/results/throughput.md")
     args = parser.parse_args()
     size = (3, 60, 200) if args.quick else (20, 500, 1000)
     repeats, budget = (3, 0.0) if args.quick else (7, 5.0)
     cpus = sorted(os.sched_getaffinity(0), reverse=True)  # the first core serves most interrupts
     full = not args.quick and set(args.only) == set(kinds)
-    out = args.out or (root / "docs" / "throughput.md" if full else None)
+    out = args.out or (root / "docs" / "results" / "throughput.md" if full else None)
     began = time.perf_counter()
     lines = [preface, machine() + "."]
     with tempfile.TemporaryDirectory() as cache:
@@ -290,9 +290,9 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
     lines.append(f"`e_step` as the library sets it, {base[0]} sequences x {base[1]} steps, {base[2]} particles and")
     lines += ["25 trajectories where nothing else is said; one core.", ""]
     if out:
-        picture = out.parent / "figures" / "throughput.png"
+        picture = out.parents[1] / "figures" / "throughput.png"
         growth_figure(curves, base).savefig(picture)
-        lines += [f"![Time and memory of the E-step](figures/{picture.name})", ""]
+        lines += [f"![Time and memory of the E-step](../figures/{picture.name})", ""]
     return [*lines, *table(["smoother", "work", "time [s]", "peak memory [MB]"], rows)]
 
 

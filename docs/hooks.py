@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import itertools
 import os
 import re
 from html import unescape
@@ -13,6 +14,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
+from nnap_em.portable.homes import HOMES, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -26,7 +28,8 @@ _ACCENTS = set("¨˙¯~^")
 
 def on_page_markdown(markdown: str, **_) -> str:
     """Put what is made from the code in the place of its marker."""
-    for marker, made in (("<!-- commands -->", commands), ("<!-- effects -->", effects), ("<!-- folders -->", folders)):
+    for made in (commands, effects, folders, verdict):
+        marker = f"<!-- {made.__name__} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, made())
     return markdown
@@ -63,12 +66,30 @@ def commands() -> str:
 
 
 def effects() -> str:
-    """A row for each class of the catalogue: the law, its parameters, and how to confirm it on the machine."""
-    rows = ["| name | law | parameters | to be sure |", "| --- | --- | --- | --- |"]
+    """A row for each class of the catalogue: law, parameters, confirmation on the machine, place in an MJCF file."""
+    rows = ["| name | law | parameters | to be sure | in an MJCF file |", "| --- | --- | --- | --- | --- |"]
     for name, kind in catalogue.items():
         law = kind.meaning().rstrip(".").replace("|", BAR)
         units = ", ".join(f"`{parameter}` [{unit}]" for parameter, unit in kind.units.items())
-        rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} |")
+        rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} | {_place(name)} |")
+    return "\n".join(rows)
+
+
+def _place(name: str) -> str:
+    """Place of a law in MuJoCo, or the reason why it has none."""
+    if name in HOMES:
+        return (HOMES[name].__doc__ or "").partition("\n")[0]
+    return f"None: {REASONS.get(name, 'no element of MuJoCo has this form')}."
+
+
+def verdict() -> str:
+    """A row for each number that decides whether an effect enters a model or leaves it."""
+    body = ast.parse((ROOT / "nnap_em/diagnose/verdict.py").read_text()).body
+    rows = ["| number | value | meaning |", "| --- | --- | --- |"]
+    for number, text in itertools.pairwise(body):
+        if isinstance(number, ast.Assign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            value, meaning = ast.unparse(number.value), " ".join(str(text.value.value).split())
+            rows.append(f"| `{ast.unparse(number.targets[0])}` | {value} | {meaning.replace('|', BAR)} |")
     return "\n".join(rows)
 
 

@@ -31,7 +31,7 @@ MEASURED = ROOT.parent / "shared" / "data" / "measured"
 LAW = "torsional_spring"
 """Taken out of the torque log of the real acrobot."""
 SHORT = {"as the library sets it": "default", "one start, one pass": "one pass"}
-"""Names of rows of docs/throughput.md in a picture."""
+"""Names of rows of docs/results/throughput.md in a picture."""
 Arrays = Mapping[str, Any]
 
 
@@ -149,8 +149,8 @@ def arm(out: Path) -> Arrays:
 
 
 def throughput(out: Path) -> Arrays:
-    """Rows smoothed per second, by this library and by dynamax, out of the tables of docs/throughput.md."""
-    page = (ROOT / "docs" / "throughput.md").read_text()
+    """Rows smoothed per second, by this library and by dynamax, out of the tables of docs/results/throughput.md."""
+    page = (ROOT / "docs" / "results" / "throughput.md").read_text()
     names, whose, speeds = [], [], []
     for kind, head in (("extended", "Extended Kalman filter + RTS"), ("sigma points", "Sigma-point filter + RTS")):
         table = page.partition(f"## {head}\n")[2].partition("\n## ")[0]

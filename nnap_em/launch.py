@@ -1,6 +1,6 @@
 """Several processes for one command: `python -m nnap_em.launch 2 identify FOLDER --out OUT`.
 
-Every process does the same on its share of the sequences; the first one writes and speaks.  For several machines, give
+Every process does the same on its share of the sequences; the first one writes and reports.  For several machines, give
 on each of them
 
     python -m nnap_em.launch --coordinator HOST:PORT --first K --here N COUNT identify FOLDER --out OUT
@@ -24,10 +24,10 @@ from pathlib import Path
 from .storage.files import cores
 
 PATIENCE = 600
-"""How long processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
+"""Time that processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
 
 FAREWELL = 10
-"""How long the first process may take to say what is kept when it is stopped by Ctrl-C [s]."""
+"""Time for the first process to report its finished steps when it is stopped by Ctrl-C [s]."""
 
 
 def free_address() -> str:
@@ -50,9 +50,9 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     if index == 0:
         status = cli.main(command)
         if status == 130:
-            os._exit(status)  # it has said what is kept; jax.distributed would wait for the others here
+            os._exit(status)  # it has reported what is kept; jax.distributed would wait for the others here
         sys.exit(status)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # or the first one would wait for this one and say nothing
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # or the first one would wait for this one and report nothing
     place = command.index("--out") + 1
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:
@@ -86,7 +86,7 @@ def watch(children: list[subprocess.Popen], first: int) -> int:
 def _blame(children: list[subprocess.Popen], first: int) -> int:
     codes = [child.poll() for child in children]
     if codes[0] and codes[0] > 0:
-        return codes[0]  # it has said why
+        return codes[0]  # it has reported the reason
     index = next(i for i, code in enumerate(codes) if code)
     code = codes[index]
     assert code is not None

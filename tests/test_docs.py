@@ -17,6 +17,7 @@ import pytest
 import nnap_em
 from nnap_em.commands import cli
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnose import verdict
 from nnap_em.effects import catalogue
 from nnap_em.smoother import Posterior
 from nnap_em.systems import register, specs, systems
@@ -152,6 +153,7 @@ def test_pages_made_from_the_code_are_whole():
     under = next(a for a in cli.parser()._actions if isinstance(a, argparse._SubParsersAction))
     assert all(f"## {name}\n" in commands for name in under.choices)
     assert all(f"| `{name}` |" in effects for name in catalogue)
+    assert all(f"| `{name}` | " in hooks.verdict() for name in vars(verdict) if name.isupper() and name != "REASONS")
     rows = re.findall(r"(?m)^\| `([\w/]+\.py)` \| \S.* \|$", hooks.folders())
     modules = [p.relative_to(folder) for folder in FOLDERS for p in folder.rglob("*.py") if p.name != "__init__.py"]
     assert sorted(rows) == sorted(map(str, modules))

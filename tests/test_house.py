@@ -5,11 +5,14 @@ import re
 from pathlib import Path
 
 import pytest
+from prose import EXEMPT, in_package, mistakes
 from shell import ROOT
 
 FOLDERS = ("numerics", "storage", "data", "systems", "effects", "model", "smoother", "em", "residual", "curves",
            "diagnose", "design", "report", "portable", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
+UNNAMED = ("diagnose",)
+"""Folders whose README does not yet name all files."""
 
 
 def _imports(path: Path) -> set[str]:
@@ -45,3 +48,36 @@ def test_no_test_imports_another():
         taken = {alias.name for n in imports for alias in n.names}
         taken |= {n.module for n in imports if isinstance(n, ast.ImportFrom)}
         assert not taken & names, path.name
+
+
+def test_docstrings_and_comments_speak_the_language_of_the_field():
+    assert in_package() == {}
+
+
+def test_only_files_that_need_it_are_exempt_from_the_check_of_sentences():
+    wrong = in_package(exempt=True)
+    assert [entry for entry in EXEMPT if not any(name.startswith(entry) for name in wrong)] == []
+
+
+def test_the_check_of_sentences_sees_starts_and_words():
+    assert mistakes('"""Rows of the log that `told` returns."""\n') == []
+    assert mistakes('"""Of every row."""\nx = 1\n"""What a model tells."""  # felt\n') == [
+        (1, "starts with 'Of'"),
+        (3, "has the word 'felt'"),
+        (3, "has the word 'tells'"),
+        (3, "starts with 'What'"),
+    ]
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_readme_names_the_files_of_its_folder(folder):
+    """Each file and each folder within, and none that is not there."""
+    if folder in UNNAMED:
+        return
+    text = (PACKAGE / folder / "README.md").read_text()
+    inner = {p.name for p in (PACKAGE / folder).iterdir() if p.is_dir() and p.name != "__pycache__"}
+    files = {p.name for p in (PACKAGE / folder).glob("*.py") if p.name != "__init__.py"}
+    there = {f"`{name}`" for name in files} | {f"`{name}/`" for name in inner}
+    named = set(re.findall(r"`\w+(?:\.py|/)`", text))
+    assert there - named == set()
+    assert named - there - {f"`{p.name}`" for p in PACKAGE.rglob("*.py")} == set()

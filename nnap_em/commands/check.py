@@ -1,4 +1,4 @@
-"""nnap-em check: whether the logs can identify what is asked."""
+"""nnap-em check: test of whether the logs can identify what is declared."""
 
 import argparse
 

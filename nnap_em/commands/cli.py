@@ -145,7 +145,7 @@ SMOOTHERS = {
     "ekf": "gaussian.ExtendedKalmanSmoother",
     "particle": "particle.smoother.banked",
 }
-"""Where in `nnap_em.smoother` a smoother with its options is made of the hypotheses of the start."""
+"""Function of `nnap_em.smoother` that makes a smoother with its options from the hypotheses of the start."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -299,7 +299,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """`say`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped, noisily."""
+    """`notify`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
+    noisily.
+    """
     asked = False
 
     def handle(number: int, frame: FrameType | None) -> None:
@@ -349,7 +351,7 @@ def _say(text: str) -> None:
 
 
 def _silent(text: str) -> None:
-    """Say nothing."""
+    """Discard a message."""
 
 
 def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):

@@ -1,4 +1,4 @@
-"""What the commands share: set-up, data sets, model files, and runs that go on after a stop."""
+"""Common parts of the commands: set-up, data sets, model files, and runs that go on after a stop."""
 
 import argparse
 import dataclasses
@@ -39,7 +39,7 @@ from ..systems import specs
 
 
 class Halted(RuntimeError):
-    """A file could not be written: the message names it, and says what is kept and how to go on."""
+    """A file could not be written: the message names it, the steps that are kept, and the way to continue."""
 
 
 MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError, ExportError, Halted)
@@ -53,7 +53,7 @@ MOST = 64
 OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
 Say = Callable[[str], None]
-"""Where lines of progress go."""
+"""Receiver of lines of progress."""
 
 
 def set_up() -> None:
@@ -133,7 +133,7 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
 
 
 def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:
-    """One file per sequence; a value that is no number becomes an empty field, and is told."""
+    """One file per sequence; a value that is no number becomes an empty field, with a message."""
     for i, file in enumerate(logs.files):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)
@@ -205,7 +205,7 @@ def _how_to_go_on(args: argparse.Namespace, journal: Journal) -> str:
 
 @contextmanager
 def _telling(kept: Callable[[], str]) -> Iterator[None]:
-    """Say what is kept where one is stopped, or where a file cannot be written."""
+    """Report the finished steps where a run is stopped or a file cannot be written."""
     try:
         yield
     except KeyboardInterrupt:

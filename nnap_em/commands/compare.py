@@ -8,7 +8,7 @@ from .common import Say
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
-    """Print the table; write the page where it is asked for."""
+    """Print the table; write the page if requested."""
     comparison = compare(*args.fits)
     print(table(comparison))
     if args.out is not None:

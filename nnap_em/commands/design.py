@@ -52,7 +52,7 @@ def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
 
 
 def _wanted(args: argparse.Namespace, fitted: Identified) -> list[tuple[Law | None, Law]]:
-    """Laws to be told apart: those that the report beside the model leaves open, and those that --rival names."""
+    """Laws to be discriminated: those that the report beside the model leaves open, and those that --rival names."""
     report = model_file(args.folder).with_name("report.json")
     found = open_pairs(json.loads(report.read_text())) if report.exists() else []
     own = [Law(effect.name, effect.joint, effect.channel) for effect in fitted.model.effects] or [None]

@@ -24,7 +24,7 @@ _NAMES = {  # what people call a column, its number apart
     "x": re.compile(r"(?:x|pos|position)()$"),
 }
 _EITHER = ("pos", "position", "vel", "velocity", "speed")  # of a joint with a number, of a slide without
-_UNITS = {  # how the end of a name says a unit, and what it is in SI; none: it is SI
+_UNITS = {  # unit by the end of a name, and its size in SI; none: SI
     "deg/s": "rad/s", "deg": "rad", "rpm": "rad/s", "mm/s": "m/s", "mm": "m", "ms": "s", "us": "s", "mnm": "N m",
     "nmm": "N m", "rad/s": "", "rad": "", "m/s": "", "nm": "", "n m": "", "n": "", "m": "", "s": "",
 }  # fmt: skip
@@ -51,7 +51,7 @@ class Draft(NamedTuple):
 
     text: str
     notes: tuple[str, ...]
-    """What to change in the log."""
+    """Changes that the log needs."""
 
     @property
     def missing(self) -> list[str]:
@@ -60,20 +60,20 @@ class Draft(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """What a name of the header seems to mean."""
+    """Meaning of a name of the header."""
 
     name: str
     kind: str
     """`time`, `input`, the name of a state, or nothing."""
     number: int | None
     unit: str
-    """Where the name says one that is not SI."""
+    """Unit by the name where it is not SI."""
 
 
 def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
-    """The rig.toml that a CSV log calls for; `system` where its columns do not tell it.
+    """The rig.toml for a CSV log; `system` where its columns do not show it.
 
-    Raises DataError where the log cannot be read or the system not be told.
+    Raises DataError where the log cannot be read or the system not be recognised.
     """
     return drafted(path, numbers(path), system, specs)
 
@@ -111,7 +111,7 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
 
 
 def meaning(name: str) -> _Column:
-    """What a column seems to hold, by its name."""
+    """Meaning of a column by its name."""
     word, unit = name.strip().lower(), ""
     if not any(pattern.match(word) for pattern in _NAMES.values()) and (match := _UNIT.match(word)):
         word, unit = match[1], match[2]
@@ -203,7 +203,7 @@ def measurement(
     spec: SystemSpec,
     unit: Callable[[str], str] = parameter_unit,
 ) -> Iterator[str]:
-    """What is read, its noise, and the state in the first row."""
+    """Tables of readings, their noise, and the state in the first row."""
     yield from ("", "[measurement]")
     names = f"[{', '.join(map(toml_text, measured))}]"
     states = ", ".join(map(toml_text, spec.states))
@@ -220,7 +220,7 @@ def measurement(
 
 
 def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
-    """What to rename or convert in the log."""
+    """Columns to rename or convert in the log."""
     names = {column.name for column in columns}
     for column in columns:
         if column.number and column.name.strip().endswith(str(column.number - 1)):

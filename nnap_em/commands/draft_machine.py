@@ -61,7 +61,7 @@ def _fields(topics: Sequence[Topic]) -> list[tuple[Address, str]]:
 
 
 def _first(fields: Sequence[tuple[Address, str]], wanted: Sequence[str]) -> Address | None:
-    """Where the first of some names is that there is at all."""
+    """Address of the first name that exists."""
     return next((at for name in wanted for at, word in fields if word == name), None)
 
 
@@ -81,7 +81,7 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
 
 
 _IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
-"""What a ROS message of an inertial sensor calls its readings."""
+"""Names of readings in a ROS message of an inertial sensor."""
 
 
 def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
@@ -97,7 +97,7 @@ def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
 
 
 def _kinds(fields: Sequence[tuple[Address, str]]) -> dict[str, Address]:
-    """What names mean that know nothing of the file: `theta2`, and `input2` for a torque."""
+    """Meanings of names that are not in the file: `theta2`, and `input2` for a torque."""
     told = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
     out: dict[str, Address] = {}
     for column, (at, _) in zip(told, fields, strict=True):
@@ -148,7 +148,7 @@ def _model(machine: Machine, file: str) -> Iterator[str]:
 
 
 def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
-    """The inputs; nothing to say where they are the motors of the file."""
+    """The inputs; no lines where they are the motors of the file."""
     if machine.motors and len(joints) == len(machine.motors):
         yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
         return
@@ -161,7 +161,7 @@ def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
 
 
 def _addresses(topics: Sequence[Topic], found: Mapping[str, Address]) -> Iterator[str]:
-    """Where columns are that are not called as they are here."""
+    """Addresses of columns that have another name in the log."""
     lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if str(at) != name]
     if lines:
         yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")

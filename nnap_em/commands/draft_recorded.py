@@ -1,4 +1,4 @@
-"""A first rig.toml from the topics of an MCAP or HDF5 log, with the table that says what was found where."""
+"""A first rig.toml from the topics of an MCAP or HDF5 log, with the table of addresses of all columns."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,12 +14,12 @@ from ..data.rig import SystemSpec, toml_text
 from .draft import Draft, drafted, meaning
 
 ROWS = 100_000
-"""Of the log that are looked at for its interval and its noise."""
+"""Rows of the log from which its interval and noise are estimated."""
 COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
 
 
 def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
-    """The rig.toml that a log of topics calls for; `system` where its names do not tell it.
+    """The rig.toml for a log of topics; `system` where its names do not show it.
 
     Raises DataError where the log cannot be read, or nothing in it looks like a machine.
     """

@@ -41,14 +41,14 @@ def run(args: argparse.Namespace, say: Say) -> None:
 
 
 def smoother(args: argparse.Namespace) -> MakeSmoother:
-    """The E-step that was asked for."""
+    """The chosen E-step."""
     options = {} if args.particles is None else {"num_particles": args.particles}
     home, _, name = SMOOTHERS[args.smoother].rpartition(".")
     return functools.partial(getattr(importlib.import_module(f"nnap_em.smoother.{home}"), name), **options)
 
 
 def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch:
-    """After every epoch: an entry in `epochs`, and a line."""
+    """Add an entry to `epochs` and a line to the log after every epoch."""
     last = time.perf_counter()
 
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
@@ -71,6 +71,6 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch
 
 
 def _noise(rig: Rig, log_r: Float[np.ndarray, " obs"]) -> str:
-    """Of the readings whose noise is estimated."""
+    """Estimated noise of the readings."""
     pairs = zip(rig.measured, np.exp(0.5 * log_r), strict=True)
     return ", ".join(f"{name} {std:.3g}" for name, std in pairs if name not in rig.noise_std) or "as declared"

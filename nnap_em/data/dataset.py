@@ -12,7 +12,7 @@ Array = jax.Array | np.ndarray  # host or device
 
 
 class DataError(ValueError):
-    """A mistake in a log: the message names the file, the place, what was found and the mend."""
+    """A mistake in a log: the message names the file, the place, the value and a hint."""
 
 
 class Dataset(NamedTuple):

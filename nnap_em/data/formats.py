@@ -1,4 +1,4 @@
-"""One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with its mend."""
+"""One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with a hint."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 
 
 
 def has_logs(folder: Path) -> bool:
-    """Whether there is a log in the folder."""
+    """True where there is a log in the folder."""
     return bool(_logs(folder))
 
 
@@ -53,7 +53,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def place(path: Path, column: str, row: int | None = None) -> str:
-    """How a message names a column, or a field of it: by the line of a CSV file, or by the row of another."""
+    """Name of a column, or of a field of it, in messages: by the line of a CSV file, or by the row of another."""
     if row is None:
         return f"column {column!r}"
     return f"{f'line {row + 2}' if path.suffix.lower() == '.csv' else f'row {row + 1}'}, column {column!r}"

@@ -1,4 +1,4 @@
-"""What rig.toml declares of a machine that stands in a file: its names, its inputs, and what of it is uncertain."""
+"""Declaration in rig.toml of a machine from a file: names, inputs, and uncertain numbers."""
 
 import warnings
 from collections.abc import Iterator
@@ -169,7 +169,7 @@ def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
 
 
 def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
-    """That some distribution of mass has the declared inertia."""
+    """Raise RigError unless some distribution of mass has the declared inertia."""
     inertia = np.empty((3, 3))
     for (i, j), what in zip(PAIRS, OF_BODY[4:], strict=True):
         inertia[i, j] = inertia[j, i] = values[what]

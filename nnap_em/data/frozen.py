@@ -16,7 +16,7 @@ from .spikes import LONGEST, noise
 
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
-_SIDE = 10  # rows before and after a run that tell its motion: fewer tell little beside noise, more are no parabola
+_SIDE = 10  # rows before and after a run that show its motion: fewer vanish in noise, more are no parabola
 _AHEAD = 3  # rows that a parabola through `_SIDE` rows is trusted beyond its end
 _SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
 _SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
@@ -82,7 +82,7 @@ def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, 
 def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.ndarray, " time"] | None) -> bool:
     """True where equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
 
-    The noise of a column that hardly ever repeats a reading tells as well: `noisy`, without readings at a limit.
+    The noise of a column that hardly ever repeats a reading counts as well: `noisy`, without readings at a limit.
     """
     away = _travel(name, readings, run, dt)
     if away is not None:
@@ -91,7 +91,7 @@ def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.nd
 
 
 def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """Whether the reading after the run is far from it, beside the usual steps."""
+    """True where the reading after the run is far from it, beside the usual steps."""
     step = np.abs(np.diff(y))
     usual = np.percentile(step[step > 0], 95) if (step > 0).any() else 0.0
     later = y[run.end : run.end + LONGEST + 1]
@@ -126,7 +126,7 @@ def _partner(name: str, readings: Columns) -> str | None:
 
 
 def _travel(name: str, readings: Columns, run: Run, dt: float) -> Float[np.ndarray, " row"] | None:
-    """How far the other column says that it moved while it read the same, over what noise and steps explain."""
+    """Motion during equal readings by the other column, over the part that noise and steps explain."""
     other = _partner(name, readings)
     if other is None:
         return None
@@ -164,7 +164,7 @@ def _quantum(y: Float[np.ndarray, " time"]) -> float:
 def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> bool:
     """True where it went beyond its limit: by the other column, or by the motion before and after.
 
-    A rate denies what the motion of its coordinate says: a machine at a stop comes and goes as fast.
+    A rate decides against the motion of its coordinate: a machine at a stop comes and goes as fast.
     """
     y = readings[name]
     before, after = y[max(run.first - _SIDE, 0) : run.first], y[run.end : run.end + _SIDE]

@@ -1,4 +1,4 @@
-"""What a machine may be asked to do: the table [limits] of `rig.toml`."""
+"""Limits of a machine for designed inputs: the table [limits] of `rig.toml`."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -13,11 +13,11 @@ class Bounds:
     """Lowest and highest values, by column, in SI units; what is absent is as far as the logs went."""
 
     values: Mapping[str, Range] = field(default_factory=dict)
-    """Of inputs [N m, or N], coordinates and rates."""
+    """Ranges of inputs [N m, or N], coordinates and rates."""
     rate: Mapping[str, Range] = field(default_factory=dict)
-    """Of the change of inputs [N m/s]."""
+    """Ranges of the change of inputs [N m/s]."""
     start: Mapping[str, Range] = field(default_factory=dict)
-    """Of the states in which a sequence may begin, set by hand."""
+    """Ranges of the states in which a sequence may begin, set by hand."""
 
 
 UNBOUNDED = Bounds()

@@ -82,7 +82,7 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
 def groups(machine: Machine, free: Callable[[int], bool]) -> list[int]:
     """A number for every body, and 0 for the world at the end: the same for bodies that nothing moves apart.
 
-    `free` says of a body by its place in the list that some joint moves it.
+    `free` is true for a body, by its place in the list, that some joint moves.
     """
     out: list[int] = []
     for i, body in enumerate(machine.bodies):

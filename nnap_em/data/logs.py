@@ -20,7 +20,7 @@ from .rough import Rough, rough
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
-TOLD = 0.1  # of the impulse of one row: how wrong inputs that are told over a gap may be
+TOLD = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 _REASONS = {
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
@@ -34,7 +34,7 @@ class DataWarning(UserWarning):
 
 
 class Masked(NamedTuple):
-    """What a log holds and a fit does not see."""
+    """Readings of a log that a fit does not use."""
 
     file: str
     kind: str
@@ -43,7 +43,7 @@ class Masked(NamedTuple):
     row: int
     """The first one in the file, counted from 1 under the header."""
     time: float
-    """Of that row [s]."""
+    """Time of that row [s]."""
     amount: int
     """Readings, or rows."""
 
@@ -71,7 +71,7 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
-    Those later than `until` [s after the first row] are neither masked nor asked: a prediction may not know of them.
+    Those later than `until` [s after the first row] are neither masked nor used: a prediction has no access to them.
     Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
     files = log_files(Path(folder))
@@ -104,7 +104,7 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
 
 
 def together(parts: Mapping[str, Logs]) -> Logs:
-    """Logs of one rig from some folders as one; files of all but the first are told by the names of their folders."""
+    """Logs of one rig from some folders as one; files of all but the first carry the names of their folders."""
     first, *rest = parts.items()
     if not rest:
         return first[1]
@@ -123,13 +123,13 @@ def _unpadded(data: Dataset) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 class _Table(NamedTuple):
-    """One file, its clock checked; rows that it lost are back, with inputs told from the others."""
+    """One file, its clock checked; rows that it lost are back, with interpolated inputs."""
 
     path: Path
     table: Float[np.ndarray, "time column"]
     """Time, inputs, readings."""
     rows: Int[np.ndarray, " row"]
-    """Where those of the file stand."""
+    """Rows of the uniform grid in which those of the file stand."""
     masked: list[Masked]
 
     def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
@@ -182,7 +182,7 @@ def _sequence(whole: _Table, found: Sequence[Rough], rig: Rig) -> _Sequence:
 
 
 def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray, " time"]:
-    """Where the rows of a file stand in a uniform one; refuses a clock that is not uniform but for a few gaps."""
+    """Place of the rows of a file in a uniform grid; refuses a clock that is not uniform but for a few gaps."""
     steps = np.diff(t) / rig.dt
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
@@ -207,7 +207,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
 
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
-    """The rows that the file lost, without readings; cut at the first gap where inputs cannot be told."""
+    """The rows that the file lost, without readings; cut at the first gap where inputs cannot be interpolated."""
     size, inputs = int(rows[-1]) + 1, slice(1, 1 + len(rig.input_columns))
     if size == len(rows):
         return _Table(path, table, rows, [])

@@ -1,4 +1,4 @@
-"""The inputs of rows that a log lost, told from the rows around them."""
+"""Inputs of rows that a log lost, interpolated from the rows around them."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from .frozen import runs
 
 _ORDER = 16  # of the linear prediction of an input
-_TRIALS = 40  # gaps that are made on purpose to see how well an input is told
+_TRIALS = 40  # gaps that are made on purpose to measure the error of interpolation
 
 
 class Told(NamedTuple):
@@ -17,14 +17,14 @@ class Told(NamedTuple):
 
     u: Float[np.ndarray, " time"]
     doubt: Float[np.ndarray, " time"]
-    """How wrong the gap of a lost row may be: what is told minus what was, summed, over the size of one row."""
+    """Interpolation error of the gap of a lost row: estimated minus true, summed, over the size of one row."""
 
 
 def retell(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) -> Told:
-    """An input with its lost rows told from the others, and how far to trust them.
+    """An input with its lost rows interpolated, and the interpolation error.
 
     The lost rows are those that linear prediction from the rows around makes likeliest [Janssen, Veldhuis & Vries
-    1986, IEEE Trans. ASSP 34(2)].  The doubt is the worst of gaps of the same length that are made elsewhere.
+    1986, IEEE Trans. ASSP 34(2)].  The error is the worst of gaps of the same length that are made elsewhere.
     """
     size, doubt = float(np.sqrt(np.mean(u[~lost] ** 2))), np.zeros(u.size)
     if size == 0.0:

@@ -37,7 +37,7 @@ OF_BODY = ("mass", *(f"com.{axis}" for axis in AXES), *(f"inertia.{AXES[i]}{AXES
 
 
 def of_body(body: Body) -> tuple[float, ...]:
-    """In the order of `OF_BODY`."""
+    """Values in the order of `OF_BODY`."""
     return body.mass, *body.centre, *(body.inertia[i][j] for i, j in PAIRS)
 
 
@@ -49,13 +49,13 @@ class Joint(NamedTuple):
     """The body that it moves; several joints of one body act in the order of the list."""
     slide: bool
     axis: Vector
-    """Of unit length, in the frame of the body."""
+    """Unit vector in the frame of the body."""
     anchor: Vector
     """A point of the axis in the frame of the body [m]."""
     zero: float
     """Coordinate at which the body stands as declared [rad or m]."""
     stiffness: float
-    """Of its spring [N m/rad or N/m]."""
+    """Stiffness of its spring [N m/rad or N/m]."""
     rest: float
     """Coordinate at which the spring is at rest."""
     armature: float
@@ -65,7 +65,7 @@ class Joint(NamedTuple):
     dry: float
     """Dry friction of the file [N m or N]."""
     range: tuple[float, float] | None
-    """Where its stops are."""
+    """Positions of its stops."""
 
 
 class Motor(NamedTuple):
@@ -108,9 +108,9 @@ class Sense(NamedTuple):
     body: int
     """-1: the world."""
     place: Vector
-    """Of the site in the frame of the body [m]."""
+    """Position of the site in the frame of the body [m]."""
     turn: Rotation
-    """Of the site in the frame of the body."""
+    """Orientation of the site in the frame of the body."""
 
 
 SENSE_UNITS = {"gyro": "rad/s", "accelerometer": "m/s^2", "framepos": "m"}
@@ -129,7 +129,7 @@ class Machine(NamedTuple):
     gauges: tuple[Gauge, ...]
     spots: tuple[Spot, ...]
     states: tuple[str, ...] = ()
-    """What the coordinates, then the rates, are called in the logs."""
+    """Names of the coordinates, then of the rates, in the logs."""
     gears: tuple[float, ...] = ()
     """Torque of a unit of every input column."""
     motored: bool = False
@@ -137,7 +137,7 @@ class Machine(NamedTuple):
     rubs: bool = False
     """True where friction of the file acts, because none is learned."""
     senses: tuple[Sense, ...] = ()
-    """Of a file all, of a rig those that are measured."""
+    """All sensors of a file, measured ones of a rig."""
     part: tuple[tuple[str, ...] | None, tuple[tuple[str, float], ...]] | None = None
     """The joints that rig.toml names, and those that it holds with their values; None where all of the file move."""
 

@@ -1,4 +1,6 @@
-"""What numbers of a right form betray: wrong units and signs, wrapped angles, swapped columns, dead sensors, copies."""
+"""Plausibility of numbers of a valid form: wrong units and signs, wrapped angles, swapped columns, dead sensors,
+copies.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +15,7 @@ Columns = Mapping[str, Float[np.ndarray, " time"]]
 IMPLAUSIBLE = 30.0  # rad/s, as the median speed of a joint
 STRETCH = 20  # rows that two sequences do not have in common by chance
 _DEGREES = "it looks like degrees: write rad and rad/s"
-_ANGLE = (  # by what an angle's rate of change exceeds its rate column, which of the two is wrong, and the mend
+_ANGLE = (  # factor of an angle's rate of change over its rate column, the wrong one of the two, and the hint
     (math.degrees(1), "", _DEGREES),
     (math.radians(1), "d", _DEGREES),
     (1 / (2 * math.pi), "", "it looks like turns: write rad"),
@@ -27,7 +29,7 @@ _ANY = (
 
 
 class Doubt(NamedTuple):
-    """What is doubtful in a column, from which row on, and how to mend it."""
+    """Implausible part of a column, from which row on, and the hint."""
 
     ruins: bool
     """True where a fit would be wrong without a word; False where it may be meant."""
@@ -55,9 +57,9 @@ def doubts(
     unit: Callable[[str], str] = parameter_unit,
     pairs: Sequence[tuple[str, str]] | None = None,
 ) -> Iterator[Doubt]:
-    """What is doubtful in the columns of one sequence, sampled every `dt` [s].
+    """Implausible parts of the columns of one sequence, sampled every `dt` [s].
 
-    `pairs` are the columns of coordinates and of their rates, where the names do not tell.
+    `pairs` are the columns of coordinates and of their rates, where the names do not show it.
     """
     for name, values in readings.items():
         observed = values[np.isfinite(values)]
@@ -153,7 +155,7 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
 
 
 def _moves(values: np.ndarray) -> bool:
-    """Whether a signal is more than noise: its steps are small beside its range."""
+    """True where a signal is more than noise: its steps are small beside its range."""
     observed = values[np.isfinite(values)]
     return observed.size > STRETCH and float(np.std(np.diff(observed))) < 0.2 * float(np.std(observed))
 
@@ -168,7 +170,7 @@ def _follows(position: np.ndarray, rate: np.ndarray, dt: float) -> tuple[float, 
 
 
 def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " way"]:
-    """How far it goes in 0.1 s: long enough to see past the noise of single readings."""
+    """Change within 0.1 s, which exceeds the noise of single readings."""
     span = min(max(round(0.1 / dt), 1), values.size - 1)
     values = bridge(values)
     return values[span:] - values[:-span]

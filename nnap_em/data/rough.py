@@ -1,4 +1,4 @@
-"""Readings that no sensor took: spikes, and what a stuck, late or saturated sensor says."""
+"""Readings that no sensor took: spikes, and the output of a stuck, late or saturated sensor."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -21,7 +21,7 @@ class Rough(NamedTuple):
 
 
 def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = ()) -> list[Rough]:
-    """What is no reading in the columns of one sequence, sampled every `dt` [s]; NaN is a missing sample.
+    """Implausible readings in the columns of one sequence, sampled every `dt` [s]; NaN is a missing sample.
 
     `limits` are columns and values at which they are known to saturate.
     """

@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-SPIKE = 6.0  # standard deviations of a reading from what its neighbours tell
+SPIKE = 6.0  # standard deviations of a reading from the value of its neighbours
 LONGEST = 3  # rows of a spike
-MOVING = 0.1  # share of the rows of a column that tell its noise by themselves: 1 % of spikes spoils 5 % of them
-_SIDE, _NEAR = 5, 3  # rows on either side of a spike that are asked, and where the signal is too quick for these
+MOVING = 0.1  # share of the rows of a column that show its noise by themselves: 1 % of spikes spoils 5 % of them
+_SIDE, _NEAR = 5, 3  # rows on either side of a spike that are compared, and where the signal is too quick for these
 _MARGIN = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
 _END = 5.0  # times as large it must be in the first and last three rows, which have neighbours on one side
 _PAIR = 2.5  # times as large it must be where another row near by has to be left out to see it
-_AROUND = 10  # rows before and after a spike that say how restless the signal is
+_AROUND = 10  # rows before and after a spike that show the activity of the signal
 _RESTLESS = 5.0  # times its own jerks that a spike must be
 _LEAST = 0.015  # of the standard deviation of the column: a smaller spike does no harm, and machines make small wiggles
 _QUICK = 3.0  # times what the curve of `_SIDE` neighbours misses that a spike from that of `_NEAR` must be
-_DOUBT = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them tell little
+_DOUBT = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them show little
 _SHORT = 5.0  # times as large a run must be as a single reading: machines make short wiggles too
 
 
@@ -43,7 +43,7 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
 def noise(y: Float[np.ndarray, " time"]) -> float:
     """Standard deviation of a reading about its neighbours' cubic, by the median; at least a third of a step.
 
-    Stretches in which readings repeat tell nothing of the noise of others, and count only where nearly all do.
+    Stretches in which readings repeat show nothing of the noise of others, and count only where nearly all do.
     """
     seen = y[np.isfinite(y)]
     left = _left(np.flatnonzero(np.isfinite(y)), y, 1)
@@ -56,7 +56,7 @@ def noise(y: Float[np.ndarray, " time"]) -> float:
 
 
 class _Left(NamedTuple):
-    """What is left of the readings of runs when the cubic through two neighbours on either side is taken off."""
+    """Residual of the readings of runs after the cubic through two neighbours on either side is taken off."""
 
     rows: Int[np.ndarray, "run row"]
     miss: Float[np.ndarray, "run row"]
@@ -67,7 +67,7 @@ class _Left(NamedTuple):
 
 
 def _left(k: Int[np.ndarray, " seen"], y: Float[np.ndarray, " time"], length: int) -> _Left:
-    """Of all runs of `length` among the rows `k` that were read."""
+    """Residuals of all runs of `length` among the rows `k` that were read."""
     count = max(k.size - length - 3, 0)
     at = np.arange(count)[:, None]
     nodes, inner = k[at + np.array([0, 1, length + 2, length + 3])], k[at + 2 + np.arange(length)]
@@ -98,7 +98,7 @@ def _candidates(y: Float[np.ndarray, " time"], sigma: float) -> Iterator[Int[np.
 
 
 def _is_spike(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone: list[int], sigma: float) -> bool:
-    """Whether the neighbours agree without the run; one of them that may be a spike itself may be left out."""
+    """True where the neighbours agree without the run; one of them that may be a spike itself may be left out."""
     if _stands_out(y, run, sigma, _SIDE) or _stands_out(y, run, sigma, _NEAR):
         return True
     for other in alone:
@@ -118,7 +118,7 @@ class _Fit(NamedTuple):
     y: Float[np.ndarray, " row"]
     base: Float[np.ndarray, "row term"]
     size: float
-    """How far the nearest reading of the run lies from it."""
+    """Distance of the nearest reading of the run."""
     rest: float
     """The least squares that it leaves."""
     freedom: int
@@ -144,7 +144,9 @@ def _fit(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], side: int)
 def _stands_out(
     y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float, side: int, strict: float = 1.0
 ) -> bool:
-    """Whether the run is far from the curve of `side` neighbours, and a jump, a kink or both explain the rows worse."""
+    """True where the run is far from the curve of `side` neighbours, and a jump, a kink or both explain the rows
+    worse.
+    """
     fit = _fit(y, run, side)
     excess = max(fit.rest / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
     spread = max(sigma, math.sqrt(fit.rest / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
@@ -183,7 +185,7 @@ def _broken(x: Float[np.ndarray, " row"], base: Float[np.ndarray, "row term"], y
 
 
 def _activity(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma: float) -> float:
-    """How far readings around the run lie from the cubic through their neighbours, as far as noise does not explain it.
+    """Distance of readings around the run from the cubic through their neighbours, as far as noise does not explain it.
 
     The upper quartile: one more spike near by does not hide this one.
     """

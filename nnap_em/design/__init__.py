@@ -1,1 +1,1 @@
-"""What to run on the machine next: the inputs that answer the open questions best."""
+"""The next experiment: inputs that determine what a fit leaves open."""

@@ -27,11 +27,11 @@ CHECKED, DRAWN_IN = 500, 200
 SLOW = 20
 """Percent of the rows that are near rest."""
 NEAR_REST = 0.05
-"""Of the largest velocity: below it velocities count alike, above it the less the denser they would be."""
+"""Share of the largest velocity: below it velocities count alike, above it the less the denser they would be."""
 
 
 class Design(NamedTuple):
-    """Sequences to be played, and what they would tell."""
+    """Sequences to be played, and their expected information."""
 
     fitted: Identified
     limits: Limits
@@ -40,27 +40,27 @@ class Design(NamedTuple):
     u: Float[np.ndarray, "sequence time input"]
     """[N m, or N]"""
     start: Float[np.ndarray, "sequence readable"]
-    """Where each begins, set by hand."""
+    """Start of each sequence, set by hand."""
     low: Float[np.ndarray, "sequence time readable"]
     """The central 98 % of the motions."""
     middle: Float[np.ndarray, "sequence time readable"]
     high: Float[np.ndarray, "sequence time readable"]
     fit: Fit
     told: Told
-    """By all sequences."""
+    """Information of all sequences."""
     old: Told
-    """What as much time of the old inputs would tell."""
+    """Information of as much time of the old inputs."""
     question: AbstractQuestion
     rivals: tuple[Rivals, ...]
     apart: Apart | None
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
-    """Which velocities count; 0 where the logs never were."""
+    """Weight of velocities; 0 where the logs never were."""
 
     @property
     def nothing(self) -> Told:
-        """What is told without an experiment."""
+        """Information without an experiment."""
         return jax.tree.map(np.zeros_like, self.told)
 
 
@@ -76,12 +76,12 @@ def design_experiment(
     effort: Effort = EFFORT,
     say: Say = lambda text: None,
 ) -> Design:
-    """The `sequences` inputs of `seconds` [s] together that answer a question best, found by a seeded search.
+    """The `sequences` inputs of `seconds` [s] together that serve a criterion best, found by a seeded search.
 
-    `question` is "friction", "parameters", the name of one, "apart" (tell each of `rivals`) or "all" of what there is.
-    `data` are the logs that `fitted` was fitted to.  Every sequence stays inside the limits of its rig (`limits_of`)
-    for 500 models drawn from the posterior, process noise included.
-    Raises DesignError where the rig has no input, a start is out of the limits, or there is nothing to ask.
+    `question` is "friction", "parameters", the name of one, "apart" (discriminate each of `rivals`) or "all" of what
+    there is. `data` are the logs that `fitted` was fitted to.  Every sequence stays inside the limits of its rig
+    (`limits_of`) for 500 models drawn from the posterior, process noise included. Raises DesignError where the rig has
+    no input, a start is out of the limits, or nothing is open.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
     data = jax.device_put(data)
@@ -179,7 +179,7 @@ def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.nd
 
 
 SHRINKS, LAST = 0.85, 12
-"""What a sequence that breaks a limit after all is multiplied with, and how often at most."""
+"""Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
 
 
 def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say):
@@ -200,12 +200,12 @@ def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say)
 
 
 def _padded(proposal: Proposal, batch: int) -> Proposal:
-    """As many as are played at once: one program serves."""
+    """Batch padded to the number played at once: one program serves."""
     return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
 
 
 def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
-    """What a row of the logs tells, the mean along their smoothed motions, as far as a new sequence is long."""
+    """Information of a row of the logs, the mean along their smoothed motions, as far as a new sequence is long."""
     rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
     short = rows - cut.t.shape[1]

@@ -1,4 +1,4 @@
-"""What a sequence would tell: expected information by the sensitivities that the fit itself uses."""
+"""Expected information of a sequence, by the sensitivities that the fit itself uses."""
 
 import math
 from typing import NamedTuple
@@ -30,11 +30,11 @@ class Fit(NamedTuple):
     cov: Float[Array, "phi phi"]
     """Posterior covariance of phi (Laplace)."""
     prior_cov: Float[Array, "phi phi"]
-    """That before any log."""
+    """Covariance before any log."""
 
 
 def known(fitted: Identified) -> Fit:
-    """What is known after a fit."""
+    """Knowledge after a fit."""
     weights = fitted.m_step.weights(fitted.model)
     cov, before = _covariances(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian)
     return Fit(fitted.model, fitted.m_step.prior, weights.nodes, cov, before)
@@ -93,14 +93,14 @@ def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
 
 
 def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time state phi"]:
-    """Sensitivity of the next state to phi; friction is felt at all speeds that the path may have."""
+    """Sensitivity of the next state to phi; friction acts at all speeds that the path may have."""
     speeds = _speeds(path, fit.nodes.shape[0])
     torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, here.by_force)
     return jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter], axis=-1), 0.0)
 
 
 def _sensitivities(fit: Fit, here: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
-    """Of the whitened readings to phi."""
+    """Sensitivities of the whitened readings to phi."""
     columns = columns_of(fit, here, path)
     readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), here)
     jac = whitened_sensitivities(filtered, columns, readings, here.seq.observed)
@@ -108,7 +108,7 @@ def _sensitivities(fit: Fit, here: Local, filtered: Filtered, path: Gaussian) ->
 
 
 class Contrast(NamedTuple):
-    """How far the readings of a true model are from what a rival expects, in its whitened innovations r = J delta."""
+    """Readings of a true model beside those that a rival expects, in its whitened innovations r = J delta."""
 
     information: Float[np.ndarray, "*proposal phi phi"]
     """J' J, of the rival's own phi."""
@@ -121,7 +121,7 @@ class Contrast(NamedTuple):
 def contrast(
     rival: Fit, truth: StateSpaceModel, seq: Dataset, start: Float[np.ndarray, "proposal readable"]
 ) -> Contrast:
-    """What a rival would make of the readings that `truth` gives from `start` on, without noise."""
+    """Innovations of a rival on the readings that `truth` gives from `start` on, without noise."""
     return Contrast(*map(np.asarray, each(_contrast, (rival, truth), (seq, jnp.asarray(start)))))
 
 

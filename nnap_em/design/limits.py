@@ -1,4 +1,4 @@
-"""What the machine may be asked to do: as declared, and where nothing is declared as far as its logs went."""
+"""Limits of the machine: as declared, else the range of its logs."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -17,11 +17,11 @@ OUTER = 0.1
 
 
 class DesignError(ValueError):
-    """No experiment can be designed as it is asked: the message says why, and the mend."""
+    """No experiment can be designed: the message has the reason and a hint."""
 
 
 class Limits(NamedTuple):
-    """Lowest and highest of what is asked of the machine."""
+    """Lowest and highest values allowed on the machine."""
 
     low: Float[np.ndarray, " input"]
     """Inputs [N m, or N]."""
@@ -44,7 +44,7 @@ def limits_of(
     path: Float[np.ndarray, "seq time state"],
     used: Bool[np.ndarray, " seq"],
 ) -> Limits:
-    """As `rig` declares them, else as far as `data` and the smoothed `path` of the sequences `used` went.
+    """Limits as `rig` declares them, else as far as `data` and the smoothed `path` of the sequences `used` went.
 
     A sequence begins at rest: where nothing else is declared with all coordinates 0, if the machine was there and stays
     there, else where the logs begin on average.

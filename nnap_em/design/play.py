@@ -1,4 +1,4 @@
-"""What the machine would do, as far as the fit knows it: motions drawn from its posterior."""
+"""Motions of the machine, drawn from the posterior of its fit."""
 
 from typing import NamedTuple
 
@@ -19,10 +19,10 @@ SAFE = 3.5
 
 
 class Motions(NamedTuple):
-    """Of some inputs, by models drawn from the posterior."""
+    """Motions under some inputs, by models drawn from the posterior."""
 
     lowest: Float[Array, "*proposal path readable"]
-    """Of every coordinate and rate over the whole motion."""
+    """Lowest value of every coordinate and rate over the whole motion."""
     highest: Float[Array, "*proposal path readable"]
     x: Float[Array, "*proposal few time state"]
     """The first few motions themselves."""
@@ -33,7 +33,7 @@ class _Common(NamedTuple):
     spread: Float[Array, " readable"]
     """Standard deviation of the first state."""
     few: Float[Array, " few"]
-    """As many motions are kept."""
+    """Number of motions that are kept."""
 
 
 def motions(
@@ -88,7 +88,7 @@ def _motions(common: _Common, one) -> Motions:
 
 
 def allowed(found: Motions, limits: Limits) -> Bool[np.ndarray, " proposal"]:
-    """Whether all motions stay inside the limits, and their excursions far enough for those that were not drawn."""
+    """True where all motions stay inside the limits, and their excursions far enough for those that were not drawn."""
     low, high = np.asarray(found.lowest), np.asarray(found.highest)
     with np.errstate(invalid="ignore", over="ignore"):
         inside = (low >= limits.lowest).all(axis=(1, 2)) & (high <= limits.highest).all(axis=(1, 2))

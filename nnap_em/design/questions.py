@@ -1,4 +1,4 @@
-"""What is asked of an experiment: a cost of what it tells, in units of a logarithm, so that costs can be added."""
+"""Design criteria: costs of expected information, in units of a logarithm, so that costs can be added."""
 
 import math
 from abc import abstractmethod
@@ -14,7 +14,7 @@ from .information import Contrast, Fit
 
 
 class Told(NamedTuple):
-    """What some sequences tell together, or each of them; leading axes are proposals."""
+    """Information of some sequences together, or of each; leading axes are proposals."""
 
     information: Float[np.ndarray, "*proposal phi phi"]
     contrasts: tuple[Contrast, ...] = ()
@@ -25,7 +25,7 @@ class Told(NamedTuple):
         return Told(self.information + other.information, tuple(both))
 
     def times(self, amount: float) -> "Told":
-        """As much of it."""
+        """The information `times` as large."""
         return jax.tree.map(lambda a: amount * a, self)
 
     def of(self, which) -> "Told":
@@ -43,10 +43,10 @@ def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "
 
 
 def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
-    """Share of the expected information of the `logs` of a fit that the fit itself owns up to.
+    """Share of the expected information of the `logs` of a fit that the covariance of the fit contains.
 
-    Where noise is what the model says it is one; on a real machine recordings disagree, the fit says so by a wider
-    posterior (`em.stated.widened`), and new logs will tell as much less.
+    It is one where noise is that of the model; on a real machine recordings disagree, the posterior is wider
+    (`em.stated.widened`), and new logs add as much less.
     """
     before, now = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
     counts = now > 1e-12 * now.max()
@@ -59,7 +59,7 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
 
 
 class AbstractQuestion(eqx.Module):
-    """What is asked."""
+    """A design criterion."""
 
     least: ClassVar[float] = -math.inf
     """The cost of a whole answer."""
@@ -70,13 +70,13 @@ class AbstractQuestion(eqx.Module):
 
 
 class Friction(AbstractQuestion):
-    """How wide are the friction bands, the widest first: over all velocities, and once more near rest."""
+    """Width of the friction bands, the widest first: over all velocities, and once more near rest."""
 
     fit: Fit
     scale: Float[np.ndarray, " dof"]
     """Size of the map of each joint [N m]."""
     weight: Float[np.ndarray, "range dof node"]
-    """Which velocities count, in every range; their sum is 1."""
+    """Weight of velocities, in every range; their sum is 1."""
 
     def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
         shape = self.weight.shape[1:]
@@ -88,7 +88,9 @@ class Friction(AbstractQuestion):
 
 
 class Parameters(AbstractQuestion):
-    """How sure are some parameters: the mean of the logarithms of their standard deviations, in those of the prior."""
+    """Uncertainty of some parameters: the mean of the logarithms of their standard deviations, in those of the
+    prior.
+    """
 
     fit: Fit
     places: tuple[int, ...] = eqx.field(static=True)
@@ -102,13 +104,13 @@ class Parameters(AbstractQuestion):
 
 
 SURE = 9.0
-"""Distance of two models [standard deviations of their log-likelihood ratio] from which on more tells nothing new.
+"""Distance of two models [standard deviations of their log-likelihood ratio] beyond which more adds nothing.
 
-At 6 one in 700 is told wrong, but logs then add about half of what was promised of the ratio (docs/design.md)."""
+At 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md)."""
 
 
 class Apart(AbstractQuestion):
-    """Which of some laws is the true one: the pair that is hardest to tell counts.
+    """Discrimination between laws: the pair that is hardest to discriminate counts.
 
     A log-likelihood ratio is normal with mean d^2 / 2 and variance d^2, d the distance after everything that the rival
     can adapt: d^2 = r'(I + J C J')^-1 r.  [Atkinson & Fedorov 1975, Biometrika 62, 57, for the criterion]
@@ -116,10 +118,10 @@ class Apart(AbstractQuestion):
 
     least: ClassVar[float] = 0.0
     covs: tuple[Float[np.ndarray, "_ _"], ...]
-    """Of every rival."""
+    """Covariances of every rival."""
 
     def distance(self, told: Told) -> Float[np.ndarray, "*proposal pair"]:
-        """Of every pair [standard deviations]."""
+        """Distance of every pair [standard deviations]."""
         out = []
         for cov, (information, pull, square) in zip(self.covs, told.contrasts, strict=True):
             adapted = np.einsum("...i,...ij,...j->...", pull, after(cov, information), pull)

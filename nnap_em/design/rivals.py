@@ -1,4 +1,4 @@
-"""Laws that the logs could not tell apart, each fitted in the other's place, so that an experiment can be asked to."""
+"""Laws that the logs could not discriminate, each fitted in the other's place, for an experiment that can."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ class Law(NamedTuple):
         return self.name.replace("_", " ") + place
 
     def means(self, effect: AbstractEffect) -> bool:
-        """Whether it is this one."""
+        """True for this law."""
         here = self.joint in (None, effect.joint) and self.channel in (None, effect.channel)
         return here and self.name in (effect.name, effect.key())
 
@@ -40,7 +40,7 @@ class Rivals(NamedTuple):
 
 
 def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
-    """What a diagnosis could not tell: a law of its model, or None where nothing was added, and a rival of it."""
+    """Pairs that a diagnosis left open: a law of its model, or None where nothing was added, and a rival."""
     law = lambda told: Law(told["name"], told.get("joint"), told.get("channel"))  # noqa: E731
     out: list[tuple[Law | None, Law]] = [(None, law(told)) for told in report.get("cannot_tell", [])]
     for effect in report.get("effects", []):
@@ -51,7 +51,7 @@ def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
 def rivals(
     fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], say: Say = lambda text: None
 ) -> list[Rivals]:
-    """Models to be told apart: `fitted` beside itself with another law in the place of one of its own, and, where
+    """Models to be discriminated: `fitted` beside itself with another law in the place of one of its own, and, where
     there is none (None), all that may come on top beside each other and beside `fitted` as it is, if there is but one.
 
     Raises DesignError where the machine cannot have such a law, or the fit does not hold the one.

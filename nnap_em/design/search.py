@@ -1,7 +1,7 @@
 """The search for sequences: many are drawn, the best together are taken, and each is bettered in turn.
 
 Friction has kinks, limits are walls and a free arm is chaotic, so that a slope of the cost leads nowhere for long: the
-search is a seeded one.  What a batch of proposals would do and tell is a step that a resumed run finds again.
+search is a seeded one.  Motions and information of a batch of proposals are a step that a resumed run finds again.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ Say = Callable[[str], None]
 
 
 class Effort(NamedTuple):
-    """How long is searched."""
+    """Effort of a search."""
 
     pool: int = 192
     """Proposals to choose from."""
@@ -40,13 +40,13 @@ class Effort(NamedTuple):
 
 EFFORT = Effort()
 SHRINKS = 0.7
-"""Of the size of a proposal that breaks a limit."""
+"""Factor on the size of a proposal that breaks a limit."""
 REACH = (0.3, 0.05)
-"""How far the numbers of a proposal are moved in the first round and in the last."""
+"""Change of the numbers of a proposal in the first round and in the last."""
 
 
 class Bench(NamedTuple):
-    """All that decides what a proposal does and tells."""
+    """Constants on which motions and information of a proposal depend."""
 
     fit: Fit
     pairs: tuple[tuple[Fit, Fit], ...]
@@ -57,13 +57,13 @@ class Bench(NamedTuple):
     t: Float[np.ndarray, " time"]
     key: PRNGKeyArray
     share: float = 1.0
-    """Of the expected information that is believed (`questions.share`)."""
+    """Share of the expected information that counts (`questions.share`)."""
     informed: bool = True
-    """Whether information is taken, too: a search that tells laws apart asks for none."""
+    """True where information is computed, too: a search that only discriminates laws needs none."""
 
 
 class Plan(NamedTuple):
-    """Sequences, and what each of them tells."""
+    """Sequences, and the information of each."""
 
     proposal: Proposal
     told: Told
@@ -71,7 +71,7 @@ class Plan(NamedTuple):
 
 @step(lambda bench, *_: (HERE, Told(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
 def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Told]:
-    """Which proposals stay inside the limits, and what each would tell."""
+    """Proposals that stay inside the limits, and the information of each."""
     u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
     found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
     seq = blank(bench.t, u, len(bench.fit.model.measured))
@@ -79,7 +79,7 @@ def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, "
 
 
 def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:
-    """What sequences tell along the motions x, and from `start` on of the rivals."""
+    """Information of sequences along the motions x, and from `start` on about the rivals."""
     pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
     none = np.zeros((len(start), *bench.fit.cov.shape))
     return Told(information(bench.fit, seq, x) if bench.informed else none, pairs)

@@ -24,7 +24,7 @@ class AbstractSignal(eqx.Module):
 
 
 def _frequency(z, t):
-    """From one wave in the whole to the fastest, evenly in its logarithm [Hz]."""
+    """Frequency from one wave in the whole to the fastest, evenly in its logarithm [Hz]."""
     slow, fast = 1.0 / (t[-1] - t[0]), FASTEST / (t[1] - t[0])
     return slow * (fast / slow) ** z
 

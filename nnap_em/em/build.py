@@ -1,4 +1,4 @@
-"""From what the owner declares and the logs to the model that EM starts from; every scale comes from one of the two."""
+"""First model of EM, from the declaration and the logs; every scale comes from one of the two."""
 
 import math
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Scales(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What EM needs: the first model, how its parts are estimated, and the hypotheses of its start."""
+    """Input of EM: the first model, the estimators of its parts, and the hypotheses of its start."""
 
     model: StateSpaceModel
     mstep: ScoringMStep
@@ -232,7 +232,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
 
 
 def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
-    """How far accelerations as large as those in the logs move a reading: as little is known of forces at first."""
+    """Change of a reading by accelerations as large as those in the logs: the first uncertainty of forces."""
     dof = len(system.coordinates)
     still, out = jnp.zeros(dof), np.zeros(len(system.readable))
     if system.sensors:
@@ -251,8 +251,8 @@ def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
 
 
 FEW, MOST = 25, 325
-"""Hypotheses of the rates of joints that are read, and of all states, at most: two rows of readings tell such a rate as
-well, and n joints would have 5^n of them."""
+"""Hypotheses of the rates of joints that are read, and of all states, at most: two rows of readings determine such a
+rate as well, and n joints would have 5^n of them."""
 
 
 def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:

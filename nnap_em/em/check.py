@@ -1,4 +1,4 @@
-"""Whether logs can identify what is asked, before anyone waits for EM: one line per question, ok, look or bad."""
+"""Test of whether logs can identify what is declared, before EM: one line per subject, ok, look or bad."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -36,10 +36,10 @@ from .stops import at_stops
 
 OK, LOOK, BAD = "ok", "look", "bad"
 SEQUENCES, SECONDS = 6, 1.0
-"""How much is smoothed with the first model: a wrong one loses a hidden joint later on."""
+"""Number and length of the sequences smoothed with the first model: a wrong one loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
-_WIDTH = 1.0  # s, of the readings that must tell the state
+_WIDTH = 1.0  # s, of the readings that must determine the state
 
 
 class CheckResult(NamedTuple):
@@ -136,7 +136,7 @@ def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
 
 
 def _rough(train: Logs) -> Iterator[CheckResult]:
-    """What was masked at reading, and how much of each column it is."""
+    """Readings masked on reading, and their share of each column."""
     total = int(np.asarray(train.data.valid).sum())
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
         here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
@@ -169,7 +169,7 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         seen, spread = reading_noise(signal), float(np.nanstd(signal))
         declared = rig.noise_std.get(name)
         loud = max(seen, declared or 0.0) > 0.3 * spread
-        alone = name not in model.system.sensors  # of three axes one may feel nothing
+        alone = name not in model.system.sensors  # of three axes one may sense nothing
         drowned = "; the motion hardly rises above it: move more, or look at the units" if loud else ""
         if declared is None:
             text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
@@ -239,7 +239,9 @@ def drives(
             text += f"; a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
         yield CheckResult(_mark(low or limit < whole or late, limit < 0.5 * weight), "servo", text)
         if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
-            yield CheckResult(LOOK, "servo", f"{name}: its command never changes, so that it tells no gain and no delay")
+            yield CheckResult(
+                LOOK, "servo", f"{name}: its command never changes, so that it tells no gain and no delay"
+            )
 
 
 def _stiff(rig: Rig, system: AbstractSystem) -> Iterator[CheckResult]:
@@ -277,7 +279,7 @@ def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, 
 
 
 def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[CheckResult]:
-    """Which velocities each joint visits: range, both directions, passages through rest."""
+    """Velocities that each joint visits: range, both directions, passages through rest."""
     dof = len(model.system.coordinates)
     for joint in range(dof):
         name, unit = model.system.rates[joint], model.system.unit(model.system.rates[joint])
@@ -330,7 +332,7 @@ def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
 
 
 def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[CheckResult]:
-    """How well readings alone tell the state, by the observability Gramian sum Phi' C' R^-1 C Phi along the logs.
+    """Observability of the state from readings alone, by the Gramian sum Phi' C' R^-1 C Phi along the logs.
 
     [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
     """

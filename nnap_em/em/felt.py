@@ -1,4 +1,4 @@
-"""What no log can tell: uncertain numbers that no motion feels, or that it feels only together with others."""
+"""Identifiability: uncertain numbers that no motion depends on, or only in combination with others."""
 
 from typing import NamedTuple
 
@@ -21,15 +21,15 @@ class Felt(NamedTuple):
     """Uncertain parameters that keep, alone or along a combination, what was declared."""
 
     never: tuple[str, ...]
-    """No motion feels these."""
+    """Numbers that no motion depends on."""
     together: tuple[tuple[str, ...], ...]
-    """Of each group motions feel fewer combinations than it has members."""
+    """Groups of which motions depend on fewer combinations than members."""
     rubbed: tuple[str, ...] = ()
     """Numbers of servos that the learned friction of their joint can take the place of."""
 
 
 def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Felt:
-    """What of the uncertain parameters the inverse dynamics M(q) a + c(q, v) depends on, whatever the motion.
+    """Base parameters: combinations of uncertain parameters that the inverse dynamics M(q) a + c(q, v) depends on.
 
     [Gautier & Khalil 1990, IEEE Trans. Robotics and Automation 6(3): base parameters]  By the null space of its
     derivatives at random states, each in declared standard deviations.  With servos, whose torques nobody logs, it is
@@ -104,7 +104,7 @@ def _columns(
 
 
 def sentences(found: Felt) -> list[str]:
-    """What a reader is told about it."""
+    """Sentences of a report on parameters that are not identifiable."""
     out = []
     if found.never:
         out.append(f"no motion feels {', '.join(found.never)}: kept as declared; take out what you do not doubt")

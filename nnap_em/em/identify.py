@@ -1,4 +1,4 @@
-"""From a declared rig and its logs to a fitted model: the main job in one call."""
+"""Identification: from a declared rig and its logs to a fitted model in one call."""
 
 from collections.abc import Callable
 from typing import NamedTuple, cast
@@ -39,7 +39,7 @@ class Identified(NamedTuple):
     bank: StartBank
     """Hypotheses of the start."""
     smoother: AbstractSmoother
-    """Of the fit, and of all that uses it: to smooth, predict, tell what is left over, and search for what it lacks."""
+    """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     unsaid: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
 
@@ -64,7 +64,7 @@ class FrictionTable(NamedTuple):
     cov: Float[Array, "dof node node"]
     """Covariance of the torque over the nodes of a joint [N^2 m^2]."""
     units: tuple[tuple[str, str], ...]
-    """Of velocity and torque of every joint: on a slide they are m/s and N."""
+    """Units of velocity and torque of every joint: on a slide they are m/s and N."""
 
     @property
     def std(self) -> Float[Array, "dof node"]:
@@ -127,8 +127,8 @@ PARTS = 2
 def finished(fitted: Identified, data: Dataset) -> Identified:
     """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
 
-    Only where the noise of the readings is not what the model says: where it is, one-step likelihood is efficient, and
-    its curvature says how sure it is.
+    Only where the noise of the readings is not that of the model: elsewhere one-step likelihood is efficient, and its
+    curvature is its precision.
     """
     data = jax.device_put(data)
     if white_readings(data):

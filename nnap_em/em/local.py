@@ -36,7 +36,7 @@ def _sensitivities(
     Float[Array, "time obs dof"] | None,
     Float[Array, "time obs param"],
 ]:
-    """Of next state and reading to a force held over the step, and to the parameters."""
+    """Sensitivities of next state and reading to a force held over the step, and to the parameters."""
     value, held = prior.read(model), prior.held(model)
     free = np.flatnonzero(~held)
     dof = len(model.system.coordinates)

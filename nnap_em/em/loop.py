@@ -31,7 +31,7 @@ class EMState(NamedTuple):
     best: AbstractModel
     """The likeliest model so far at the present horizon."""
     proposal: AbstractModel
-    """Where the M-step would go from `best`."""
+    """Model that the M-step proposes from `best`."""
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the M-step's weights at `best`."""
     top: Float[np.ndarray, " seq"]
@@ -50,7 +50,7 @@ class FitError(RuntimeError):
 
 
 class Schedule(eqx.Module):
-    """How many samples of each sequence an epoch sees."""
+    """Number of samples of each sequence that an epoch uses."""
 
     first: int = eqx.field(static=True, default=60)
     growth: float = eqx.field(static=True, default=1.6)
@@ -73,7 +73,7 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
 
 @eqx.filter_jit
 def _likeliest(outcomes: list[Posterior]) -> Posterior:
-    """Of every sequence."""
+    """The likeliest for every sequence."""
 
     def one(*tries):
         best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
@@ -165,10 +165,10 @@ def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EM
 
 
 def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
-    """`model` with its process noise scaled by the likeliest of `scales`: nobody knows how far its motion is off."""
+    """`model` with its process noise scaled by the likeliest of `scales`: the error of its motion is unknown."""
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
-    for trial in trials:  # the step that would follow has no say
+    for trial in trials:  # the step that would follow does not count
         posterior = e_step(trial, data, smoother, key=key)
         used = np.asarray(kept(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)

@@ -32,7 +32,7 @@ from .weights import Weights
 
 
 class MStepInfo(NamedTuple):
-    """What an M-step lets one see and reuse."""
+    """Results of an M-step for diagnosis and reuse."""
 
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the weights, at those of the model that was given (zero for M-steps that know none)."""
@@ -41,7 +41,7 @@ class MStepInfo(NamedTuple):
 
 
 class Core(NamedTuple):
-    """What an M-step changes, whatever else the model is made of."""
+    """Parts of a model that an M-step changes."""
 
     unknown: Any
     """The friction map."""
@@ -112,7 +112,7 @@ def _widened(prior: ParameterPrior, w, here: Local, path: Gaussian, pad: int):
 
 @eqx.filter_jit
 def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
-    """`log_r` where it is no less than what the kicks of a step, felt as accelerations, do to a reading on average."""
+    """`log_r` where it is no less than the mean effect of the kicks of a step, as accelerations, on a reading."""
     assert here.reading_by_force is not None
     dof = here.by_force.shape[-1]
     kick = jnp.swapaxes(here.by_force[..., dof : 2 * dof, :], -1, -2)  # of a unit force on every joint
@@ -126,7 +126,7 @@ def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " ob
 
 @eqx.filter_jit
 def _narrowed(core: Core, hessian, pad: int):
-    """Without the last `pad` parameters."""
+    """The prior without the last `pad` parameters."""
     size = core.w.shape[0] - pad
     return core._replace(w=core.w[:size]), hessian[:size, :size]
 
@@ -173,16 +173,18 @@ class ScoringMStep(AbstractMStep):
     """Log variances of the process noise of the first model."""
 
     def weights(self, model) -> Weights:
-        """What is estimated: weights of the network and parameters."""
+        """Estimated vector: weights of the network and parameters."""
         nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
         return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough)
 
     def early(self) -> "ScoringMStep":
-        """With the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the whole."""
+        """The rule with the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the
+        whole.
+        """
         return eqx.tree_at(lambda m: (m.tie, m.rough), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
 
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
-        """Of the network's weights and the parameters."""
+        """Zero precision of the network's weights and the parameters."""
         w = self.weights(model).read(model)
         return jnp.zeros((w.shape[0], w.shape[0]), w.dtype)
 
@@ -195,7 +197,7 @@ class ScoringMStep(AbstractMStep):
         return self.whole(model, core), MStepInfo(hessian, used)
 
     def core(self, model) -> Core:
-        """What a step changes of a model."""
+        """Parts of a model that a step changes."""
         return Core(model.unknown, self.weights(model).read(model), model.log_q, model.log_r, model.start)
 
     def whole(self, model, core: Core) -> StateSpaceModel:

@@ -31,7 +31,7 @@ HORIZONS = (0.25, 0.5)
 JUDGED = (*HORIZONS, 1.0)
 """Horizons [s] at which a model is judged: what only bends the first half second fails later."""
 SOON = (0.05, 0.1)
-"""Horizons [s] that a machine does not forget over, however fast it is."""
+"""Horizons [s] over which even a fast machine remains predictable."""
 SPACING = 0.05
 """Time [s] between starts."""
 WIDE = 0.1
@@ -41,7 +41,7 @@ HUBER = 2.0
 
 
 class Columns(NamedTuple):
-    """What something adds along a path."""
+    """Additions along a path."""
 
     force: Float[Array, "*seq column time dof"]
     """Generalised force held over the step [N m]."""
@@ -65,9 +65,9 @@ class Forks(NamedTuple):
     error: Float[np.ndarray, "seq start horizon obs"]
     """Reading minus open-loop prediction [rad, or m]; NaN where there is none."""
     columns: Float[np.ndarray, "seq start horizon obs column"]
-    """By friction nodes, by parameters, then by whatever else was asked for."""
+    """Derivatives by friction nodes, by parameters, then by the extra columns."""
     overlap: Float[np.ndarray, " horizon"]
-    """How many forks cover one moment."""
+    """Number of forks that cover one moment."""
 
 
 def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Grid:
@@ -96,7 +96,9 @@ def forks(
     extra: Callable[[Int[np.ndarray, " some"]], Columns] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
 ) -> Forks:
-    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` says more columns of some."""
+    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` returns more columns of
+    some.
+    """
     grid = _grid(model, data, horizons)
     here, exact = _wide(model, weights.prior, path, data)
     state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
@@ -177,7 +179,7 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
 def read_columns(
     nodes: Float[Array, "dof count"], here: Local, middle: Float[Array, "time state"], found: Columns
 ) -> Float[Array, "time obs column"]:
-    """How friction nodes, parameters and what was `found` move the readings of one sequence."""
+    """Change of the readings of one sequence by friction nodes, parameters and the columns `found`."""
     dof = nodes.shape[0]
     own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], here), jnp.moveaxis(found.reading, 0, -1)
     if here.reading_by_force is not None:
@@ -186,7 +188,7 @@ def read_columns(
 
 
 def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
-    """How every column moves the predictions of one sequence."""
+    """Change of the predictions of one sequence by every column."""
     (nodes, grid), (here, gain, middle, found) = common, one
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
     dof = nodes.shape[0]
@@ -221,10 +223,10 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
 
 
 def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "seq 1 horizon obs"]:
-    """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error to tell.
+    """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error.
 
-    It is the geometric mean of a sequence's own and that of all: with that of all, a few loud recordings decide alone;
-    with its own, a recording in which hardly anything moves says as much as any.
+    It is the geometric mean of a sequence's own and that of all: with that of all, a few recordings with large errors
+    decide alone; with its own, one with hardly any motion counts as much as any.
     """
     if not error.size:
         return np.ones((error.shape[0], 1, *error.shape[2:]))

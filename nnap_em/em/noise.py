@@ -1,4 +1,4 @@
-"""Whether readings carry the white noise that the model says."""
+"""Test of readings for white noise."""
 
 import numpy as np
 
@@ -21,6 +21,6 @@ def third_differences(y) -> float:
 
 
 def white_readings(data: Dataset) -> bool:
-    """Whether some reading carries white noise that is sampled as it is."""
+    """True where some reading carries white noise that is sampled as it is."""
     y = np.asarray(data.y)
     return min((third_differences(y[..., i]) for i in range(y.shape[-1])), default=0.0) < READINGS

@@ -1,4 +1,4 @@
-"""Physical parameters that are estimated, of the machine and of the effects: one vector, with the owner's belief."""
+"""Physical parameters that are estimated, of the machine and of the effects: one vector, with the declared prior."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float
 
 
 class ParameterPrior(eqx.Module):
-    """Physical parameters to be estimated, with the owner's belief; estimated in its standard deviations."""
+    """Physical parameters to be estimated, with the declared prior; estimated in its standard deviations."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    """Of the system, "m2" or "forearm.mass", of a servo, "goal.kp", or of an effect by its place, "0.k"."""
+    """Names of the system, "m2" or "forearm.mass", of a servo, "goal.kp", or of an effect by its place, "0.k"."""
     mean: Float[Array, " param"]
     std: Float[Array, " param"]
 
@@ -43,7 +43,7 @@ class ParameterPrior(eqx.Module):
         return eqx.tree_at(self.places, model, shaped)
 
     def held(self, model) -> Bool[np.ndarray, " param"]:
-        """Which of the numbers act as forces held over a step."""
+        """Mask of the numbers that act as forces held over a step."""
         places = [name.partition(".")[0] for name in self.names]
         kinds = [at.isdigit() and model.effects[int(at)].held for at in places]
         flags = [np.full(np.size(a), k) for a, k in zip(self.places(model), kinds, strict=True)]
@@ -51,5 +51,5 @@ class ParameterPrior(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers are estimated."""
+        """Number of estimated values."""
         return self.mean.shape[0]

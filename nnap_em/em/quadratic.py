@@ -23,7 +23,7 @@ class Local(NamedTuple):
     by_parameter: Float[Array, "*time state param"]
     reading_by_parameter: Float[Array, "*time obs param"]
     reading_by_force: Float[Array, "*time obs dof"] | None = None
-    """Of the reading to a force that acts at its moment; None where no sensor feels one."""
+    """Sensitivity of the reading to a force at its moment; None without a sensor of forces."""
 
 
 class Quadratic(NamedTuple):
@@ -32,7 +32,7 @@ class Quadratic(NamedTuple):
     score: Float[Array, "*seq phi"]
     information: Float[Array, "*seq phi phi"]
     noise_score: Float[Array, "*seq noise"]
-    """With respect to (log_q, log_r)."""
+    """Score with respect to (log_q, log_r)."""
     noise_information: Float[Array, "*seq noise noise"]
 
 

@@ -1,4 +1,4 @@
-"""What logs of a machine that nothing drives cannot tell: the scale of all its masses and of its friction."""
+"""Scale of all masses and of friction, which is not identifiable where nothing drives the machine."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ EXACT = 1e-4
 
 
 def untold(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
-    """The uncertain parameters that carry the scale of the machine, where these logs cannot tell it; else none.
+    """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
 
     Without a torque the motion is the same when M(q) and c(q, v) are multiplied by one number, and the learned friction
     with them. That number is free as long as a change of the uncertain parameters multiplies M and c. Of the change

@@ -1,4 +1,4 @@
-"""What is known of friction before any data: its shape, not its size."""
+"""Prior knowledge of friction: its shape, not its size."""
 
 import numpy as np
 

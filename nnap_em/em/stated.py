@@ -1,6 +1,6 @@
-"""How sure a fit is of itself where its noise is not what the model says.
+"""Reported covariance of a fit whose noise is not that of the model.
 
-A likelihood is then too sure, in two ways: recordings disagree by more than it knows of, and all of them share forces
+A likelihood is then overconfident: recordings disagree by more than it allows, and all of them share forces
 that no part of the model describes, which stand in every recording alike and bend the estimates the same way.
 """
 
@@ -26,16 +26,16 @@ from .weights import Weights
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""
 SMALLEST, LARGEST, SIZES = 1e-3, 1e5, 49
-"""Sizes of such forces that are tried: variance of what they add over that of the rest, where they are told best."""
+"""Sizes of such forces that are tried: variance of what they add over that of the rest, where it is known best."""
 
 
 class Stated(NamedTuple):
-    """How sure a fit is."""
+    """Reported uncertainty of a fit."""
 
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the M-step's weights."""
     unsaid: float
-    """Size of the forces that no part of the model describes, in those of `unsaid`."""
+    """Size of the forces that no part of the model describes, in the units of `unsaid`."""
 
 
 class Errors(NamedTuple):
@@ -43,13 +43,13 @@ class Errors(NamedTuple):
 
     error: Float[np.ndarray, " row"]
     own: Float[np.ndarray, "row phi"]
-    """By what is estimated."""
+    """Columns of the estimated quantities."""
     other: Float[np.ndarray, "row force"]
-    """By forces that no part of the model describes."""
+    """Columns of forces that no part of the model describes."""
     weight: Float[np.ndarray, " row"]
     """One over the variance, less where errors overlap."""
     rows: float
-    """How many rows there would be, did they not overlap."""
+    """Number of rows, did they not overlap."""
 
 
 def widened(
@@ -62,16 +62,16 @@ def widened(
     *,
     key: PRNGKeyArray,
 ) -> Stated:
-    """Posterior precision that owns up to how much recordings disagree and to what the model leaves unsaid.
+    """Posterior precision reduced by the disagreement of recordings and by model discrepancy.
 
         H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s' + tau^2 sum_k b_k b_k') A^-1
 
     with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s and A its information,
     that of the prior with it; b_k is the score of the k-th of many smooth random forces of the state, and tau their
-    size, by the likelihood of the errors that are left. Nothing becomes less certain than the prior.
-    [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters;
-    Muller 2013, Econometrica 81, 1805, for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for what is
-    left unsaid; Rahimi & Recht 2007, NIPS, for the functions]
+    size, by the likelihood of the errors that are left. Nothing becomes less certain than the prior. [Huber 1967, Proc.
+    5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters; Muller 2013, Econometrica 81, 1805,
+    for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for model discrepancy; Rahimi & Recht 2007, NIPS,
+    for the functions]
     """
     weights = m_step.weights(model)
     other = unsaid(model, weights, path, data, used, key=key)
@@ -103,7 +103,7 @@ def of_states(
     key: PRNGKeyArray,
 ) -> Float[Array, "seq time state state"]:
     """Covariance that smoothed states have beyond the smoother's own: by friction and parameters, of which `phi` are
-    deviations drawn from the posterior, and by forces unsaid of size `force`.
+    deviations drawn from the posterior, and by unmodelled forces of size `force`.
 
     The smoother is linear about its path: the mean square of what each draw moves there.
     """
@@ -116,7 +116,7 @@ def of_states(
 
 
 def _moved(common, one) -> Float[Array, "time state state"]:
-    """Of one sequence."""
+    """Change of one sequence."""
     (log_q, log_r, start, nodes, draws), (here, mean, found) = common, one
     dof = nodes.shape[0]
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], here.by_force)

@@ -1,4 +1,4 @@
-"""Where a log reaches the joint ranges of a machine file, whose stops have no force in the model."""
+"""Rows of a log that reach the joint ranges of a machine file, whose stops have no force in the model."""
 
 from collections.abc import Iterator
 

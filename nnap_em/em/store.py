@@ -48,11 +48,11 @@ MODEL, AFTER = "model.npz", "after.npz"
 
 
 class Stored(NamedTuple):
-    """What a file holds."""
+    """Content of a model file."""
 
     fitted: Identified
     fingerprint: str
-    """Of the training data; empty if it was not given."""
+    """Digest of the training data; empty if it was not given."""
     notes: dict[str, Any]
     """Whatever the writer wished to keep, as JSON."""
 
@@ -65,7 +65,7 @@ def model_file(path: Path) -> Path:
 
 
 def fingerprint(data: Dataset) -> str:
-    """SHA-256 of the content of `data`, to tell later whether it is the same."""
+    """SHA-256 of the content of `data`, to recognise the same data later."""
     digest = hashlib.sha256()
     for part in data:
         array = np.ascontiguousarray(part)

@@ -20,7 +20,7 @@ class Weights(eqx.Module):
     asymmetry: Float[Array, " dof"]
     """Prior standard deviation [N m] of an offset, the even part of a friction map that all nodes share."""
     rough: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
-    """That of the even part at every node alone, in those of the offset."""
+    """Standard deviation of the even part at every node alone, in those of the offset."""
 
     def read(self, model) -> Float[Array, " weight"]:
         """Those of a model, as one vector."""
@@ -50,7 +50,7 @@ class Weights(eqx.Module):
 
     @eqx.filter_jit
     def symmetry(self) -> Float[Array, "phi phi"]:
-        """Prior precision of phi: friction opposes motion alike in both directions, unless the data say otherwise."""
+        """Prior precision of phi: friction opposes motion alike in both directions, unless the data contradict."""
         dof, count = self.nodes.shape
         even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1])
         inverse = (jnp.eye(count) - 1 / (count + self.rough**2)) / self.rough**2  # of 1 + rough^2 I
@@ -59,7 +59,7 @@ class Weights(eqx.Module):
 
     @eqx.filter_jit
     def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
-        """Sensitivity of phi to the weights; a node knows nothing of the others."""
+        """Sensitivity of phi to the weights; nodes are independent."""
         cut = w.shape[0] - self.prior.size
         at = lambda v: jax.jacrev(lambda w: unknown.with_weights(w)(v))(w[:cut])  # noqa: E731
         torque = jnp.swapaxes(jax.vmap(at)(self.nodes.T), 0, 1).reshape(self.nodes.size, cut)

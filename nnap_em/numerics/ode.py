@@ -20,7 +20,7 @@ class RK4(diffrax.AbstractSolver):
     interpolation_cls: ClassVar[Callable] = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
-        """Of the error over an interval."""
+        """Order of the error over an interval."""
         return 4
 
     def init(self, terms, t0, t1, y0, args):

@@ -50,7 +50,7 @@ def all_devices() -> Mesh:
 
 
 def everywhere(flag: bool) -> bool:
-    """Whether `flag` is true in every process."""
+    """True where `flag` is true in every process."""
     if jax.process_count() == 1:
         return flag
     return bool(np.all(multihost_utils.process_allgather(np.asarray(flag))))
@@ -91,9 +91,8 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
 
 
 def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " some"], tuple[Any, ...]]]:
-    """As many entries at a time as there are devices: which, and theirs of `trees`; the last again where they run out.
-
-    For work whose results, of all entries together, would not fit the memory.
+    """Batches of as many entries as there are devices: indices, and the entries of `trees`; the last is repeated at the
+    end. They serve work whose results, of all entries together, would not fit the memory.
     """
     every = jax.tree.map(np.asarray, trees)  # NumPy cuts by views, JAX by a program for every shape
     for first in range(0, count, jax.device_count()):
@@ -109,7 +108,7 @@ def _program(function: Callable) -> Callable:
         numbers, rest = eqx.partition(common, eqx.is_array)
 
         def share(numbers, batch):
-            """What one device does."""
+            """Work of one device."""
             one = jax.vmap(lambda one: function(eqx.combine(numbers, rest), one))
             size = jax.tree.leaves(batch)[0].shape[0]
             if size == group:
@@ -141,7 +140,7 @@ def at_home(tree: Any) -> Any:
 
 
 def _bound_to(a: Any, device: Any) -> bool:
-    """Whether an array is committed to this device, and to no other."""
+    """True where an array is committed to this device, and to no other."""
     return isinstance(a, jax.Array) and not isinstance(a, Tracer) and a.committed and a.devices() == {device}
 
 

@@ -1,4 +1,4 @@
-"""Where the time of a run goes: the programs that were traced, lowered and compiled or loaded."""
+"""Time of a run by program: those that were traced, lowered and compiled or loaded."""
 
 import time
 from collections import defaultdict
@@ -12,7 +12,7 @@ STAGES = {
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
     "/jax/core/compile/backend_compile_duration": "compile",
 }
-"""What JAX tells of a program; to load one that was kept counts as compiling it."""
+"""Events of JAX about a program; loading a cached one counts as compiling it."""
 
 
 class Profile:
@@ -23,7 +23,7 @@ class Profile:
         self._began = time.perf_counter()
 
     def __call__(self, event: str, duration_secs: float, **told: str | int) -> None:
-        """One event, as `jax.monitoring` tells it."""
+        """One event, as `jax.monitoring` reports it."""
         if event in STAGES:
             name = str(told.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
             self.spent[name][STAGES[event]].append(duration_secs)

@@ -9,7 +9,7 @@ MOST = 40_000
 
 
 def maps() -> int:
-    """Memory maps of this process; 0 where the system does not tell."""
+    """Memory maps of this process; 0 where the system does not report them."""
     try:
         return Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:

@@ -3,7 +3,8 @@
 JAX's own cache spares a run the compiling alone: to know what it looks for it traces and lowers the program first,
 which took 14 of the 66 s of a diagnosis that had all its programs at hand.  Here a program is known by what decides it
 before it is traced: the package's own text, the versions of what it stands on, and its arguments but for the numbers in
-their arrays.  What else could decide it, say an effect of a user's own, is not looked for: such a program is not kept.
+their arrays.  What else could decide it, such as an effect of a user's own, is not searched: such a program is not
+kept.
 """
 
 import functools
@@ -27,10 +28,10 @@ STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
 
 @runtime_checkable
 class Shelf(Protocol):
-    """Where programs lie between runs."""
+    """Folder of programs between runs."""
 
     def get(self, key: str) -> bytes | None:
-        """What was put there under this key, if anything."""
+        """Entry under this key, if any."""
         ...
 
     def put(self, key: str, content: bytes) -> None:
@@ -88,7 +89,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
         try:
             exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
             shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
-        except Exception as error:  # not everything can be written down; what is wrong with `run` is told by `run`
+        except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
         found = exported, told[-1]
@@ -103,7 +104,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
 
 
 def _unpacked(content: bytes | None) -> tuple[jax.export.Exported, Any] | None:
-    """What lies on the shelf; None for what is not whole."""
+    """Entry of the cache; None for one that is damaged."""
     if content is None:
         return None
     try:
@@ -119,7 +120,7 @@ def _shape(a: jax.Array) -> tuple[str, bool]:
 
 
 def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
-    """What decides a program, as one number."""
+    """Key of a program, as one number."""
     text = io.BytesIO()
     pickler = _Telling(text)
     pickler.fast = True  # the same whichever objects are the same
@@ -128,10 +129,10 @@ def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
 
 
 class _Telling(pickle.Pickler):
-    """Tells what it is given, in every process alike; refuses what it cannot tell whole."""
+    """Describes its input, in every process alike; refuses an object that it cannot describe whole."""
 
     def reducer_override(self, obj: Any) -> Any:
-        """As `pickle` has it."""
+        """Reducer as `pickle` has it."""
         if isinstance(obj, jax.sharding.Mesh):
             return repr, (f"{obj.axis_names} {obj.devices.shape}",)
         if obj in (str, repr) or not (isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__"))):

@@ -72,16 +72,19 @@ def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect |
 
 
 def _spring(sheet: Sheet, effect: Any) -> Sheet:
+    """`stiffness` (a cubic) and `springref` of the joint; since MuJoCo 3.7."""
     pull = float(effect.moment), -float(effect.slope), -float(effect.square), -float(effect.cube)
     return sheet.with_joint(effect.joint, pull=added(sheet.joint(effect.joint).pull, pull))
 
 
 def _offset(sheet: Sheet, effect: Any) -> Sheet:
+    """Passive `<dcmotor>`, `cogging` without poles, since MuJoCo 4.0; with a spring its `springref`."""
     constant = float(effect.value), 0.0, 0.0, 0.0
     return sheet.with_joint(effect.joint, pull=added(sheet.joint(effect.joint).pull, constant))
 
 
 def _cogging(sheet: Sheet, effect: Any) -> Sheet:
+    """Passive `<dcmotor cogging=...>`, its `gear` the periods per turn; since MuJoCo 4.0."""
     k, pairs = float(effect.k), ((effect.sine, effect.cosine), (effect.sine2, effect.cosine2))
     tones = [
         (math.hypot(sine, cosine), turn * k, math.atan2(cosine, sine)) for turn, (sine, cosine) in enumerate(pairs, 1)
@@ -91,6 +94,7 @@ def _cogging(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _stop(sheet: Sheet, effect: Any) -> Sheet:
+    """`range` of the joint, a spring and damper that only push; the law also holds back a joint that leaves."""
     if sheet.joint(effect.joint).stop is not None:
         raise NoHome("a joint has one range")
     numbers = effect.lower, effect.upper, np.exp(effect.stiffness), np.exp(effect.damping)
@@ -98,16 +102,19 @@ def _stop(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _back_emf(sheet: Sheet, effect: Any) -> Sheet:
+    """`damping` of the joint."""
     return sheet.with_joint(effect.joint, viscous=sheet.joint(effect.joint).viscous + float(effect.b))
 
 
 def _drag(sheet: Sheet, effect: Any) -> Sheet:
+    """`damping` of the joint, quadratic, at a joint; since MuJoCo 3.7."""
     if effect.joint is None:
         raise NoHome("the drag of one point is no drag of a body")
     return sheet.with_joint(effect.joint, drag=sheet.joint(effect.joint).drag + float(effect.c))
 
 
 def _bristle(sheet: Sheet, effect: Any) -> Sheet:
+    """Passive `<dcmotor input="none" lugre=...>`; since MuJoCo 4.0."""
     return sheet.with_joint(
         effect.joint, bristle=Bristle(float(np.exp(effect.log_sigma)), max(float(effect.damping), 0.0))
     )
@@ -117,13 +124,14 @@ def _bristle(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _in_bodies(sheet: Sheet, effect: Any) -> Sheet:
-    """The numbers of the bodies are those of the machine with its payload."""
+    """Mass, centre and inertia of the body, where the machine of the file has such a variation."""
     if (effect.name, effect.joint) not in sheet.system.variations:
         raise NoHome("the machine does not vary so")
     return sheet
 
 
 def _tilt(sheet: Sheet, effect: Any) -> Sheet:
+    """`gravity`, where the first joint carries the whole machine."""
     frames, machine = laid(sheet.system.text).frames, sheet.system.machine
     if frames[0].slide or any(frame.before < 0 for frame in frames[1:]):
         raise NoHome("the first joint does not carry the whole machine")
@@ -141,11 +149,13 @@ def _tilt(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _gain(sheet: Sheet, effect: Any) -> Sheet:
+    """`gainprm` of the motor."""
     drive, gain = sheet.drives[effect.joint], 1 + float(effect.excess)
     return sheet.with_drive(effect.joint, gain=drive.gain * gain, after=drive.after * abs(gain))
 
 
 def _saturation(sheet: Sheet, effect: Any) -> Sheet:
+    """`ctrlrange` of the motor or, behind a lag, `forcerange`."""
     drive, limit = sheet.drives[effect.joint], float(effect.limit)
     if drive.lag:
         return sheet.with_drive(effect.joint, after=min(drive.after, limit))
@@ -153,10 +163,12 @@ def _saturation(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _delay(sheet: Sheet, effect: Any) -> Sheet:
+    """`delay`, `nsample` and `interp="linear"` of the motor; since MuJoCo 3.5."""
     return sheet.with_drive(effect.joint, delay=sheet.drives[effect.joint].delay + max(float(effect.delay), 0.0))
 
 
 def _lag(sheet: Sheet, effect: Any) -> Sheet:
+    """`dyntype="filterexact"` of the motor."""
     drive = sheet.drives[effect.joint]
     if drive.lag or math.isfinite(drive.after):
         raise NoHome("an actuator has one state, and no limit before it but that of the command")
@@ -164,11 +176,13 @@ def _lag(sheet: Sheet, effect: Any) -> Sheet:
 
 
 def _flexibility(sheet: Sheet, effect: Any) -> Sheet:
+    """Rotor joined by a `<fixed>` tendon, its spring; the model has one joint more."""
     inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
     return _with_rotor(sheet, effect.joint, Rotor(inertia, k, damping))
 
 
 def _backlash(sheet: Sheet, effect: Any) -> Sheet:
+    """Rotor joined by a `<fixed>` tendon, its `range`; the model has one joint more."""
     inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
     half = 0.5 * max(float(effect.gap), 1e-9)
     return _with_rotor(sheet, effect.joint, Rotor(inertia, play=Contact(-half, half, k, damping)))
@@ -184,11 +198,12 @@ def _with_rotor(sheet: Sheet, joint: int, rotor: Rotor) -> Sheet:
 
 
 def _sensor_delay(sheet: Sheet, effect: Any) -> Sheet:
+    """`delay`, `nsample` and `interp="linear"` of the sensor; since MuJoCo 3.5."""
     return sheet.with_sensors(effect.channel, delay=max(float(effect.delay), 0.0))
 
 
 def _quantisation(sheet: Sheet, effect: Any) -> Sheet:
-    """The model holds the rounding as noise; the fitted noise of the reading has it already."""
+    """`noise` of the sensor, as the fitted noise of the reading has the rounding already."""
     return sheet
 
 
@@ -214,7 +229,7 @@ HOMES: Mapping[str, Home] = {
     "sensor_delay": _sensor_delay,
     "sensor_quantization": _quantisation,
 }
-"""Functions that add a law to a sheet, by its name in the catalogue."""
+"""Functions that add a law to a sheet, by its name in the catalogue; the first line of each is the place in a table."""
 
 REASONS: Mapping[str, str] = {
     "dead_zone": "an actuator is linear between its limits",

@@ -18,7 +18,7 @@ class Model(NamedTuple):
     measured: tuple[str, ...]
     inputs: tuple[str, ...]
     sensors: tuple[str, ...]
-    """What is shown beside positions and rates."""
+    """Sensors reported beside positions and rates."""
     dt: float
     substeps: int
     dressed: bool
@@ -52,7 +52,7 @@ class Prediction(NamedTuple):
 
 
 def rows_of(model: Model, time: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """What acts from outside in every row."""
+    """External inputs of every row."""
     if not model.dressed:
         return u
     before = np.concatenate([np.zeros_like(u[:1]), u[:-1]])
@@ -152,7 +152,7 @@ def _smooth(model: Model, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
 def _filter(model: Model, mean, cov, u, y, log_q, affine: Affine | None = None, reading=None):
     """Kalman filter of a batch: states, predictions, matrices and log-likelihoods.
 
-    Linearised about its own states, or as `affine` and `reading` say.
+    Linearised about its own states, or by `affine` and `reading`.
     """
     q, r = np.zeros((len(mean), *cov.shape[1:])), np.exp(model.log_r)
     q[:] = np.eye(mean.shape[1]) * np.exp(log_q)[..., None, :]

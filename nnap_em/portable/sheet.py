@@ -97,9 +97,9 @@ class Sheet(NamedTuple):
     """Sample interval of the fit [s]."""
     joints: tuple[JointSheet, ...]
     drives: Mapping[int, Drive] = MappingProxyType({})
-    """By joint, counted from 1."""
+    """Drives by joint, counted from 1."""
     sensors: Mapping[str, SensorSheet] = MappingProxyType({})
-    """By measured column."""
+    """Sensors by measured column."""
 
     def joint(self, number: int) -> JointSheet:
         """Joint by its number, counted from 1."""

@@ -29,7 +29,7 @@ _ELEMENTWISE = {  # primitive to NumPy
 _REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
 _SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
 _STEERED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}
-"""Operands that are moved, where others say whereto."""
+"""Operands that are moved, where others give the destination."""
 _MOVERS = (
     *_STEERED, "broadcast_in_dim", "concatenate", "pad", "reshape", "rev", "slice", "split", "squeeze", "stack",
     "transpose", "unstack",
@@ -41,7 +41,7 @@ _LONGEST = 1000  # passes of a loop
 
 
 class UnrollError(ValueError):
-    """What cannot be written in plain NumPy, by the name of JAX's primitive."""
+    """An operation that cannot be written in plain NumPy, by the name of JAX's primitive."""
 
 
 class Source(NamedTuple):
@@ -199,7 +199,7 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
 
 
 def _refused(equation: core.JaxprEqn) -> str | None:
-    """What it is about an operation that NumPy does otherwise than the form says."""
+    """Property of an operation that NumPy does not share."""
     name, kinds = equation.primitive.name, {_dtype(atom).kind for atom in equation.invars}
     if name in ("div", "rem", "not") and kinds & {"i", "u"}:
         return "of whole numbers"
@@ -262,7 +262,7 @@ def _dot(writer: _Writer, a: np.ndarray, b: np.ndarray, numbers: Any) -> np.ndar
 
 
 def _move(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """What moves numbers about, done by JAX on their places."""
+    """Operations that move numbers, done by JAX on their places."""
     name = equation.primitive.name
     if name not in _MOVERS:
         raise UnrollError(f"JAX's {name!r} has no plain NumPy form here")

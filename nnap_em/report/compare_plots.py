@@ -20,7 +20,7 @@ def comparison_figure(comparison: Comparison, curve: Curve) -> Figure:
     for i, colour, torque, std in zip(curve.fits, colours, curve.torque, curve.std, strict=True):
         for ax, mean in ((above, torque), (apart, torque - curve.pooled.value)):
             band(ax, curve.velocity, mean, std, colour, comparison.fits[i].name)
-            ax.collections[-1].set_label("_")  # the caption tells of the bands
+            ax.collections[-1].set_label("_")  # the caption explains the bands
     above.plot(curve.velocity, curve.pooled.value, color=TRUTH, lw=1.0, ls="--", label="pooled")
     above.set_ylim(*limits(list(curve.torque), 0.2))
     above.set_ylabel(f"friction [{curve.units[1]}]")

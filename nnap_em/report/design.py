@@ -24,7 +24,7 @@ Say = Callable[[str], None]
 INPUTS, MOTIONS = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
 NOTED = 1.1
-"""How much surer a parameter becomes to be named in the verdict."""
+"""Factor of certainty from which on a parameter is named in the verdict."""
 ACROSS = 3
 """Sequences in one figure."""
 
@@ -70,7 +70,7 @@ def _write_sequences(out: Path, design: Design) -> list[str]:
 
 
 def describe(design: Design) -> dict[str, Any]:
-    """What the experiment is, and what it should tell, as design.json holds it."""
+    """Description of the experiment and of its expected information, as in design.json."""
     fitted, system = design.fitted, design.fitted.model.system
     states, inputs = system.coordinates + system.rates, fitted.rig.input_columns
     force = dict(zip(inputs, (system.force_unit(joint) for joint in system.joints), strict=True))
@@ -101,7 +101,7 @@ def _ranges(names, low, high) -> dict[str, list[float]]:
 
 
 def _sides(design: Design) -> dict[str, Told]:
-    """What is known now, and after each of two experiments."""
+    """Uncertainty now, and after each of two experiments."""
     return {"now": design.nothing, "expected": design.told, "same_time_of_old_inputs": design.old}
 
 
@@ -154,7 +154,7 @@ def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
 
 
 def apart_told(design: Design) -> list[dict[str, Any]]:
-    """For every pair of rivals: how far they are apart, and how often the wrong one would be likelier."""
+    """Distance of every pair of rivals, and the probability that the wrong one is likelier."""
     if design.apart is None:
         return []
     far = {side: design.apart.distance(told) for side, told in _sides(design).items()}
@@ -167,7 +167,7 @@ def apart_told(design: Design) -> list[dict[str, Any]]:
 
 
 def _verdict(told: dict[str, Any]) -> str:
-    """What the experiment is good for, in one sentence."""
+    """Use of the experiment, in one sentence."""
     gains = []
     if told["friction"]:
         ratios = [

@@ -96,7 +96,7 @@ def _error_pictures(
     names: Names,
     test: Logs | None,
 ) -> list[Picture]:
-    """How far predictions are off, one of them, and the friction that was learned."""
+    """Pictures of prediction errors, of one prediction, and of the learned friction."""
     out = []
     if error:
         caption = "On test sequences that no fit and no choice has seen."
@@ -174,7 +174,7 @@ def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> li
 
 
 def _experiment(rig: Rig) -> list[str]:
-    """The command that asks the machine."""
+    """The command that designs the next experiment."""
     if not rig.input_columns:
         return []
     return ["nnap-em design FIT --out NEXT, FIT this folder: the inputs that would tell most, ready to be played."]

@@ -1,4 +1,4 @@
-"""What report.json holds of any fit, whichever command made it."""
+"""Content of report.json that fits of all commands share."""
 
 import platform
 import time
@@ -40,13 +40,13 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
 
 
 def versions() -> dict[str, str]:
-    """Of this package, of Python, and of what decides the last digits."""
+    """Versions of this package, of Python, and of packages that affect the last digits."""
     names = ("jax", "jaxlib", "equinox", "numpy")
     return {"nnap_em": __version__, "python": platform.python_version()} | {name: version(name) for name in names}
 
 
 def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
-    """What no fit and no filter saw of the logs."""
+    """Readings of the logs that no fit and no filter used."""
     parts = (("train", train), ("test", test))
     return [{"part": part, **entry._asdict()} for part, logs in parts if logs for entry in logs.masked]
 
@@ -85,13 +85,13 @@ def noise(fitted: Identified) -> dict[str, Any]:
 
 
 def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Prediction]:
-    """Of the test sequences, from their first readings, by every model."""
+    """Predictions of the test sequences, from their first readings, by every model."""
     key = jax.random.key(0)
     return {name: predict(fitted, test.data, GIVEN, key=key) for name, fitted in sides.items()} if test else {}
 
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Any]:
-    """Of the predictions, for every column and horizon."""
+    """Errors of the predictions, for every column and horizon."""
     found = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items() if test}
     return {"given_s": GIVEN, "horizons_s": list(HORIZONS), **found}
 

@@ -1,4 +1,4 @@
-"""What was found: learned functions, and what the first look suggested."""
+"""Pictures of accepted effects: learned functions, and the first screening round."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,7 @@ def screen_figure(
     *,
     chosen: str | None = None,
 ) -> Figure:
-    """What the candidates promise, in the `measure`, as bars; the `chosen` label in colour."""
+    """Screening scores of the candidates, in the `measure`, as bars; the `chosen` label in colour."""
     top = sorted(entries, key=lambda e: -e[1])
     figure = Figure(figsize=(7.4, 0.28 * max(len(top), 1) + 1.0), layout="constrained")
     ax = figure.subplots()

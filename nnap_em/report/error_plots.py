@@ -1,4 +1,4 @@
-"""How far predictions are off, before and after."""
+"""Prediction errors before and after."""
 
 import math
 from collections.abc import Mapping

@@ -49,7 +49,7 @@ def timeline(document: Mapping[str, Any]) -> Figure:
 
 
 def _bar(ax: Any, y: int, topic: Mapping[str, Any]) -> None:
-    """A topic while it speaks; a gap is drawn wide enough to be seen."""
+    """A topic while it is present; a gap is drawn wide enough to be seen."""
     span = max(topic["end"] - topic["start"], 1e-9)
     ax.barh(y, span, 0.3, topic["start"], color=TRUTH, alpha=0.55, label="topic")
     for gap in topic["gaps"]:

@@ -1,4 +1,4 @@
-"""What `nnap-em import` says of its logs: import.json, and the same as a page."""
+"""Report of `nnap-em import`: import.json, and the same as a page."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -78,7 +78,7 @@ def _topic(topic: TopicFacts) -> dict[str, Any]:
 
 
 def _look(logs: Sequence[Brought], rig: Rig) -> Iterator[str]:
-    """What the owner should know before he fits."""
+    """Warnings for the owner before a fit."""
     for log in logs:
         for entry in log.delays:
             if surely(entry) and abs(entry.seconds) > NOTABLE * rig.dt:
@@ -89,7 +89,7 @@ def _look(logs: Sequence[Brought], rig: Rig) -> Iterator[str]:
 
 
 def surely(entry: Delay) -> bool:
-    """Whether a delay is more than chance."""
+    """True where a delay is more than chance."""
     return bool(np.isfinite(entry.seconds) and abs(entry.seconds) > SURE * entry.std)
 
 

@@ -29,8 +29,9 @@ _TRUST = {
     "held_out_gain": _NATS,
     "log_likelihood_gain": _NATS,
 }
-"""From where on a word is deserved: share of the error on recordings left out, log-likelihood [nat]; the first known
-decides, because nats are worth little where noise is not what the model says."""
+"""Thresholds of words: share of the error on recordings left out, log-likelihood [nat]; the first known
+decides, because nats are worth little where noise is not that of the
+model."""
 _PLACES = re.compile(rb'(?<=\s)(?:d|x|y)="[^"]*"')
 _DIGITS = re.compile(rb"(\.\d\d)\d+")
 _SVG_UNITS = {b"pt": 96 / 72, b"in": 96.0}
@@ -156,7 +157,7 @@ def _at(values: Any, place: int) -> Any:
 
 
 class _Failed(NamedTuple):
-    """How many tests failed before and after (None: there is no after), and how many of these by little."""
+    """Numbers of tests that failed before and after (None: there is no after), and of those that failed by little."""
 
     total: int
     before: int
@@ -180,7 +181,7 @@ def _fails(test: Mapping[str, Any]) -> bool:
 
 
 def _doubted(document: Mapping[str, Any]) -> bool:
-    """Whether the test sequences speak against what was found."""
+    """True where the test sequences contradict the accepted effects."""
     error = document.get("error") or {}
     horizons = error.get("horizons_s") or []
     if 1.0 not in horizons or not document.get("effects"):
@@ -192,7 +193,7 @@ def _doubted(document: Mapping[str, Any]) -> bool:
 
 
 def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
-    """How sure the finding is, in words; empty where nothing tells."""
+    """Certainty of the finding in words; empty where it is unknown."""
     told = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
     decisive = next(((scale, value) for _, scale, value in told if finite(value)), None)
     if decisive is None:
@@ -220,7 +221,7 @@ def _media(picture: Picture) -> str:
 
 
 def _width(image: bytes) -> int:
-    """In CSS pixels; 0 where it is unknown.  PNG is taken for 150 dots per inch."""
+    """Width in CSS pixels; 0 where it is unknown.  PNG is taken for 150 dots per inch."""
     if image.startswith(b"\x89PNG"):
         return round(struct.unpack(">I", image[16:20])[0] * 96 / 150) if len(image) >= 24 else 0
     found = re.search(rb"<svg\b[^>]*?\swidth=[\"']([0-9.]+)(pt|in|px)?[\"']", image[:4000])

@@ -1,4 +1,4 @@
-"""What the declared model leaves unexplained: the force that it lacks, and its one-step errors."""
+"""Residuals of the declared model: the force that it lacks, and its one-step errors."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -79,12 +79,12 @@ def _causes(found: Residual, names: Names) -> Iterator[_Cause]:
 
 
 def _followed(found: Residual) -> Residual:
-    """Where no sequence was, all of them."""
+    """Sequences that are followed; all where there is none."""
     return (found if found.used.any() else found._replace(used=~found.used)).followed()
 
 
 _Side = tuple[Residual, str, str]
-"""What was left, its colour and its name."""
+"""Residual, colour and name of a model."""
 
 
 def _sides(residual: Residual, after: Residual | None, labels: tuple[str, str]) -> list[_Side]:
@@ -102,7 +102,7 @@ class _Panel(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the variation under the declared model."""
+        """Share of the variation under the declared model."""
         return max(self.curves[0].share, 0.0)
 
 
@@ -240,7 +240,7 @@ def innovation_figure(before: Residual, names: Names, after: Residual | None = N
 
 
 _Errors = Sequence[tuple[Float[np.ndarray, "_ _"], str, str]]  # the two fits may follow different sequences
-"""Of one channel: innovations, colour and name of every side."""
+"""Sides of one channel: innovations, colour and name of every side."""
 
 
 def _autocorrelations(ax: Axes, errors: _Errors) -> None:

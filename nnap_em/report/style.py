@@ -54,7 +54,7 @@ def styled(draw: Callable[_Arguments, Figure]) -> Callable[_Arguments, Figure]:
 
 
 def symbol(name: str) -> str:
-    """How a column is written in a figure: theta1 is θ₁, dtheta1 is ω₁; others as they are."""
+    """Symbol of a column in a figure: theta1 is θ₁, dtheta1 is ω₁; others as they are."""
     for start, sign in (("dtheta", "ω"), ("theta", "θ")):
         if name.startswith(start):
             return sign + name.removeprefix(start).translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))

@@ -18,7 +18,7 @@ INNER = (0.5, 99.5)
 
 
 def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], str] = str) -> None:
-    """Write JSON whole or not at all, texts as they are `told`; what is no finite number becomes null."""
+    """Write JSON whole or not at all, texts as `told` returns them; values that are not finite become null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):

@@ -8,7 +8,7 @@ from ..diagnose.keys import words
 
 
 def finite(value: Any) -> bool:
-    """Whether it is a number."""
+    """True for a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
 
 
@@ -58,7 +58,7 @@ def p_value(p: Any) -> str:
 
 
 def ratio(before: Any, after: Any) -> str:
-    """How many times smaller the second is."""
+    """Number of times by which the second is smaller."""
     if not (finite(before) and finite(after)) or after <= 0 or before <= 0:
         return "–"
     times = before / after
@@ -80,7 +80,7 @@ def label(effect: Mapping[str, Any]) -> str:
 
 
 def sentence(text: Any) -> str:
-    """With a capital, a full stop, and no underscores."""
+    """Text with a capital, a full stop, and no underscores."""
     told = str(text or "").replace("_", " ").rstrip(".")
     return f"{told[:1].upper()}{told[1:]}." if told else ""
 

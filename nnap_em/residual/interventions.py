@@ -55,7 +55,7 @@ class Intervention(NamedTuple):
     """Last row."""
     from_s: float
     to_s: float
-    """On the clock of the log [s]."""
+    """End on the clock of the log [s]."""
     size: float
     """Largest mean over a window [N m, or N]."""
     std: float

@@ -30,10 +30,10 @@ class GaussianSmoother(AbstractSmoother):
     @property
     def bytes_per_row(self) -> int:
         """Memory [B] that a row takes."""
-        return 8192  # measured for four states in 64 bits (docs/throughput.md)
+        return 8192  # measured for four states in 64 bits (docs/results/throughput.md)
 
     def tolerant(self) -> "GaussianSmoother":
-        """With looser first passes."""
+        """The smoother with looser first passes."""
         return dataclasses.replace(self, inflations=(1.0, 10.0, 100.0))
 
     def tries(self) -> "list[_Loosened]":
@@ -50,7 +50,7 @@ class GaussianSmoother(AbstractSmoother):
         return jax.tree.map(lambda a: a[best], tracks)
 
     def follow(self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]) -> tuple[Filtered, Smoothed]:
-        """From one start, the log of the process noise of the first pass `looser` than that of the model."""
+        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model."""
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
         def again(_, now):
@@ -60,7 +60,7 @@ class GaussianSmoother(AbstractSmoother):
         return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
-        """The start of the bank that the first samples speak for."""
+        """The start of the bank that the first samples make likeliest."""
         starts, log_weight = self.bank.hypotheses(model.start)
         if log_weight.shape[0] == 1:
             return jax.tree.map(lambda a: a[0], starts)

@@ -76,8 +76,9 @@ TANGENT = Tangent()
 class Cubature(eqx.Module):
     """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square.
 
-    It sees a friction kink as wide as the state is uncertain, and owns up to what an affine map cannot follow.
-    [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017, "Iterated posterior linearization smoother"]
+    It sees a friction kink as wide as the state is uncertain, and keeps the covariance that an affine map cannot
+    explain. [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017, "Iterated posterior linearization
+    smoother"]
     """
 
     def __call__(self, model, about: Gaussian, u: Any) -> Affine:

@@ -28,7 +28,7 @@ class Posterior(NamedTuple):
 
 
 class AbstractSmoother(eqx.Module):
-    """An E-step for one sequence.  `Identified` carries it: all that smooths with the fitted model asks it."""
+    """An E-step for one sequence.  `Identified` carries it: all that smooths with the fitted model uses it."""
 
     room: ClassVar[int] = 2**30
     """Memory [B] that smoothing may take on a device beside its results."""
@@ -43,7 +43,9 @@ class AbstractSmoother(eqx.Module):
         """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
 
     def tolerant(self) -> "AbstractSmoother":
-        """The same for a finished model, where no next epoch mends a lost track: slower and more patient, if it can."""
+        """The same for a finished model, where no next epoch recovers a lost track: slower and more patient, if it
+        can.
+        """
         return self
 
     def tries(self) -> Sequence["AbstractSmoother"]:

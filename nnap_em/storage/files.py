@@ -20,24 +20,24 @@ _HEADER, _CHECKSUM = "header", "sha256"
 
 
 class StoreError(ValueError):
-    """A file that is not what it should be: the message names the file, what is wrong with it and the mend."""
+    """A file that is not what it should be: the message names the file, the mistake and a hint."""
 
 
 class Kind(NamedTuple):
-    """What a file of arrays is, and what to do where it is not that."""
+    """Kind of a file of arrays, and hints where it is another."""
 
     name: str
     """Stands in the header."""
     format: int
     noun: str
     give: str
-    """The mend for a file of another program."""
+    """The hint for a file of another program."""
     whole: str
-    """The mend for a file that is cut short."""
+    """The hint for a file that is cut short."""
     again: str
-    """The mend for a file of another format."""
+    """The hint for a file of another format."""
     copy: str
-    """The mend for a file whose checksum does not hold."""
+    """The hint for a file whose checksum does not hold."""
 
 
 def cores() -> int:
@@ -97,7 +97,7 @@ def sweep(folder: Path) -> None:
 
 
 def _alive(process: int) -> bool:
-    """Whether another process has this number."""
+    """True where another process has this number."""
     if process == os.getpid():  # in a container all first processes have one number
         return False
     try:

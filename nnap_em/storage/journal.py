@@ -38,7 +38,7 @@ _Step = TypeVar("_Step", bound=Callable)
 
 
 class Journal:
-    """A folder of finished steps; `of` says, as JSON, of which computation they are."""
+    """A folder of finished steps; `of` names, as JSON, the computation to which they belong."""
 
     def __init__(self, folder: Path, of: Mapping[str, Any]):
         self.folder = folder
@@ -46,7 +46,7 @@ class Journal:
         self.by = {"nnap_em": __version__, "jax": jax.__version__}
 
     def __len__(self) -> int:
-        """How many steps are finished."""
+        """Number of finished steps."""
         return sum(1 for _ in self.folder.glob("*.npz"))
 
     def check(self) -> None:
@@ -133,7 +133,7 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
 def digest(*trees: Any) -> str:
     """SHA-256 of all that stands in `trees`: numbers to the last bit, types and functions by name.
 
-    Raises TypeError for what cannot be told apart.
+    Raises TypeError for objects that cannot be distinguished.
     """
     found = hashlib.sha256()
 

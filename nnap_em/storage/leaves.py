@@ -8,19 +8,19 @@ import numpy as np
 
 
 def plain(value: Any) -> bool:
-    """What JSON gives back unchanged; tuples come back as tuples."""
+    """True for a value that JSON gives back unchanged; tuples come back as tuples."""
     if isinstance(value, tuple):
         return all(map(plain, value))
     return value is None or type(value) in (bool, int, float, str)
 
 
 def tuples(value: Any) -> Any:
-    """What JSON made of a plain value, as it was."""
+    """Plain value as it was before JSON."""
     return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
 
 
 def is_key(value: Any) -> bool:
-    """Whether it is an array of random keys."""
+    """True for an array of random keys."""
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
@@ -30,7 +30,7 @@ def name_of(code: Any) -> str:
 
 
 def describe(value: Any) -> tuple[dict[str, Any], np.ndarray | None]:
-    """How a leaf is told in the header, and its array if it is one.
+    """Description of a leaf in the header, and its array if it is one.
 
     Raises TypeError where it is nothing that can be stored.
     """
@@ -48,7 +48,7 @@ def describe(value: Any) -> tuple[dict[str, Any], np.ndarray | None]:
 
 
 def restore(entry: dict[str, Any], array: np.ndarray | None, code: Any = None) -> Any:
-    """The leaf of which `describe` told; for a function that is `code`."""
+    """The leaf that `describe` described; for a function that is `code`."""
     match entry["is"]:
         case "plain":
             return tuples(entry["of"])

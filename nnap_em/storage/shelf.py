@@ -15,7 +15,7 @@ class Shelf:
             sweep(folder)
 
     def get(self, key: str) -> bytes | None:
-        """What was put there under this key, if anything that can be read."""
+        """Entry under this key, if there is one that can be read."""
         try:
             return (self.folder / key).read_bytes()
         except OSError:

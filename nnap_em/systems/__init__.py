@@ -16,7 +16,7 @@ systems: dict[str, type[AbstractSystem]] = {
 
 
 def spec(system: type[AbstractSystem], driven: int = 1) -> SystemSpec:
-    """What `rig.toml` may say of a system, whose usual input drives the joint `driven`."""
+    """Keys of a system in `rig.toml`, whose usual input drives the joint `driven`."""
     names = [f.name for f in dataclasses.fields(system) if f.name != "joints"]
     return SystemSpec(
         states=system.coordinates + system.rates,

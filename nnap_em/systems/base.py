@@ -1,4 +1,4 @@
-"""What a machine must give to become a model: names, mass matrix and bias force."""
+"""Interface of a machine: names, mass matrix and bias force."""
 
 import dataclasses
 from abc import abstractmethod
@@ -17,7 +17,7 @@ class AbstractSystem(eqx.Module):
     """Known rigid-body physics M(q) q'' + c(q, q') = B u + tau, in SI units.
 
     Fields hold the physical parameters as scalars, under the names used in `rig.toml`.
-    `coordinates` names q, `rates` names q'; `angles` says which coordinates are angles [rad].
+    `coordinates` names q, `rates` names q'; `angles` marks the coordinates that are angles [rad].
     """
 
     coordinates: ClassVar[tuple[str, ...]]
@@ -26,7 +26,7 @@ class AbstractSystem(eqx.Module):
     optional: ClassVar[dict[str, float]] = {}
 
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {}
-    """How a body may differ: (effect, joint) to (system, amount) -> system and system -> typical amount."""
+    """Variations of a body: (effect, joint) to (system, amount) -> system and system -> typical amount."""
 
     spots: ClassVar[dict[int, Any]] = {}
     """Where a load of any mass and centre may sit, by the joint that carries it, counted from 1: `bodies.Spot`."""
@@ -110,13 +110,13 @@ class AbstractSystem(eqx.Module):
     def acceleration(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], force: Float[Array, " dof"]
     ) -> tuple[Float[Array, ""], ...]:
-        """Of every joint under a generalised force [N m, or N], one by one (`integrate` says why)."""
+        """Accelerations of all joints under a generalised force [N m, or N], one by one (reason: `integrate`)."""
         return tuple(spd_solve(self.mass(q), force - self.bias(q, v)))
 
     def senses(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Float[Array, ""]]
     ) -> Sequence[Float[Array, ""]]:
-        """What the `sensors` read in a motion with the acceleration `a`, in SI units."""
+        """Readings of the `sensors` in a motion with the acceleration `a`, in SI units."""
         return ()
 
     def vary(self, kind: str, joint: int, amount: Float[Array, ""]) -> "AbstractSystem":

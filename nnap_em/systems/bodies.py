@@ -41,7 +41,7 @@ def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Tu
 def carried_by(
     machine: Machine, layout: Layout, values: Mapping[str, Scalar], loads: Mapping[int, Inertia]
 ) -> list[Inertia]:
-    """What the frame of every joint carries; no number where a body is not physical, so that no fit goes there.
+    """Body that the frame of every joint carries; no number where a body is not physical, so that no fit goes there.
 
     `loads`, by place of the body, are added to the bodies.
     """
@@ -64,7 +64,8 @@ def mounted(mass: Scalar, centre: Three, own: Turn, mount: Mount) -> Inertia:
 
 
 def physical(mass: Scalar, own: Turn) -> Any:
-    """Whether some distribution of mass has this inertia: half its trace less itself is positive, and so is the mass.
+    """True where some distribution of mass has this inertia: half its trace less itself is positive, and so is the
+    mass.
 
     [Wensing, Kim & Slotine 2018, IEEE RA-L 3(1), eq. 12: the pseudo-inertia]  By leading minors, with a margin.
     """
@@ -96,7 +97,7 @@ def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
 
 
 def _told(body: Numbers) -> list[Scalar]:
-    """In the order of `names`."""
+    """Numbers in the order of `names`."""
     return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 

@@ -25,7 +25,7 @@ class Frame(NamedTuple):
 
 
 class Mount(NamedTuple):
-    """Where a body sits: the joint whose frame carries it, and its own frame in there."""
+    """Place of a body: the joint whose frame carries it, and its own frame in there."""
 
     joint: int
     """-1: the base."""
@@ -34,12 +34,12 @@ class Mount(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """How a machine is put together."""
+    """Structure of a machine."""
 
     frames: tuple[Frame, ...]
-    """Of every joint."""
+    """Frames of every joint."""
     mounts: tuple[Mount, ...]
-    """Of every body."""
+    """Mounts of every body."""
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 
 class Numbers(NamedTuple):
-    """Of a body, in its own frame."""
+    """Numbers of a body, in its own frame."""
 
     mass: Float[Array, ""]
     """[kg]"""
@@ -39,7 +39,7 @@ def of_pseudo(whole: Float[Array, "4 4"]) -> Numbers:
 
 @jax.jit
 def stepped(before: Numbers, after: Numbers) -> Numbers:
-    """Where a step from `before`, a body that can be, towards `after` leads in the logarithm of the Cholesky factor.
+    """End of a step from `before`, a physical body, towards `after` in the logarithm of the Cholesky factor.
 
     To first order it is the step itself.  Not numbers where `before` cannot be.
     """

@@ -1,7 +1,7 @@
 """Mass matrix, bias force and acceleration of a tree of joints, by recursions from base to tips and back.
 
 [Featherstone 2008, "Rigid Body Dynamics Algorithms": Newton-Euler ch. 5.3, composite bodies ch. 6.2, the sparse
-factor ch. 6.5]  All is in the frames of `frames.py`, scalar by scalar (`spatial.py` says why).
+factor ch. 6.5]  All is in the frames of `frames.py`, scalar by scalar (reason: `spatial.py`).
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from .spatial import (
 
 
 class Inertia(NamedTuple):
-    """Of a rigid body about the origin of its frame."""
+    """Inertia of a rigid body about the origin of its frame."""
 
     mass: Scalar
     """[kg]"""
@@ -49,7 +49,7 @@ class Pose(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Of a joint's frame, in its own axes."""
+    """Motion of a joint's frame, in its own axes."""
 
     spin: Three
     """Angular velocity [rad/s]."""
@@ -63,13 +63,13 @@ NOTHING = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))
 
 
 def inertia(mass: Scalar, centre: Three, own: Turn) -> Inertia:
-    """From the inertia about the centre of mass."""
+    """Inertia from that about the centre of mass."""
     moment = scaled(mass, centre)
     return Inertia(mass, moment, summed(own, about(scaled(0.5, moment), centre)))
 
 
 def united(a: Inertia, b: Inertia) -> Inertia:
-    """Of two bodies that are one."""
+    """Inertia of two bodies that are one."""
     return Inertia(plus(a.mass, b.mass), add(a.moment, b.moment), summed(a.second, b.second))
 
 
@@ -82,7 +82,7 @@ def carried(body: Inertia, place: Three, turn: Turn) -> Inertia:
 
 
 def posed(frames: Sequence[Frame], q: Sequence[Scalar]) -> list[Pose]:
-    """Where every joint's frame stands at the coordinates `q`."""
+    """Poses of every joint's frame at the coordinates `q`."""
     poses = []
     for frame, at in zip(frames, q, strict=True):
         place, turn = frame.place, frame.turn
@@ -100,7 +100,7 @@ def posed(frames: Sequence[Frame], q: Sequence[Scalar]) -> list[Pose]:
 def motions(
     frames: Sequence[Frame], poses: Sequence[Pose], v: Sequence[Scalar], a: Sequence[Scalar], gravity: Three
 ) -> list[Motion]:
-    """How the frame of every joint moves; that of the base stands last, so that -1 finds it."""
+    """Motions of the frames of all joints; that of the base stands last, so that -1 finds it."""
     found: list[Motion] = [Motion(ZERO, ZERO, scaled(-1.0, gravity))]
     for frame, pose, rate, more in zip(frames, poses, v, a, strict=True):
         spin, turns, rise = found[frame.before]

@@ -1,4 +1,4 @@
-"""What sensors at a site of a machine file read: exact, without noise, delay or range.
+"""Readings of sensors at a site of a machine file: exact, without noise, delay or range.
 
 [MuJoCo's documentation, "Sensors": gyro, accelerometer, framepos]
 """

@@ -15,7 +15,7 @@ ZERO: Three = (0.0, 0.0, 0.0)
 
 
 def known(a: Scalar, value: float) -> bool:
-    """Whether a scalar is the number `value` before anything runs."""
+    """True where a scalar is the number `value` before anything runs."""
     return isinstance(a, float) and a == value
 
 

@@ -68,7 +68,7 @@ class Tree(AbstractSystem):
 
     @property
     def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Of those of the file the measured ones."""
+        """Measured sensors of the file."""
         return {sense.name: SENSE_UNITS[sense.kind] for sense in self.machine.senses}
 
     @property

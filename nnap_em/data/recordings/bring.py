@@ -23,12 +23,12 @@ COARSE = 4.0
 
 
 class TopicFacts(NamedTuple):
-    """What a topic is like."""
+    """Properties of a topic."""
 
     name: str
     kind: str
     columns: tuple[str, ...]
-    """Of the data set; none: the topic is not used."""
+    """Columns of the data set; none: the topic is not used."""
     messages: int | None
     clock: str = ""
     start: float = math.nan
@@ -39,7 +39,7 @@ class TopicFacts(NamedTuple):
     jitter: float = math.nan
     """Standard deviation of the intervals that are no gap [s]."""
     worst: float = math.nan
-    """How far an interval that is no gap is from the median at most [s]."""
+    """Largest deviation from the median of an interval that is no gap [s]."""
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -48,12 +48,12 @@ class Stretch(NamedTuple):
     """Rows that become one file, or are dropped."""
 
     start: float
-    """On the clock of the log [s]."""
+    """Time on the clock of the log [s]."""
     rows: int
     missing: Mapping[str, int]
     """Empty fields of readings."""
     why: str = ""
-    """Why it is dropped."""
+    """Reason why it is dropped."""
 
 
 class Brought(NamedTuple):
@@ -66,7 +66,7 @@ class Brought(NamedTuple):
     topics: tuple[TopicFacts, ...]
     delays: tuple[Delay, ...]
     rows: int
-    """Of the grid from the first row to the last in which all topics spoke."""
+    """Rows of the grid from the first to the last in which all topics are present."""
     sequences: tuple[Stretch, ...]
     values: tuple[Mapping[str, Float[np.ndarray, " row"]], ...]
     """Columns of each sequence that is used, in order."""
@@ -158,7 +158,7 @@ def _gridded(
 
 
 def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> tuple[float, float]:
-    """From when to when all topics speak [s]; DataError where they do not."""
+    """Interval in which all topics are present [s]; DataError where there is none."""
     found = spans(inputs, readings, dt)
     start, end = max(first for first, _ in found.values()), min(last for _, last in found.values())
     if end <= start:
@@ -185,7 +185,7 @@ def _there(
     dt: float,
     longest: Mapping[str, float],
 ) -> Bool[np.ndarray, " row"]:
-    """Rows in which every input is known, and some topic of readings speaks."""
+    """Rows in which every input is known, and some topic of readings is present."""
     there = np.ones(at.size, bool)
     for name, s in _one_each(inputs):
         there &= commanded(s, at, dt, longest[name])
@@ -222,7 +222,7 @@ def _sequence(piece: Piece, columns: Mapping[str, np.ndarray], rig: Rig, at: Flo
 def _facts(
     topic: Topic, recording: Recording, addresses: Mapping[str, Address], origin: int, plan: Plan, dt: float
 ) -> TopicFacts:
-    """Rate, jitter and gaps of a topic that was read; of others, what the file says."""
+    """Rate, jitter and gaps of a topic that was read; of others, the entries of the file."""
     track: Track | None = recording.tracks.get(topic.name)
     used = tuple(name for name, at in addresses.items() if at.topic == topic.name)
     if track is None:
@@ -250,7 +250,7 @@ def _facts(
 
 
 def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
-    """What is lost or made up between topics and rows."""
+    """Messages about readings lost or interpolated between topics and rows."""
     told = set()
     for name in rig.measured:
         s = signals[name]

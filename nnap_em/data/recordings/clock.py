@@ -20,7 +20,7 @@ class Clock(NamedTuple):
     t: Int[np.ndarray, " kept"]
     """ns."""
     kept: Int[np.ndarray, " kept"]
-    """Which messages, in the order of their times."""
+    """Indices of the used messages, in the order of their times."""
     name: str
     notes: tuple[str, ...]
 
@@ -71,7 +71,7 @@ def _backwards(row: str, amount: float) -> tuple[str, str]:
 
 
 def _single(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " m"], name: str, notes: tuple[str, ...]) -> Clock:
-    """Of messages at one time the last: what was commanded last is held."""
+    """The last of the messages at one time: the last command is held."""
     last = np.append(np.diff(t) > 0, True)
     if not last.all():
         notes = (*notes, f"{int(np.sum(~last))} messages have the time of the next one: the last of each is taken")
@@ -79,7 +79,7 @@ def _single(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " m"], name: str, n
 
 
 def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> str | None:
-    """Why stamps are no clock."""
+    """Reason why stamps are no clock."""
     if stamp.max() == stamp.min():
         return "are all the same" if stamp[0] else "are all 0"
     back = np.flatnonzero(np.diff(stamp) < 0)

@@ -16,7 +16,7 @@ Bytes = UInt8[np.ndarray, " byte"]
 
 @runtime_checkable
 class Codec(Protocol):
-    """How messages of one schema are read."""
+    """Reader of messages of one schema."""
 
     def fields(self, message: bytes) -> dict[str, float]:
         """All numbers of a message by their paths."""
@@ -30,7 +30,7 @@ class Codec(Protocol):
 
 
 class Unreadable(ValueError):
-    """An encoding that is not read: the text says which."""
+    """An encoding that cannot be read, with its name."""
 
 
 class Decoded:
@@ -101,7 +101,7 @@ class Ros2:
         return todo[~same]
 
     def _form(self, message: bytes, paths: Sequence[str]) -> Layout | None:
-        """Where the numbers of this message lie; None where that cannot be told, or forms are too many."""
+        """Places of the numbers of this message; None where they are unknown, or forms are too many."""
         if len(self.known) >= FORMS or not self.types:
             return None
         try:
@@ -119,7 +119,7 @@ FORMS = 64
 
 
 def codec(encoding: str, channel: Any, schema: Any) -> Codec:
-    """What reads a channel of this message encoding; Unreadable where nothing does."""
+    """Codec of a channel of this message encoding; Unreadable where there is none."""
     if encoding not in _codecs:
         raise Unreadable(f"encoding {encoding!r} is not read")
     return _codecs[encoding](channel, schema)

@@ -1,4 +1,4 @@
-"""Where the columns of a rig stand in a log: as declared, or by their names."""
+"""Addresses of the columns of a rig in a log: as declared, or by their names."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,13 +8,13 @@ from ..dataset import DataError
 from .recording import Address, Topic, field_of, near
 
 _PARTS = (("", "position"), ("d", "velocity"))
-"""What stands before the name of a joint where its angle, and its rate, are meant; and the array that has them."""
+"""Prefix of the name of a joint for its angle and its rate, and the array that holds them."""
 
 
 def resolve(
     path: Path, topics: Sequence[Topic], inputs: Sequence[str], measured: Sequence[str], declared: Mapping[str, Address]
 ) -> dict[str, Address]:
-    """Where each column of the rig is; DataError with the nearest names where one is not there."""
+    """Address of each column of the rig; DataError with the nearest names where one is absent."""
     out = {}
     for name in (*inputs, *measured):
         if name in declared:
@@ -58,7 +58,7 @@ def _names(column: str, is_input: bool) -> list[str]:
 
 
 def _nearest(column: str, every: Sequence[str]) -> str:
-    """The mend by the last word of each address, which is what a column is called by."""
+    """The hint by the last word of each address, which is what a column is called by."""
     words = {re.split(r"[:.\[]", name.rstrip("]"))[-1]: name for name in every}
     text = near(column, list(words))
     match = re.match(r"did you mean '([^']*)'\? ", text)

@@ -13,12 +13,12 @@ INPUTS = ("hold", "mean")
 
 
 class Plan(NamedTuple):
-    """How logs are brought to one grid."""
+    """Parameters of resampling logs to one grid."""
 
     columns: Mapping[str, Address]
-    """Where columns come from; what is absent is found by its name."""
+    """Addresses of columns; an absent one is found by its name."""
     duplicates: Mapping[str, Address]
-    """The same quantity as a column on another topic: tells their delay, and is used for nothing else."""
+    """The quantity of a column on another topic, used for their delay only."""
     mean: bool
     """Inputs averaged over the sample, instead of the value held at the row."""
     gap: float | None
@@ -30,12 +30,12 @@ class Plan(NamedTuple):
 
 
 NOTHING = Plan({}, {}, False, None, None, 30.0)
-"""Without a table."""
+"""Plan of a rig without the table."""
 _KEYS = ("columns", "duplicates", "input", "gap", "shortest", "longest")
 
 
 def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
-    """What rig.toml (which `read_rig` has accepted) declares of an import; `columns` are those of the rig.
+    """Import that rig.toml, accepted by `read_rig`, declares; `columns` are those of the rig.
 
     Raises RigError at the first mistake.
     """

@@ -1,4 +1,4 @@
-"""How much later one topic tells what another told: by which shift their signals fit each other best."""
+"""Delay between topics: the shift by which their signals fit each other best."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,15 +14,15 @@ REACH = 0.25
 PARTS = 3
 """The readings are cut in so many parts, whose delays must agree."""
 BIAS = 0.25
-"""Intervals of the readings that parts which agree may all be wrong by; a third was seen, where angles tell it."""
+"""Intervals of the readings that parts which agree may all be wrong by; a third was observed for angles."""
 SPREAD = 0.01
-"""How far the delays of the parts may be apart [s]."""
+"""Largest difference between the delays of the parts [s]."""
 ROWS = 12_000
-"""Readings that a delay is told from at most: those around the liveliest input."""
+"""Readings used for a delay at most: those around the liveliest input."""
 WIDTHS = (1, 2, 4, 8)
 """Differences are over so many times the least stretch that shows anything: what is surest decides."""
 SURE = 0.3
-"""Correlation of what is left of both signals from which on a delay is told."""
+"""Smallest correlation of the residual signals at which a delay is reported."""
 
 
 class Pair(NamedTuple):
@@ -31,13 +31,14 @@ class Pair(NamedTuple):
     cause: str
     effect: str
     order: int
-    """How often the first is integrated to give the second: a torque to a rate 1, to an angle 2, one quantity 0."""
+    """Number of integrations from the first to the second: 1 from a torque to a rate, 2 to an angle, 0 for one
+    quantity."""
     held: bool
-    """Whether the first is held between its values, as a command is."""
+    """True where the first is held between its values, as a command is."""
 
 
 class Delay(NamedTuple):
-    """By how much the second signal comes after the first [s]."""
+    """Delay of the second signal after the first [s]."""
 
     cause: str
     """The column, and its topic."""
@@ -45,7 +46,7 @@ class Delay(NamedTuple):
     effect: str
     effect_topic: str
     seconds: float
-    """NaN: cannot be told."""
+    """Delay [s]; NaN: unknown."""
     std: float
     correlation: float
 
@@ -53,7 +54,8 @@ class Delay(NamedTuple):
 def pairs(
     inputs: Mapping[str, int], states: Sequence[str], signals: Mapping[str, Signal], duplicates: Sequence[str]
 ) -> list[Pair]:
-    """What follows what on another topic: motion its torque, an angle its rate, a quantity itself.
+    """Pairs of signals on different topics, the second after the first: motion after its torque, an angle its rate, a
+    quantity itself.
 
     `inputs` are columns and their joints, from 1; `states` coordinates, then rates; a duplicate of a column is called
     as it is, with a '.
@@ -142,7 +144,7 @@ def _part(
 
 
 def _between(signal: Signal, start: float, end: float) -> Signal:
-    """The part of a signal that tells its values from start to end [s]."""
+    """The part of a signal with its values from start to end [s]."""
     first, last = np.searchsorted(signal.t, (start, end))
     part = slice(max(int(first) - 1, 0), int(last) + 1)
     return Signal(signal.topic, signal.t[part], signal.y[part])
@@ -178,7 +180,7 @@ def _explained(at: Float[np.ndarray, " x"], around: Sequence[Signal]) -> Float[n
 
 
 class _Rest:
-    """What some columns do not explain of a signal."""
+    """Residual of a signal after regression on some columns."""
 
     def __init__(self, columns: Float[np.ndarray, "x regressor"]):
         u, s, _ = np.linalg.svd(columns, full_matrices=False)

@@ -1,4 +1,4 @@
-"""Which reader is for which file."""
+"""Readers by kind of file."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ readers: dict[str, Reader] = {
     ".parquet": table_file,
     ".mat": table_file,
 }
-"""By the end of the name; for another kind of file, add one that has `topics` and `read`."""
+"""Reader by the end of the name; for another kind of file, add one that has `topics` and `read`."""
 
 
 def reader(path: Path) -> Reader:

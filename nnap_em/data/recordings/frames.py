@@ -28,17 +28,17 @@ class Batch(NamedTuple):
     t: Int[np.ndarray, " message"]
     """Log time [ns]."""
     start: Int[np.ndarray, " message"]
-    """Where each message begins in `data`."""
+    """Offset in `data` of each message."""
     size: Int[np.ndarray, " message"]
     """Bytes."""
 
 
 class Broken(ValueError):
-    """A piece of the file that is not whole, or cannot be unpacked: the text says why."""
+    """A piece of the file that is damaged or cannot be unpacked, with the reason."""
 
 
 class Walked(NamedTuple):
-    """What stands in a piece of the file, record by record."""
+    """Records of a piece of the file."""
 
     schemas: dict[int, Any]
     channels: dict[int, Any]
@@ -62,7 +62,7 @@ class Frames:
     def batches(self, wanted: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
         """Messages of wanted channels, piece by piece; of all of the file, or of the chunk at an offset.
 
-        `wanted` is asked before each piece, because channels turn up on the way.
+        `wanted` is called before each piece, because channels appear on the way.
         """
         self.file.seek(len(MAGIC) if at is None else at)
         chunk, index, loose = None, {}, bytearray()
@@ -122,7 +122,7 @@ class Frames:
 
 
 def unpack(record: bytes) -> UInt8[np.ndarray, " byte"]:
-    """What a chunk record holds, unpacked; Broken where it is damaged, or of an unknown compression."""
+    """Content of a chunk record, unpacked; Broken where it is damaged, or of an unknown compression."""
     size, crc, length = struct.unpack_from("<QII", record, 16)
     compression = record[32 : 32 + length].decode(errors="replace")
     packed = memoryview(record)[40 + length :]

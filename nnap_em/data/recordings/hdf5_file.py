@@ -17,7 +17,7 @@ from .recording import EXTRA, Recording, Topic, Track, refuse
 TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
 UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9}
 MARKS = ("axis", "kind", "role", "standard_name")
-"""Attributes that say of a data set that it is the time."""
+"""Attributes that mark a data set as the time."""
 _BLOCK = 2**18
 """Rows of a wide data set that are read at once."""
 
@@ -72,7 +72,7 @@ def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
 
 
 def _nanoseconds(axis: Any) -> Int[np.ndarray, " row"]:
-    """The times, by the unit that an attribute, the name, or the size of whole numbers tells."""
+    """The times, by the unit that an attribute, the name, or the size of whole numbers shows."""
     t = axis[:]
     named = TIME.match(axis.name.rpartition("/")[2])
     unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).strip().lower() or (named and named[1]) or ""
@@ -84,7 +84,7 @@ def _nanoseconds(axis: Any) -> Int[np.ndarray, " row"]:
 
 
 def _axis(group: Any) -> Any | None:
-    """The times of a group: a data set that says so, or is named so; else that of a group above it, of as many rows."""
+    """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
     inside = [(name, data) for name, data in _numeric(group)]
     for _, data in inside:
         if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in MARKS):

@@ -1,4 +1,4 @@
-"""MCAP files: topics and their numbers, in the memory of what is asked for."""
+"""MCAP files: topics and their numbers, in the memory of the requested ones."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,13 +30,13 @@ class _Open(NamedTuple):
     path: Path
     frames: Frames
     counts: Mapping[int, int] | None
-    """Messages of each channel, where the file says."""
+    """Messages of each channel, where the file has them."""
     firsts: Mapping[int, int] | None
-    """Offset of the first chunk of each channel, where the file says."""
+    """Offset of the first chunk of each channel, where the file has it."""
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """What the file holds; whole chunks are read only to see the first messages of each channel."""
+    """Topics of the file; whole chunks are read only for the first messages of each channel."""
     with _opened(path) as log:
         samples = _samples(log)
         found: dict[str, Topic] = {}
@@ -128,7 +128,7 @@ def _nanoseconds(values: Float[np.ndarray, "message two"]) -> Int[np.ndarray, " 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Open]:
-    """The file with what its summary tells; its mistakes as a DataError."""
+    """The file with the content of its summary; mistakes as a DataError."""
     try:
         import mcap.exceptions
         import mcap.reader
@@ -202,7 +202,7 @@ def _stamp(reader: Codec, batch: Batch) -> tuple[str, ...]:
 
 
 def _cut(log: _Open) -> tuple[str, ...]:
-    """What is to be told of a file that ends too early."""
+    """Messages about a file that ends too early."""
     if log.frames.whole:
         return ()
     lost = f"its last {log.frames.lost} bytes are no whole record" if log.frames.lost else "its summary is missing"

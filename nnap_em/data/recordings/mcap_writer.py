@@ -25,7 +25,7 @@ class Channel(NamedTuple):
     """Columns of one topic, for every sequence."""
 
     units: Mapping[str, str]
-    """By column."""
+    """Unit by column."""
     values: Float[np.ndarray, "seq time column"]
 
 

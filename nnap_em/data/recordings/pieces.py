@@ -1,4 +1,4 @@
-"""Rows of one uniform grid, and the stretches of it in which every topic speaks."""
+"""Rows of one uniform grid, and the stretches of it in which every topic is present."""
 
 import math
 from collections.abc import Mapping
@@ -32,16 +32,16 @@ class Piece(NamedTuple):
     end: int
     """The row after the last one."""
     why: str = ""
-    """Why it is dropped; empty: it is used."""
+    """Reason why it is dropped; empty: it is used."""
 
 
 def reach(signal: Signal, dt: float) -> float:
-    """How far apart neighbours may be that are interpolated [s]."""
+    """Largest distance of neighbours between which values are interpolated [s]."""
     return max(NEAR * signal.interval, dt)
 
 
 def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
-    """From which silence on a topic has a gap [s]."""
+    """Shortest silence that is a gap of a topic [s]."""
     return INTERVALS * max(signal.interval, dt) if declared is None else declared
 
 
@@ -52,7 +52,7 @@ def gaps(signal: Signal, longest: float) -> list[Gap]:
 
 
 def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> dict[str, tuple[float, float]]:
-    """From when to when each topic speaks [s]; a command is held for one more of its intervals, not to its end."""
+    """Intervals in which each topic is present [s]; a command is held for one more of its intervals, not to its end."""
     found: dict[str, tuple[float, float]] = {}
     for signals, hold in ((inputs, True), (readings, False)):
         for s in signals.values():

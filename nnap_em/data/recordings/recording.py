@@ -1,4 +1,4 @@
-"""What a recording holds, whatever file it came from: topics with numbers at times of their own."""
+"""Content of a recording, whatever file it came from: topics with numbers at times of their own."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,30 +21,30 @@ class Topic(NamedTuple):
     kind: str
     """Type and encoding, for people."""
     messages: int | None
-    """None: the file does not say."""
+    """Number of messages; None where the file does not have it."""
     fields: tuple[str, ...]
     """Paths of its numbers, such as `position[shoulder]` or `data[0]`, in the order of the message."""
 
 
 class Track(NamedTuple):
-    """What was read of one topic."""
+    """Content of one topic."""
 
     t: Int[np.ndarray, " message"]
     """ns, rising; of the epoch where the file's clock is."""
     values: Mapping[str, Float[np.ndarray, " message"]]
-    """By path; NaN where a message has no such number."""
+    """Values by path; NaN where a message has no such number."""
     clock: str
-    """Where the times come from: `header stamp`, `log time`, or the name of a column."""
+    """Source of the times: `header stamp`, `log time`, or the name of a column."""
     notes: tuple[str, ...]
-    """What was odd about the times."""
+    """Irregularities of the times."""
 
 
 class Recording(NamedTuple):
-    """What was read of one file."""
+    """Content of one file."""
 
     path: Path
     tracks: Mapping[str, Track]
-    """By topic."""
+    """Tracks by topic."""
     notes: tuple[str, ...] = ()
 
 
@@ -53,7 +53,7 @@ class Reader(Protocol):
     """A kind of file."""
 
     def topics(self, path: Path) -> tuple[Topic, ...]:
-        """What the file holds, without reading it all."""
+        """Topics of the file, without reading it all."""
         ...
 
     def read(self, path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
@@ -62,7 +62,7 @@ class Reader(Protocol):
 
 
 class Address(NamedTuple):
-    """Where a column comes from."""
+    """Address of a column."""
 
     topic: str
     path: str
@@ -109,7 +109,7 @@ OTHER = "write it as ROS 2 CDR, JSON or protobuf, or name another topic"
 
 
 def near(word: str, known: Sequence[str], most: int = 12) -> str:
-    """The mend for a misspelt name among many."""
+    """The hint for a misspelt name among many."""
     text = nearest(word, known)
     first, mark, rest = text.partition("possible here: ")
     names = rest.split(", ")

@@ -1,4 +1,4 @@
-"""Where the numbers of a ROS 2 message lie in its bytes: CDR, little endian [OMG DDS-XTypes 1.3, 7.4: XCDR1]."""
+"""Places of the numbers of a ROS 2 message in its bytes: CDR, little endian [OMG DDS-XTypes 1.3, 7.4: XCDR1]."""
 
 import math
 import re
@@ -37,23 +37,23 @@ class Run(NamedTuple):
     length: int
     """-1: one number that is no list."""
     names: tuple[str, ...]
-    """Of the entries, where names stand beside them."""
+    """Names of the entries, where names are beside them."""
 
 
 class Layout(NamedTuple):
-    """Where everything lies in the messages of one form: same lengths of all lists and texts, same names."""
+    """Layout of the messages of one form: same lengths of all lists and texts, same names."""
 
     size: int
     fixed: Int[np.ndarray, " byte"]
     """Offsets of the bytes that make the form: those of every length, and of names."""
     form: UInt8[np.ndarray, " byte"]
-    """What stands there."""
+    """Bytes of the form."""
     runs: Mapping[str, Run]
 
     def matches(
         self, data: UInt8[np.ndarray, " byte"], start: Int[np.ndarray, " message"], size: Int[np.ndarray, " message"]
     ) -> Bool[np.ndarray, " message"]:
-        """Which messages have this form."""
+        """Mask of the messages that have this form."""
         same = size == self.size
         rows = start[same] if not same.all() else start
         same[same] = (data[rows[:, None] + self.fixed] == self.form).all(axis=1)
@@ -74,7 +74,7 @@ class Layout(NamedTuple):
 
 
 def _place(run: Run, index: str | None) -> int | None:
-    """Which number of a run is meant."""
+    """Place of a number in a run."""
     if index is None:
         return 0 if run.length < 0 else None
     if index in run.names:
@@ -190,7 +190,7 @@ class _Walk:
 
 
 def layout(types: Types, name: str, message: bytes) -> Layout:
-    """Where the numbers of a message lie; UnknownLayout where it is no little-endian XCDR1 of these types."""
+    """Places of the numbers of a message; UnknownLayout where it is no little-endian XCDR1 of these types."""
     if message[:2] != b"\x00\x01":
         raise UnknownLayout(f"encapsulation {message[:2].hex()}")
     walk = _Walk(types, message)

@@ -69,7 +69,7 @@ class LogQuadratic(NamedTuple):
 
 
 class Move(NamedTuple):
-    """What the particles need of the potential psi at one time; the fields carry a leading time axis.
+    """Quantities of the potential psi at one time that particles use; the fields carry a leading time axis.
 
     With spread S, S S' = (V^-1 + precision)^-1 where V is the covariance of what moves the particles:
     a particle of mean m moves to N(keep m + shift, S S').
@@ -83,7 +83,7 @@ class Move(NamedTuple):
     spread: Float[Array, "*time state state"]
 
     def move(self, mean: Rows, noise: Rows) -> Rows:
-        """Where particles of some mean go with standard normal noise."""
+        """Positions of particles of some mean with standard normal noise."""
         kept, kicked = apply(self.keep, mean), apply(self.spread, noise)
         return [a + b + c for a, b, c in zip(kept, self.shift, kicked, strict=True)]
 

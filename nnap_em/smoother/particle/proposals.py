@@ -1,4 +1,4 @@
-"""How far a particle sees when it is moved: the potentials of a model linearised about its smoothed path."""
+"""Look-ahead of particles: the potentials of a model linearised about its smoothed path."""
 
 from abc import abstractmethod
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from .potentials import Potentials, twisted
 
 
 class AbstractProposal(eqx.Module):
-    """How far a particle sees when it is moved."""
+    """Look-ahead of a particle when it is moved."""
 
     @abstractmethod
     def __call__(self, model, seq: Prepared, filtered: Filtered, smoothed: Smoothed) -> Potentials:
@@ -42,7 +42,7 @@ class Bootstrap(AbstractProposal):
     """Blind: the transition itself [Gordon, Salmond & Smith 1993]."""
 
     def __call__(self, model, seq: Prepared, filtered: Filtered, smoothed: Smoothed) -> Potentials:
-        """Potentials that say nothing."""
+        """Constant potentials."""
         path, cov = smoothed.state
         return Potentials(path, jnp.zeros_like(cov), jnp.zeros_like(path))
 

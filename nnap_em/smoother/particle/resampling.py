@@ -26,7 +26,7 @@ def systematic(log_w: Float[Array, " particle"], offset: Float[Array, ""], count
 
 
 def sweep(reach: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
-    """Where (j + offset) / count of the total falls among the cumulative weights, for each j."""
+    """Place of (j + offset) / count of the total among the cumulative weights, for each j."""
     before = jnp.ceil(reach * (count / reach[-1]) - offset).astype(jnp.int32)  # draws among the particles up to here
     drops = jnp.zeros(count + 1, reach.dtype).at[jnp.clip(before, 0, count)].add(1, mode="promise_in_bounds")
     return jnp.minimum(cumsum(drops[:count]).astype(jnp.int32), reach.shape[0] - 1)

@@ -26,15 +26,15 @@ class ParticleSmoother(AbstractSmoother):
     num_particles: int = eqx.field(static=True, default=300)
     num_paths: int = eqx.field(static=True, default=100)
     dtype: str = eqx.field(static=True, default="float32", converter=lambda dtype: jnp.dtype(dtype).name)
-    """Of the particles; Gaussians and results keep the precision of the model."""
+    """Type of the particles; Gaussians and results keep the precision of the model."""
 
     @property
     def bytes_per_row(self) -> int:
-        """Memory [B] that a row takes."""
-        return self.guide.bytes_per_row + 64 * self.num_particles + 128 * self.num_paths  # measured: docs/throughput.md
+        """Memory [B] that a row takes, measured for docs/results/throughput.md."""
+        return self.guide.bytes_per_row + 64 * self.num_particles + 128 * self.num_paths
 
     def tolerant(self) -> "ParticleSmoother":
-        """With a guide whose first passes are looser."""
+        """The smoother with a guide whose first passes are looser."""
         return dataclasses.replace(self, guide=self.guide.tolerant())
 
     def history(self, model, seq: Prepared, *, key: PRNGKeyArray) -> ParticleHistory:

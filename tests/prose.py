@@ -1,0 +1,70 @@
+"""Check of the sentences in docstrings and comments of the package: `python tests/prose.py`, a part of `make lint`.
+
+A docstring starts with what it documents: a noun, or a verb in the imperative or the third person.  It does not start
+with a question word or a preposition ("Of every sequence").  Data, models and laws do not speak: words of `BANNED`
+stand in no docstring and no comment, except as names in backticks.  CONTRIBUTING.md has the terms to use instead.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+EXEMPT = ("diagnose/", "data/rig.py", "data/mjcf.py", "model/", "effects/")
+"""Files and folders of the package that are not checked yet."""
+START = re.compile(
+    r"(What|Where|Whether|Who|Whose|Whom|Which|How|When|Why|Of|For|As|With|Without|In|On|At|From|To|By|That|If|After"
+    r"|Before|Because)\b"
+)
+"""Words that start no docstring."""
+BANNED = re.compile(
+    r"\b(told|tells?|telling|foretold|untold|unsaid|says?|said|saying|believes?|believed|beliefs?|feels?|felt|forgets?"
+    r"|forgotten|shouts?|asks?|asked|asking|mends?|mended|promised?s?|owns? up|knows|speaks?|loud)\b",
+    re.IGNORECASE,
+)
+"""Words that describe data, models and laws as people, or that the vocabulary replaces."""
+
+
+def docstrings(source: str) -> Iterator[tuple[int, str]]:
+    """Line and text of every docstring, those of attributes among them."""
+    for node in ast.walk(ast.parse(source)):
+        body = getattr(node, "body", None)
+        for one in body if isinstance(body, list) else ():
+            if isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant) and isinstance(one.value.value, str):
+                yield one.lineno, one.value.value
+
+
+def comments(source: str) -> Iterator[tuple[int, str]]:
+    """Line and text of every comment."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+
+
+def mistakes(source: str) -> list[tuple[int, str]]:
+    """Line and reason of every docstring and comment to be rewritten."""
+    found = [(line, f"starts with {m[1]!r}") for line, text in docstrings(source) if (m := START.match(text.lstrip()))]
+    for line, text in (*docstrings(source), *comments(source)):
+        words = BANNED.findall(re.sub(r"`[^`]*`", "", text))
+        found += [(line, f"has the word {word!r}") for word in words]
+    return sorted(found)
+
+
+def in_package(*, exempt: bool = False) -> dict[str, list[tuple[int, str]]]:
+    """Mistakes by file of the package: of files that are checked, or of those `exempt`."""
+    paths = {str(path.relative_to(ROOT / "nnap_em")): path for path in sorted((ROOT / "nnap_em").rglob("*.py"))}
+    some = {name: path for name, path in paths.items() if name.startswith(EXEMPT) == exempt}
+    found = {name: mistakes(path.read_text()) for name, path in some.items()}
+    return {name: lines for name, lines in found.items() if lines}
+
+
+if __name__ == "__main__":
+    wrong = in_package()
+    for name, lines in wrong.items():
+        for line, reason in lines:
+            print(f"nnap_em/{name}:{line}: {reason}")
+    sys.exit(bool(wrong))

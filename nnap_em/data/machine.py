@@ -75,9 +75,9 @@ class Motor(NamedTuple):
     joint: int
     gear: float
     kind: str = TORQUE
-    """Of `servo.KINDS`."""
+    """One of `servo.KINDS`."""
     numbers: tuple[tuple[str, float], ...] = ()
-    """Of the servo, by their keys."""
+    """Numbers of the servo, by their keys."""
 
 
 class Gauge(NamedTuple):

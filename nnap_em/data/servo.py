@@ -1,4 +1,4 @@
-"""What rig.toml declares of the drives: an input is a torque, or the command of a servo with a law of its own."""
+"""Declaration of what rig.toml declares of the drives: an input is a torque, or the command of a servo with a law of its own."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ class Key(NamedTuple):
     """A number of a servo."""
 
     unit: str
-    """On a rotary joint."""
+    """Unit on a rotary joint."""
     needed: bool = False
     """True where no servo is one without it."""
     least: float | None = None
@@ -83,7 +83,7 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
 
 
 def keys(table: Any) -> tuple[str, ...]:
-    """What may stand in [input], tables of single columns among it, which `read_drives` looks at."""
+    """Keys allowed in [input], tables of single columns among it, which `read_drives` looks at."""
     return (*RESERVED, *(key for key, value in table.items.items() if isinstance(value, dict)))
 
 
@@ -122,7 +122,7 @@ def named(drives: Mapping[str, Drive]) -> dict[str, Any]:
 
 
 def key_of(name: str, kinds: Mapping[str, str]) -> Key | None:
-    """What a parameter of this name is to the drives of some columns; None for one of the machine."""
+    """Key of a parameter of this name among the drives of some columns; None for one of the machine."""
     column, _, key = name.rpartition(".")
     return KINDS[kinds[column]].get(key) if column in kinds else None
 

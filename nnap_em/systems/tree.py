@@ -36,7 +36,7 @@ class Tree(AbstractSystem):
     """Numbers that are not the file's, under their names in `[model.uncertain]`."""
     joints: tuple[int, ...] = eqx.field(static=True)
     loads: dict[int, Inertia] = eqx.field(default_factory=dict)
-    """What bodies carry beside their own mass, by their place, about the origins of their frames."""
+    """Loads of bodies beside their own mass, by their place, about the origins of their frames."""
 
     @classmethod
     def declared(cls, parameters, joints, machine):
@@ -93,7 +93,7 @@ class Tree(AbstractSystem):
 
     @property
     def spots(self) -> dict[int, Spot]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Where a load may sit, by the joint that carries it."""
+        """Places of candidate loads, by the joint that carries it."""
         return spots(self.machine, laid(self.text))
 
     def loaded(self, joint, mass, moment):

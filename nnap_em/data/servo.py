@@ -1,4 +1,4 @@
-"""Declaration of what rig.toml declares of the drives: an input is a torque, or the command of a servo with a law of its own."""
+"""Drives that rig.toml declares: an input is a torque, or the command of a servo with a law of its own."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple

@@ -47,7 +47,7 @@ def declare(root: Any) -> Told:
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:
-    """Gear of a motor of the kind in the file; an input of another kind in rig.toml acts on the joint itself."""
+    """Gear of the motor of the file; 1 for an input of another kind in rig.toml, which acts on the joint itself."""
     return 1.0 if motor is None or (drive.kind != TORQUE and motor.kind != drive.kind) else motor.gear
 
 

@@ -75,7 +75,7 @@ class Motor(NamedTuple):
     joint: int
     gear: float
     kind: str = TORQUE
-    """Kind of `servo.KINDS`."""
+    """One of `servo.KINDS`."""
     numbers: tuple[tuple[str, float], ...] = ()
     """Numbers of the servo, by their keys."""
 

@@ -1,4 +1,4 @@
-"""Drives in rig.toml: an input is a torque, or the command of a servo with a law of its own."""
+"""Drives that rig.toml declares: an input is a torque, or the command of a servo with a law of its own."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -83,7 +83,7 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
 
 
 def keys(table: Any) -> tuple[str, ...]:
-    """Keys of [input] and tables of single columns in it, which `read_drives` checks."""
+    """Keys allowed in [input], tables of single columns among it, which `read_drives` looks at."""
     return (*RESERVED, *(key for key, value in table.items.items() if isinstance(value, dict)))
 
 
@@ -122,7 +122,7 @@ def named(drives: Mapping[str, Drive]) -> dict[str, Any]:
 
 
 def key_of(name: str, kinds: Mapping[str, str]) -> Key | None:
-    """Key of a parameter of the drives of some columns; None for one of the machine."""
+    """Key of a parameter of this name among the drives of some columns; None for one of the machine."""
     column, _, key = name.rpartition(".")
     return KINDS[kinds[column]].get(key) if column in kinds else None
 

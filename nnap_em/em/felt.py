@@ -32,9 +32,9 @@ def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Fe
     """Base parameters: combinations of uncertain parameters that the inverse dynamics M(q) a + c(q, v) depends on.
 
     [Gautier & Khalil 1990, IEEE Trans. Robotics and Automation 6(3): base parameters]  By the null space of its
-    derivatives at random states, each in declared standard deviations.  With servos, whose torques nobody logs, it is
+    derivatives at random states, each in declared standard deviations.  With servos, whose torque is no column, it is
     M(q) a + c(q, v) - tau(u, q, v), at the accelerations that the servos give, and without what a learned friction of
-    the joints holds, too.  Delays and limits are identified by moments, if at all, and are left out.
+    the joints holds.  Delays and limits are left out: only single moments depend on them.
     """
     names = [name for name, declared in rig.parameters.items() if declared.std > 0]
     names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]

@@ -102,12 +102,12 @@ def _told(body: Numbers) -> list[Scalar]:
 
 
 class Spot(NamedTuple):
-    """Place of a load on the body of a joint, and its typical size."""
+    """Place of a candidate load on the body of a joint, and its typical size."""
 
     body: int
     """Place of the body among all."""
     point: tuple[float, float, float]
-    """Place of a load without a first moment, in the frame of the body [m]."""
+    """Point of a load without a first moment, in the frame of the body [m]."""
     mass: float
     """Mean mass of a moving body [kg]."""
     length: float

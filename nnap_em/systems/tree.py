@@ -93,7 +93,7 @@ class Tree(AbstractSystem):
 
     @property
     def spots(self) -> dict[int, Spot]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Places of a load, by the joint that carries it."""
+        """Places of candidate loads, by the joint that carries it."""
         return spots(self.machine, laid(self.text))
 
     def loaded(self, joint, mass, moment):

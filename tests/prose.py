@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-EXEMPT = ("diagnose/", "data/rig.py", "data/mjcf.py", "model/", "effects/")
+EXEMPT = ("data/rig.py", "data/mjcf.py", "model/")
 """Files and folders of the package that are not checked yet."""
 START = re.compile(
     r"(What|Where|Whether|Who|Whose|Whom|Which|How|When|Why|Of|For|As|With|Without|In|On|At|From|To|By|That|If|After"

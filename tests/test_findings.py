@@ -50,7 +50,7 @@ def _closed(rig: Rig, *effects: AbstractEffect) -> Closed:
     now = Hypothesis(before.model, before.m_step)
     for effect in effects:
         candidate = Candidate(effect, (effect,), effect)
-        now = now.plus(effect, candidate, Found(candidate, 100.0, 50.0, 1e-20, ROWS))
+        now = now.plus(effect, candidate, Found(100.0, 50.0, 1e-20))
     model, rule, found = now
     size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
     state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))

@@ -11,6 +11,7 @@ from nnap_em.diagnose.hypothesis import Found
 from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed
 from nnap_em.diagnose.rivals import apart, instead, possible
+from nnap_em.diagnose.verdict import EVEN_NATS
 from nnap_em.em.identify import identify
 from nnap_em.systems import specs
 
@@ -33,7 +34,7 @@ def weak_drive(tmp_path_factory):
 
 
 def _closed(bare, full, *equivalent) -> Closed:
-    return Closed(bare, full, (Found(None, 1.0, 1.0, 0.0, 1, equivalent),), ())  # type: ignore[arg-type]
+    return Closed(bare, full, (Found(1.0, 1.0, 0.0, equivalent),), ())
 
 
 def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
@@ -62,4 +63,5 @@ def test_a_rival_that_is_clearly_likelier_takes_the_place(weak_drive):
     told = apart(_closed(bare, delay, gain), data)
     (effect,) = told.after.model.effects
     assert effect.name == "motor_gain" and abs(float(effect.values()["gain"]) - GAIN) < 0.05
+    assert told.found[0].gain > 1.0 + EVEN_NATS  # the lead over the law that it replaces is added
     assert told.found[0].equivalent == ()

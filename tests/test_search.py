@@ -49,8 +49,8 @@ def _candidate(name: str, spread: float = 2.0) -> Candidate:
     return Candidate(_law(name), (_law(name, 1.0),), _law(name, spread))
 
 
-def _found(name: str, removed: float = 0.5) -> Found:
-    return Found(_candidate(name), 100.0, 50.0, 1e-20, 9, removed=removed)
+def _found(removed: float) -> Found:
+    return Found(100.0, 50.0, 1e-20, removed=removed)
 
 
 def _function(name: str = "unknown_function"):
@@ -71,7 +71,7 @@ def _with(*names: str) -> Hypothesis:
     """The slide with these effects."""
     now = BARE
     for i, name in enumerate(names):
-        now = now.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(name))
+        now = now.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(0.5 + 0.1 * i))
     return now
 
 
@@ -107,7 +107,7 @@ def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
     left, names = [i for i in range(3) if i != place], ("motor_gain", "dead_zone", "air_drag")
     now = _with(*names).without(place)
     assert _names(now.model) == [names[i] for i in left]
-    assert [f.candidate.start.name for f in now.found if f] == [names[i] for i in left]
+    assert [f.removed for f in now.found if f] == [0.5 + 0.1 * i for i in left]
     np.testing.assert_allclose(now.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
     assert [name.partition(".")[0] for name in now.m_step.prior.names] == ["m", "0", "1"]
 
@@ -224,7 +224,7 @@ def test_both_of_two_laws_go_that_are_worth_nothing(monkeypatch):
 
 def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
     _pretend(monkeypatch, {"dead_zone": 0.5})
-    now = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found("dead_zone"))
+    now = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
     assert search._backward(_context(), now).found == ()
 
 
@@ -276,10 +276,10 @@ def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
 def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(own, names):
     """The remainder removes half of what is left by a law that removed nine tenths, or one."""
     spring = Candidate(_spring(), (_spring(),), _spring())
-    now = BARE.plus(_spring(), spring, Found(spring, 1.0, 1.0, 0.0, 9, removed=own))
+    now = BARE.plus(_spring(), spring, Found(1.0, 1.0, 0.0, removed=own))
     law = _function()
     case = _case(law)._replace(after=now.plus(law, _case(law).screened.candidate))
-    following = search._with(now, case, _found("motor_gain"), _context())
+    following = search._with(now, case, _found(0.5), _context())
     assert _names(following.model) == names
     # the remainder that took the place removed what both did; beside the law only its own
     assert following.found[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)

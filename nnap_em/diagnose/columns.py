@@ -1,4 +1,4 @@
-"""What candidates would add along the smoothed motion: force and reading of each of their probes."""
+"""Columns of candidates along the smoothed motion: force and reading of each of their probes."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -19,24 +19,24 @@ from ..numerics.parallel import each
 
 
 class Track(NamedTuple):
-    """What candidates see of a fitted model along the smoothed path of a sequence, whatever its structure."""
+    """The fitted model along the smoothed path of a sequence, in a form that does not depend on its structure."""
 
     x: Float[Array, "*time state"]
     """(q, v) in every row."""
     middle: Float[Array, "*time state"]
     """State (q, v) in the middle of every step."""
     acceleration: Float[Array, "*time dof"]
-    """In the middle of every step [rad/s^2]."""
+    """Acceleration in the middle of every step [rad/s^2]."""
     drive: Float[Array, "*time dof"]
     """Generalised force of the inputs over every step [N m]."""
     friction: Float[Array, "*time dof"]
     """Torque of the learned map in the middle of every step [N m]."""
     true: Float[Array, "*time readable"]
-    """What sensors without a fault would read in every row."""
+    """Readings of sensors without a fault in every row."""
     rate: Float[Array, "*time readable"]
     """Time derivative of that."""
     inputs: Inputs
-    """What acts on the fitted model from outside."""
+    """External inputs of the fitted model."""
 
 
 def tracks(null: StateSpaceModel, path: Gaussian, inputs: Inputs) -> Track:
@@ -60,7 +60,7 @@ def _track(null: StateSpaceModel, one) -> Track:
 
 
 def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
-    """What `effect` adds, by its own hooks, to the machine `base` along a track."""
+    """Columns that `effect` adds, by its own hooks, to the machine `base` along a track."""
     alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
     x = track.x
     drive = jax.vmap(system.drive)(hooks.reaching(alone, system, track.inputs.u, base.dt))
@@ -115,7 +115,7 @@ def _stacks(probes: Sequence[AbstractEffect]) -> list[Stack]:
 
 
 def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
-    """By NumPy: a stack of many small arrays would be one program for every number of them."""
+    """Stack made by NumPy: a stack of many small arrays would be one program for every number of them."""
     flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
     whole = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
     same = [bool((a == a[0]).all()) for a in whole]
@@ -140,7 +140,7 @@ def _stack_columns(common, track: Track) -> list[Columns]:
 def candidate_columns(
     base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0
 ) -> Callable[[Track], Columns]:
-    """What every probe of every candidate adds to `base` along the tracks of some sequences: seq column time ...
+    """Columns that the probes of all candidates add to `base` along the tracks of some sequences: seq column time ...
 
     Tracks are padded to `rows`, so that horizons share the largest program.
     """

@@ -40,7 +40,7 @@ PERIODIC = ("phase",)
 
 
 class CompareError(ValueError):
-    """Fits that cannot be compared: the message names them and says why, with a hint."""
+    """Fits that cannot be compared: the message names them and the reason, with a hint."""
 
 
 class Fit(NamedTuple):
@@ -92,7 +92,7 @@ class Curve(NamedTuple):
     pooled: Pooled
     test: JointTest
     law: tuple[Number, ...]
-    """The Stribeck numbers; their tests say which part of a curve changed, and are no quantities of their own."""
+    """The Stribeck numbers; their tests locate the change of a curve, and are no quantities of their own."""
 
     @property
     def std(self) -> Float[np.ndarray, "fit node"]:
@@ -101,7 +101,7 @@ class Curve(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As a reader would call it."""
+        """Name for a reader."""
         return f"friction of joint {self.joint}"
 
     @property
@@ -279,7 +279,7 @@ def _body(fitted: Identified):
 
 
 def _identity(fitted: Identified) -> tuple:
-    """Numbers that tell a fit from any other."""
+    """Numbers by which a fit is identified."""
     model, weights = fitted.model, fitted.m_step.weights(fitted.model)
     return weights.read(model), model.log_q, model.log_r, fitted.state.hessian, fitted.state.loglik
 

@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
 
 
 def covariance(fitted: Identified) -> Float[np.ndarray, "param param"]:
-    """Of all estimated parameters, friction integrated out (Laplace)."""
+    """Covariance of all estimated parameters, friction integrated out (Laplace)."""
     prior = fitted.m_step.prior
     cov = np.linalg.inv(np.asarray(fitted.state.hessian))
     cut = cov.shape[0] - prior.size
@@ -74,15 +74,15 @@ class Finding(NamedTuple):
     equivalent: tuple[Key, ...]
     sentence: str
     curve: Curve | None = None
-    """What was learned of its form: the function itself, or what is left beside a law."""
+    """Learned form: the function itself, or the remainder beside a law."""
     shape: Shape | None = None
-    """What the curve looks like."""
+    """Description of the curve."""
     left: bool = False
-    """Whether the curve is what is left beside the law."""
+    """True if the curve is the remainder beside the law."""
 
 
 def findings(closed: Closed) -> list[Finding]:
-    """All that was found, with what cannot be told from it."""
+    """All effects found, each with its equivalents."""
     fitted, model = closed.after, closed.after.model
     cov = covariance(fitted)
     own = [cov[block, block] for block in blocks(model, fitted.m_step)]
@@ -91,7 +91,7 @@ def findings(closed: Closed) -> list[Finding]:
     out = []
     for effect, found, numbers, law in entries:
         if law is not None:
-            continue  # told with the law that it completes
+            continue  # reported with the law that it completes
         drawn = effect.curve(numbers, model.system)
         parameters = estimates(effect, numbers, model.system)
         numbers_told = ", ".join(
@@ -166,7 +166,7 @@ def verdict(
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:
-    """How far the missing effect had bent the learned friction."""
+    """Change of the learned friction by the added effects."""
     if not (closed.found and closed.before.rig.friction):
         return None
     first, second = (np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (closed.before, closed.after))
@@ -184,16 +184,16 @@ class Dispute(NamedTuple):
     channel: str | None
     inputs: list[str]
     share_of_error: float
-    """That it would remove."""
+    """Share of the squared error that it would remove."""
     files: list[str]
-    """Recordings that speak against it."""
+    """Recordings whose error it would increase."""
     harm: float
     """Share by which the error would rise on the worst of them."""
     description: str
 
 
 def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
-    """Laws that the last look would have tried, had some recordings not said the opposite; `files` by sequence."""
+    """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
     for told in [one for step in closed.last for one in step.disputed][:most]:
         name, joint, channel, inputs = told.key

@@ -15,19 +15,16 @@ from .keys import Key
 
 
 class Found(NamedTuple):
-    """Why an effect was added."""
+    """Evidence for an added effect."""
 
-    candidate: Candidate
     gain: float
     """Log-likelihood over the model without it, where it was found [nat]."""
     held_out: float
     """Expected gain on parts left out of the fit of its strengths [nat]; NaN where many steps decided."""
     p_value: float
-    """Of the likelihood ratio, times the number of candidates tried."""
-    horizon: int
-    """Rows of each sequence on which it was found."""
+    """P-value of the likelihood ratio, times the number of candidates tried."""
     equivalent: tuple[Key, ...] = ()
-    """Effects that the data cannot tell from it."""
+    """Effects that the data cannot distinguish from it."""
     share: float = float("nan")
     """Share of the multi-step error that it removes on recordings left out of its fit."""
     removed: float = float("nan")
@@ -78,12 +75,12 @@ class Hypothesis(NamedTuple):
         return Hypothesis(model, rule, tuple(a.found for a in additions))
 
     def plus(self, effect: AbstractEffect, candidate: Candidate, found: Found | None = None) -> "Hypothesis":
-        """With one effect more, behind the others."""
+        """The hypothesis with one effect more, behind the others."""
         centre = candidate.start if effect.linear else effect
         return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.spread), found)))
 
     def without(self, place: int) -> "Hypothesis":
-        """Without the effect at `place`."""
+        """The hypothesis without the effect at `place`."""
         return self.having(tuple(a for i, a in enumerate(self.additions) if i != place))
 
     def refitted(self, model: StateSpaceModel) -> "Hypothesis":
@@ -98,7 +95,7 @@ class Hypothesis(NamedTuple):
 
 
 def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:
-    """Where the parameters of every effect stand among all that are estimated."""
+    """Slice of the parameters of every effect among all that are estimated."""
     sizes = [flat(effect).size for effect in model.effects]
     ends = np.cumsum(sizes) + m_step.prior.size - sum(sizes)
     return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]

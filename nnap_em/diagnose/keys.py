@@ -1,4 +1,4 @@
-"""What tells two effects apart, how a reader would call them, and which law completes or replaces which."""
+"""Identity of effects, their names for a reader, and the laws that complete or replace one another."""
 
 from collections.abc import Sequence
 
@@ -13,12 +13,12 @@ Key = tuple[str, int | None, str | None, tuple[str, ...]]
 
 
 def key_of(effect: AbstractEffect) -> Key:
-    """What tells two effects apart."""
+    """Identity of an effect: two with the same key are the same law in the same place."""
     return effect.name, effect.joint, effect.channel, effect.inputs_named()
 
 
 def words(key: Key) -> str:
-    """An effect as a reader would call it."""
+    """Name of an effect for a reader."""
     name, joint, channel, inputs = key
     text = name.replace("_", " ")
     if inputs:
@@ -28,7 +28,7 @@ def words(key: Key) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names as a sentence lists them."""
+    """Names joined as in a sentence."""
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
@@ -47,7 +47,7 @@ def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
 
 
 def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
-    """Whether an unnamed law in the model is a function of the same signals at the same joint as a named one."""
+    """True if an unnamed law in the model is a function of the same signals at the same joint as a named one."""
     return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
 
 
@@ -64,6 +64,6 @@ def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) 
 
 
 def _alike(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
-    """Whether both are functions of the same signals at the same joint."""
+    """True if both are functions of the same signals at the same joint."""
     own, its = (set(effect.signals(model.system)) for effect in (one, other))
     return bool(own) and own == its and one.joint == other.joint

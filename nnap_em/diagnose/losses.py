@@ -77,8 +77,8 @@ class AbstractLoss(eqx.Module):
 class MultiStep(AbstractLoss):
     """Open-loop errors of the measured coordinates some time ahead, by band of horizons.
 
-    A machine whose noise is not what its model says shows here what it lacks: that adds up over many steps, and what
-    spoils its readings does not.  Fast machines forget, and show it at the shorter horizons only.
+    Where noise is not as modelled, missing forces appear here: their effect adds up over many steps, that of bad
+    readings does not.  On fast machines, whose errors saturate early, they appear at the shorter horizons only.
     """
 
     bars: ClassVar[Bars] = MULTI_STEP
@@ -125,7 +125,7 @@ class MultiStep(AbstractLoss):
 
 
 class OneStep(AbstractLoss):
-    """Whitened innovations: efficient where they are white, as the model says."""
+    """Whitened innovations: efficient where they are white, as modelled."""
 
     bars: ClassVar[Bars] = ONE_STEP
     measure: ClassVar[str] = "share of the squared one-step error"

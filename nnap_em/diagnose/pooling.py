@@ -11,7 +11,7 @@ LEAST_VARIANCE = 1e-2
 """Smallest variance of a direction that a joint test uses, in the mean variance of its numbers [1].
 
 Contrasts between neighbouring nodes of a curve are stated to be far surer than the nodes, because the network that
-draws the curve is smooth: the shape of the network says so, not the logs."""
+draws the curve is smooth: that is a property of the network, not of the logs."""
 
 
 class JointTest(NamedTuple):

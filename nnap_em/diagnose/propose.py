@@ -1,4 +1,4 @@
-"""What is tried: every effect of the catalogue that this machine could have, and where its fit starts."""
+"""Candidates of a search: every effect of the catalogue that this machine could have, and where its fit starts."""
 
 from collections.abc import Sequence
 
@@ -54,7 +54,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
 
 @eqx.filter_jit
 def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
-    """Of the friction map at joint velocities."""
+    """Torques of the friction map at joint velocities."""
     return jax.vmap(unknown)(v)
 
 

@@ -35,7 +35,7 @@ def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMSt
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        found = Found(candidate, float(gain), float(gain), 0.0, context.data.t.shape[1])
+        found = Found(float(gain), float(gain), 0.0)
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         now = now.refitted(early).plus(effect, candidate, found)
         if told:

@@ -1,6 +1,6 @@
 """Quick refits of a fitted model with something added, from its smoothed path on.
 
-Each pass linearises the model about the path, smooths, and takes one M-step.  Only the linearisation knows the
+Each pass linearises the model about the path, smooths, and takes one M-step.  Only the linearisation depends on the
 structure of the model; the rest is one compiled program for all of them, so that a new effect costs seconds.
 """
 

@@ -1,4 +1,4 @@
-"""A law in the place of another, over the whole length: which of the two the logs speak for."""
+"""A law in the place of another, over the whole length: the likelihood decides between the two."""
 
 import math
 from collections.abc import Callable
@@ -63,7 +63,7 @@ def again(fitted: Identified, data: Dataset) -> Identified:
 def apart(closed: Closed, data: Dataset) -> Closed:
     """`closed` after its effects and their equivalents were compared over the whole length of the logs.
 
-    Screens are linear, and fits over the whole length tell more: an equivalent that is
+    Screens are linear, fits over the whole length are not: an equivalent that is
     clearly less likely goes, and one that is clearly likelier takes the place of its effect.
     """
     for place, found in enumerate(closed.found):
@@ -77,7 +77,7 @@ def apart(closed: Closed, data: Dataset) -> Closed:
         if other is not None and leads[best] > EVEN_NATS:
             rest = [one for i, one in enumerate(closed.found) if i != place]
             even = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EVEN_NATS]
-            found = found._replace(equivalent=tuple(even))
+            found = found._replace(equivalent=tuple(even), gain=found.gain + leads[best])
             return closed._replace(after=_settled(other, data), found=(*rest, found))
         even = [key for key in found.equivalent if leads.get(key, 0.0) >= -EVEN_NATS]
         both = closed.found[:place], closed.found[place + 1 :]

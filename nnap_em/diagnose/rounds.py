@@ -31,7 +31,7 @@ class Round(NamedTuple):
     screen: Screen
     accepted: Refit | None
     equivalent: tuple[Key, ...] = ()
-    """Named laws that the data cannot tell from the accepted one."""
+    """Named laws that the data cannot distinguish from the accepted one."""
 
 
 def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
@@ -68,7 +68,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
 
 
 def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: SearchContext) -> Round:
-    """Choose among laws that the screen cannot tell apart.
+    """Choose among laws that the screen cannot distinguish.
 
     The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
     best odds, then the likeliest.  None is accepted where one of these is of another cause.
@@ -196,7 +196,7 @@ def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
 
 
 def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
-    """The best law of every kind that would reach its bar, had a few recordings not said the opposite."""
+    """The best law of every kind that would reach its bar, had a few recordings not contradicted."""
     best: dict[Key, Disputed] = {}
     for one in every:
         folds, key = np.asarray(one.share.folds), key_of(one.candidate.start)

@@ -42,7 +42,7 @@ def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[S
         return now
     found = screening_round(fit, context)
     steps.append(found.step)
-    return now if found.accepted is None else _with(now, found.accepted, _found(found, length, context.loss), context)
+    return now if found.accepted is None else _with(now, found.accepted, _found(found, context.loss), context)
 
 
 def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
@@ -68,14 +68,14 @@ def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
     return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
 
 
-def _found(found: Round, length: int, loss: AbstractLoss) -> Found:
+def _found(found: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Refit, found.accepted)
     screened, directions = case.screened, max(case.screened.directions, 1)
     p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * found.step.tried)
     left_out = screened.share.left_out
     held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
-    return Found(screened.candidate, case.gain, held_out, p_value, length, found.equivalent, share, case.removed)
+    return Found(case.gain, held_out, p_value, found.equivalent, share, case.removed)
 
 
 def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:

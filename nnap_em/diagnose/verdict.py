@@ -27,7 +27,7 @@ EVEN = 0.9
 """Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
 refits decide between others, and between laws of different causes the question stays open."""
 EVEN_NATS = 5.0
-"""Log-likelihood [nat] within which two laws cannot be told apart: 1 in 150."""
+"""Log-likelihood [nat] within which two laws are indistinguishable: 1 in 150."""
 SAME = 0.01
 """Share of the information on an effect that an equivalent one may leave unexplained."""
 KEEP = 0.6
@@ -52,7 +52,7 @@ class Bars(NamedTuple):
 
 
 MULTI_STEP = Bars(0.15, 0.0)
-"""On three real rigs as recorded aliases of what their models lack remove up to .14."""
+"""Three real rigs as recorded: aliases of what their models lack remove up to .14."""
 ONE_STEP = Bars(0.004, 12.0)
 """400 candidates gain 6 nat by chance; .002 nat a reading are certain with many readings, and nobody would notice."""
 

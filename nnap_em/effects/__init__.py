@@ -17,7 +17,7 @@ for _module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
 catalogue: dict[str, type[AbstractEffect]] = {kind.name: kind for kind in _leaves(AbstractEffect)}
 """Effects by their names."""
 parts: tuple[type, ...] = (Axis, InputAxis)
-"""What effects are made of besides numbers."""
+"""Parts of effects besides numbers."""
 
 __all__ = [
     "AbstractEffect", "Around", "Candidate", "JointEffect", "Scene", "SensorEffect", "catalogue", "fields", "flat",

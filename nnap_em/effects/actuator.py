@@ -1,4 +1,4 @@
-"""What stands between the commanded input u and the torque at its joint."""
+"""Actuators: laws between the commanded input u and the torque at its joint."""
 
 from functools import partial
 from typing import ClassVar
@@ -87,7 +87,7 @@ class OneSidedLoss(InputEffect):
     loss: Scalar
     side: int = eqx.field(static=True)
     column: str = eqx.field(static=True)
-    """Of the input."""
+    """Name of the input."""
 
     @classmethod
     def candidates(cls, around):

@@ -1,4 +1,4 @@
-"""What an effect is: a named law that changes force, drive, body, friction or reading, with parameters and units.
+"""Effects: an effect is a named law that changes force, drive, body, friction or reading, with parameters and units.
 
 A new effect is one new file in this folder; the catalogue finds it.
 """
@@ -20,7 +20,7 @@ CHANNEL = "unit of the channel"
 
 
 class Scene(NamedTuple):
-    """What an effect sees of the machine at one moment."""
+    """State of the machine at one moment, as effects get it."""
 
     system: AbstractSystem
     q: Float[Array, " dof"]
@@ -84,7 +84,7 @@ class Around(NamedTuple):
         return self.inputs[self.system.joints.index(joint)] if len(self.inputs) > 1 else "u"
 
     def inertia(self, joint: int) -> float:
-        """Of everything behind a joint, with all joints at zero [kg m^2]."""
+        """Inertia of everything behind a joint, with all joints at zero [kg m^2]."""
         return float(np.asarray(_still(self.system))[joint - 1])
 
 
@@ -111,9 +111,9 @@ class Curve(NamedTuple):
     signal: str
     signal_unit: str
     joint: int
-    """Where it acts, counted from 1."""
+    """Joint at which it acts, counted from 1."""
     unit: str
-    """Of the force."""
+    """Unit of the force."""
     turns: bool
     """True where the signal is an angle that goes round."""
     x: Float[np.ndarray, " node"]
@@ -124,7 +124,7 @@ class Curve(NamedTuple):
 
 
 class AbstractEffect(eqx.Module):
-    """A law that the declared physics may lack.  The hooks say what it changes.
+    """A law that the declared physics may lack.  Its hooks change the model.
 
     Array fields are its parameters, but for `known` ones.
     """
@@ -136,7 +136,7 @@ class AbstractEffect(eqx.Module):
     named: ClassVar[bool] = True
     """False for a law without a form of its own."""
     confirm: ClassVar[str] = ""
-    """What to look at on the machine to be sure."""
+    """Measurement on the machine that confirms it."""
     units: ClassVar[dict[str, str]] = {}
     """Reported parameters and their units on a rotary joint."""
     units_free: ClassVar[dict[str, str]] = {}
@@ -176,7 +176,7 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def candidates(cls, around: Around) -> list[Candidate]:
-        """What of this kind is to be tried on a machine; nothing where the machine cannot have it."""
+        """Candidates of this kind for a machine; none where the machine cannot have it."""
         return []
 
     def values(self) -> dict[str, Scalar]:
@@ -193,19 +193,19 @@ class AbstractEffect(eqx.Module):
         return {name: unit.replace("N m", force).replace("rad", angle) for name, unit in self.units.items()}
 
     def possible(self) -> bool:
-        """Whether a fitted value makes physical sense."""
+        """True if the fitted values are physical."""
         return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
     def visible(self, around: Around) -> bool:
-        """Whether what was visited can tell it from simpler laws."""
+        """True if the visited range distinguishes it from simpler laws."""
         return True
 
     def inputs_named(self) -> tuple[str, ...]:
-        """Of what it is a function, for laws that the vocabulary has no name for."""
+        """Arguments of the function, for laws without a name in the vocabulary."""
         return ()
 
     def signals(self, system: AbstractSystem) -> tuple[str, ...]:
-        """Of what its force at its joint is a function: coordinates, rates, "time", `input_of` a joint."""
+        """Arguments of its force at its joint: coordinates, rates, "time", `input_of` a joint."""
         return ()
 
     def richer(self, around: Around) -> list[Candidate]:
@@ -213,11 +213,11 @@ class AbstractEffect(eqx.Module):
         return []
 
     def answers(self) -> bool:
-        """Whether it is a free function of an input, which under feedback answers whatever disturbs the machine."""
+        """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False
 
     def curve(self, cov: Float[np.ndarray, "param param"], system: AbstractSystem) -> Curve | None:
-        """A learned function of one signal, its parameters of covariance `cov`; None for what numbers tell."""
+        """A learned function of one signal, its parameters of covariance `cov`; None for a law given by numbers."""
         return None
 
     def memory_scale(self) -> Float[Array, " memory"]:
@@ -225,11 +225,11 @@ class AbstractEffect(eqx.Module):
         return jnp.ones(self.memory)
 
     def input(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
-        """What reaches the drive of the commanded input, mean over each sample: what takes time."""
+        """Input that reaches the drive, mean over each sample: for laws with memory of the input, as delays."""
         return u
 
     def drive(self, torque: Float[Array, "*time"]) -> Float[Array, "*time"]:
-        """What reaches the joint of the torque of its drive, at one moment [N m, or N]."""
+        """Torque of the drive that reaches the joint, at one moment [N m, or N]."""
         return torque
 
     def physics(self, system: AbstractSystem, time: Scalar) -> AbstractSystem:
@@ -249,7 +249,7 @@ class AbstractEffect(eqx.Module):
         return memory
 
     def reading(self, value: Scalar, past: Callable[[Scalar], Scalar]) -> Scalar:
-        """What the sensor of its channel reads; `past(delay)` is the value some seconds ago."""
+        """Reading of the sensor of its channel; `past(delay)` is the value some seconds ago."""
         return value
 
 
@@ -260,7 +260,7 @@ class JointEffect(AbstractEffect):
     """Counted from 1."""
 
     def own(self, values: Float[Array, " dof"]) -> Scalar:
-        """What stands at its joint."""
+        """Entry of an array at its joint."""
         return values[self.joint - 1]
 
     def at(self, scene: Scene, value: Scalar) -> Float[Array, " dof"]:
@@ -309,7 +309,7 @@ def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inne
 
 
 def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge: float) -> Scalar:
-    """What a spring and a damper answer that are pressed in, on either side, and never pull.
+    """Force of a spring and a damper that are pressed in, on either side, and never pull.
 
     The damper comes on within `edge`, so that a fit can move the place of contact.
     """

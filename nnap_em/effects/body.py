@@ -1,4 +1,4 @@
-"""Bodies that are not as declared: masses, inertias, lengths; each system says how it varies."""
+"""Bodies that are not as declared: masses, inertias, lengths; each system defines the variation."""
 
 from functools import partial
 from typing import ClassVar
@@ -13,13 +13,13 @@ from .base import Around, Candidate, JointEffect, Scalar, a, known, one
 
 
 def varieties(around: Around, name: str) -> list[tuple[int, float]]:
-    """Joints at which the system knows the variation `name`, and its typical size."""
+    """Joints at which the system has the variation `name`, and its typical size."""
     found = [(j, size) for (kind, j), (_, size) in around.system.variations.items() if kind == name]
     return [(j, float(size(around.system))) for j, size in found]
 
 
 class Variation(JointEffect):
-    """A body that differs by an amount; the machine knows what that changes."""
+    """A body that differs by an amount; the machine defines the change."""
 
     amount: Scalar
 
@@ -46,7 +46,7 @@ class Payload(Variation):
     moment: Float[Array, "3"] | None = None
     """First moment about the point [kg m]; None: the mass is at the tip."""
     point: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
-    """In the frame of the body [m]."""
+    """Centre in the frame of the body [m]."""
 
     @classmethod
     def candidates(cls, around):

@@ -105,13 +105,13 @@ class LoadFriction(JointEffect):
     log_velocity: Scalar | None = None
     """[log rad/s]"""
     square_motor: Scalar | None = None
-    """Of the motor's torque where the load drives [1/(N m)]."""
+    """Coefficient of the motor's torque where the load drives [1/(N m)]."""
     square_load: Scalar | None = None
-    """Of the load's torque where the motor drives [1/(N m)]."""
+    """Coefficient of the load's torque where the motor drives [1/(N m)]."""
     whole: bool = eqx.field(static=True, default=False, kw_only=True)
-    """True where motor and load count alike while no number of their own says otherwise."""
+    """True where motor and load share one coefficient unless each has its own."""
     names: tuple[str, str] = eqx.field(static=True, kw_only=True)
-    """Of the input and of the rate."""
+    """Names of the input and of the rate."""
 
     @classmethod
     def candidates(cls, around):
@@ -153,7 +153,7 @@ class LoadFriction(JointEffect):
         return {name: value for name, value in told.items() if value is not None}
 
     def _shares(self) -> tuple[Scalar | None, ...]:
-        """Of motor and load, steady and at rest; None: no such number."""
+        """Coefficients of motor and load, steady and at rest; None: no such number."""
         shares: list[Scalar | None] = []
         for own, its in ((self.mu, self.load), (self.stribeck, self.load_stribeck)):
             shares += [own, own if its is None and self.whole else its]

@@ -34,14 +34,14 @@ class AbstractAxis(eqx.Module):
 
     @abstractmethod
     def value(self, scene: Scene) -> Scalar:
-        """What it reads."""
+        """Argument of the function."""
 
     @abstractmethod
     def unit(self, system: AbstractSystem) -> str:
-        """Of what it reads."""
+        """Unit of the argument."""
 
     def signals(self, system: AbstractSystem) -> tuple[str, ...]:
-        """What it reads, as effects call it."""
+        """Signal that is its argument."""
         return self.names
 
     def acts(self, system: AbstractSystem) -> int | None:

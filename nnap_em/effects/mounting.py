@@ -24,7 +24,7 @@ class BaseTilt(AbstractEffect):
         return [one(cls, 0.0, 0.03, 0.5)] if around.system.angles[0] and weighs else []
 
     def turned(self, system, q, v):
-        """What the weight loses by the tilt [N m]."""
+        """Change of the gravity torque by the tilt [N m]."""
         return system.bias(q, v) - system.bias(q.at[0].add(self.angle), v)
 
     def force(self, scene, memory):

@@ -30,9 +30,9 @@ class TorsionalSpring(PlaceEffect):
     )
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
     slope: Scalar
-    """At zero [N m/rad]."""
+    """Stiffness at zero [N m/rad]."""
     moment: Scalar
-    """At zero [N m]."""
+    """Torque at zero [N m]."""
     square: Scalar
     """[N m/rad^2]"""
     cube: Scalar
@@ -86,7 +86,7 @@ class Cogging(PlaceEffect):
     cosine: Scalar
     k: Scalar
     near: Scalar = known(default=1.0)
-    """Where k was found; far from there it is another law in disguise."""
+    """Value of k at which it was found; far from it the law is a different one."""
     sine2: Scalar = eqx.field(default=0.0, converter=a)
     cosine2: Scalar = eqx.field(default=0.0, converter=a)
 

@@ -1,4 +1,4 @@
-"""What is soft or loose between a motor and its joint."""
+"""Compliance and backlash between a motor and its joint."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -16,13 +16,13 @@ class Transmission(JointEffect):
     memory: ClassVar[int] = 2
     linear: ClassVar[bool] = False
     log_inertia: eqx.AbstractVar[Scalar]
-    """Of the motor [log kg m^2]."""
+    """Inertia of the motor [log kg m^2]."""
     log_damping: eqx.AbstractVar[Scalar]
     """[log N m s/rad]"""
 
     @abstractmethod
     def torque(self, twist: Scalar, rate: Scalar) -> Scalar:
-        """On the joint, at a twist of motor minus joint [rad] and its rate [rad/s]."""
+        """Torque on the joint, at a twist of motor minus joint [rad] and its rate [rad/s]."""
 
     def memory_scale(self):
         return jnp.asarray([0.05, 1.0])

@@ -11,8 +11,9 @@ import pytest
 
 from nnap_em import close_the_loop, findings, load, read_logs, read_rig, specs
 from nnap_em.commands import cli
-from nnap_em.diagnose.findings import Finding, verdict
+from nnap_em.diagnose.findings import Estimate, Finding, verdict
 from nnap_em.effects import catalogue
+from nnap_em.effects.base import Curve
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
@@ -116,9 +117,16 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
     mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
     assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
-    assert verdict(found, None) == "The model lacks payload at joint 2."
+    assert verdict(found, None) == "The model lacks a payload at joint 2."
+    sized = found[0]._replace(parameters={"mass": Estimate(0.4567, 0.0123, "kg"), "centre_x": Estimate(0.1, 0.2, "m")})
+    assert verdict([sized], None) == "The model lacks a payload at joint 2 (mass = 0.457 ± 0.01 kg)."
+    drawn = found[0]._replace(
+        effect=catalogue["air_drag"](jnp.zeros(())),
+        curve=Curve("x", "rad", 1, "N m", False, *np.asarray([[0.0, 1.0], [-1.0, 2.0], [0.1, 0.1]])),
+    )
+    assert verdict([drawn], None) == "The model lacks air drag (3 N m from trough to peak)."
     several = [Finding(catalogue["payload"](jnp.zeros(()), joint=j), {}, {}, (), "") for j in (1, 2, 1)]
     assert verdict(several, error).startswith(
-        "The model lacks payload at joint 1, payload at joint 2 and payload at joint"
+        "The model lacks a payload at joint 1, a payload at joint 2 and a payload at joint"
     )
     assert "with them" in verdict(several[:2], error)

@@ -16,7 +16,7 @@ from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from .hypothesis import blocks
-from .keys import Key, key_of, listed, rest_of, words
+from .keys import Key, key_of, listed, rest_of, with_article, words
 from .outcome import Closed
 
 
@@ -141,7 +141,7 @@ def verdict(
         )
     if not found:
         return "Nothing is missing that these data could show: the declared model explains them."
-    names = listed([words(key_of(f.effect)) for f in found])
+    names = listed([_sized(finding) for finding in found])
     it = "it" if len(found) == 1 else "them"
     text = f"The model lacks {names}"
     if not error:
@@ -157,12 +157,20 @@ def verdict(
     column, before, after = ratios[0]
     if after >= before:
         return (
-            f"The training data ask for {names}, but on test data the 1 s prediction error of {column} does not fall "
+            f"The training data support {names}, but on test data the 1 s prediction error of {column} does not fall "
             f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
         )
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
+
+
+def _sized(finding: Finding) -> str:
+    """Name of a finding with its size: the first parameter, or the range of its function."""
+    name, curve = with_article(key_of(finding.effect)), finding.curve
+    for symbol, number in finding.parameters.items():
+        return f"{name} ({symbol} = {number.value:.3g} ± {number.std:.1g} {number.unit}".rstrip(" -") + ")"
+    return f"{name} ({np.ptp(curve.mean):.2g} {curve.unit} from trough to peak)" if curve else name
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:

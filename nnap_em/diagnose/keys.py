@@ -27,6 +27,17 @@ def words(key: Key) -> str:
     return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
 
 
+MASS_NOUNS = ("air_drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "loss", "emf")
+"""Last words of the laws that take no article."""
+
+
+def with_article(key: Key) -> str:
+    """Name of an effect with its article, as in a sentence."""
+    if key[0].endswith(MASS_NOUNS):
+        return words(key)
+    return ("an " if key[0][0] in "aeiou" else "a ") + words(key)
+
+
 def listed(names: Sequence[str]) -> str:
     """Names joined as in a sentence."""
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -224,6 +224,12 @@ def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
     assert build_system(rig).gears == (-3.0,)
     write_rig(rig, tmp_path / "rig.toml")
     assert read_rig(tmp_path / "rig.toml", specs) == rig
+    late = _of_file(tmp_path, '<position name="goal" joint="a" kp="12" delay=".02" nsample="3"/>')
+    assert late.parameters == {
+        "goal.kp": Declared(12.0, 0.0),
+        "goal.kd": Declared(0.0, 0.0),
+        "goal.delay": Declared(0.02, 0.0),
+    }
     rail = _of_file(tmp_path, ACTUATORS["position on a slide"])
     assert (rail.unit("goal.kp"), rail.unit("goal.kd")) == ("N/m", "N s/m")
 

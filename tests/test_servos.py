@@ -19,6 +19,7 @@ from nnap_em.em.build import build, build_servos, build_system
 from nnap_em.em.check import BAD, LOOK, OK, check
 from nnap_em.em.felt import felt, sentences
 from nnap_em.em.identify import identify, parameter_table
+from nnap_em.em.predict import horizon_errors, predict
 from nnap_em.em.store import load, save
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
@@ -378,16 +379,20 @@ def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner
 
 
 def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
-    """Within 5 % and 1 ms, friction to .08 of its size; what is stored is the same, and is not exported."""
+    """Within 5 % and 1 ms, friction to .08 of its size; it predicts, is stored as it is, and is not exported."""
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'
     rig = _servo(tmp_path, lines)
-    fit = identify(rig, _simulated(tmp_path, 0), key=jax.random.key(0), epochs=12)
+    data = _simulated(tmp_path, 0)
+    fit = identify(rig, data, key=jax.random.key(0), epochs=12)
     found = parameter_table(fit)
     assert abs(found["goal.kp"][0] / KP - 1) < 0.05
     assert abs(found["goal.delay"][0] - DELAY) < 1e-3
     v = np.linspace(-3.0, 3.0, 61)
     curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
     assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
+    part = jax.tree.map(lambda a: a[:2], data)
+    ahead = horizon_errors(predict(fit, part, 1.0, key=jax.random.key(1), samples=20), fit, part, 1.0, (1.0, 3.0))
+    assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is .001
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
     assert parameter_table(again) == found and again.rig == rig

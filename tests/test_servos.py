@@ -15,11 +15,12 @@ from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.data.servo import KINDS
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
-from nnap_em.em.build import build, build_servos, build_system
+from nnap_em.em.build import build, build_system
 from nnap_em.em.check import BAD, LOOK, OK, check
 from nnap_em.em.felt import felt, sentences
 from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import horizon_errors, predict
+from nnap_em.em.servos import build_servos
 from nnap_em.em.store import load, save
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
@@ -162,6 +163,19 @@ def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
         x = jnp.asarray([0.1, v])
         there = [m.scene(x, _row(m, w)).drive for m, w in ((driven, u), (servo, u / k))]
         np.testing.assert_allclose(*there, rtol=1e-12)
+
+
+def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
+    laws = (InputDelay.of(0.013, joint=1), Saturation.of(1.5, joint=1))
+    rng = np.random.default_rng(2)
+    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 12, 1))))
+    x = jnp.asarray(rng.normal(size=(12, 2)))
+    for lines in ('kind = "position"\nkp = 3.0\nkd = 0.5', 'kind = "torque"'):
+        rig = _servo(tmp_path, lines)
+        plain, whole = _model(rig), _model(rig, laws)
+        along = plain.driving(laws, x, plain.inputs(seq))
+        at = jax.vmap(lambda x, u, model=whole: model.scene(x, u).drive)(x, whole.inputs(seq))
+        np.testing.assert_allclose(along, at, rtol=1e-12)
 
 
 def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):

@@ -99,13 +99,12 @@ class StateSpaceModel(AbstractModel):
         self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs
     ) -> Float[Array, "time dof"]:
         """Generalised force of the inputs along states, with `effects` on top of what reaches the drives [N m]."""
-        if self.servos is None:
+        if not (servos := self.servos):
             return jax.vmap(self.system.drive)(hooks.reaching(effects, self.system, u.u, self.dt))
-        fed, dof = hooks.late(effects, self.servos, self.system, u.u, self.dt), len(self.system.coordinates)
+        fed, dof = hooks.late(effects, servos, self.system, u.u, self.dt), len(self.system.coordinates)
 
         def at(x: Float[Array, " state"], fed: Float[Array, " input"]) -> Float[Array, " dof"]:
-            parts = effects, self.servos, self.system, fed, x[:dof], x[dof : 2 * dof]
-            return self.system.drive(hooks.driven(*parts))
+            return self.system.drive(hooks.driven(effects, servos, self.system, fed, x[:dof], x[dof : 2 * dof]))
 
         return jax.vmap(at)(x, fed)
 

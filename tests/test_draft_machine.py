@@ -68,6 +68,16 @@ def test_a_robot_of_a_file_is_drafted_and_imported(tmp_path, command, motors, in
     np.testing.assert_allclose(q, Q[: len(q)], atol=6e-3)  # the knee is the knee, although it stands first
 
 
+def test_servos_of_a_file_are_drafted_with_what_may_be_uncertain(tmp_path):
+    """A measured effort is not taken for the goal of a servo."""
+    servo = '<position name="m_hip" joint="hip" kp="40" kv="2"/>'
+    model = _leg(tmp_path / "leg.xml", servo)
+    made = draft_machine(_log(tmp_path / "a.mcap", command="/goals/commands"), model, tmp_path)
+    assert '# [input."m_hip"]    # the goal of a position servo; in the file kp = 40, kd = 2' in made.text
+    none = draft_machine(_log(tmp_path / "b.mcap", command=None), model, tmp_path)
+    assert "effort" not in none.text.partition("[import")[0]
+
+
 def test_what_is_uncertain_can_be_said_by_taking_marks_away(tmp_path):
     made = draft_machine(_log(tmp_path / "a.mcap"), _leg(tmp_path / "leg.xml"), tmp_path)
     (tmp_path / "rig.toml").write_text(re.sub(r"(?m)^# (\w+\.\w+ = )", r"\1", made.text))

@@ -15,10 +15,12 @@ from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.data.servo import KINDS
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
-from nnap_em.em.build import build, build_servos, build_system
+from nnap_em.em.build import build, build_system
 from nnap_em.em.check import BAD, LOOK, OK, check
 from nnap_em.em.felt import felt, sentences
 from nnap_em.em.identify import identify, parameter_table
+from nnap_em.em.predict import horizon_errors, predict
+from nnap_em.em.servos import build_servos
 from nnap_em.em.store import load, save
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
@@ -163,6 +165,19 @@ def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
         np.testing.assert_allclose(*there, rtol=1e-12)
 
 
+def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
+    laws = (InputDelay.of(0.013, joint=1), Saturation.of(1.5, joint=1))
+    rng = np.random.default_rng(2)
+    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 12, 1))))
+    x = jnp.asarray(rng.normal(size=(12, 2)))
+    for lines in ('kind = "position"\nkp = 3.0\nkd = 0.5', 'kind = "torque"'):
+        rig = _servo(tmp_path, lines)
+        plain, whole = _model(rig), _model(rig, laws)
+        along = plain.driving(laws, x, plain.inputs(seq))
+        at = jax.vmap(lambda x, u, model=whole: model.scene(x, u).drive)(x, whole.inputs(seq))
+        np.testing.assert_allclose(along, at, rtol=1e-12)
+
+
 def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
     """Laws of the input give a torque column the same beside a servo and without one."""
     text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
@@ -224,6 +239,12 @@ def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
     assert build_system(rig).gears == (-3.0,)
     write_rig(rig, tmp_path / "rig.toml")
     assert read_rig(tmp_path / "rig.toml", specs) == rig
+    late = _of_file(tmp_path, '<position name="goal" joint="a" kp="12" delay=".02" nsample="3"/>')
+    assert late.parameters == {
+        "goal.kp": Declared(12.0, 0.0),
+        "goal.kd": Declared(0.0, 0.0),
+        "goal.delay": Declared(0.02, 0.0),
+    }
     rail = _of_file(tmp_path, ACTUATORS["position on a slide"])
     assert (rail.unit("goal.kp"), rail.unit("goal.kd")) == ("N/m", "N s/m")
 
@@ -372,16 +393,20 @@ def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner
 
 
 def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
-    """Within 5 % and 1 ms, friction to .08 of its size; what is stored is the same, and is not exported."""
+    """Within 5 % and 1 ms, friction to .08 of its size; it predicts, is stored as it is, and is not exported."""
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'
     rig = _servo(tmp_path, lines)
-    fit = identify(rig, _simulated(tmp_path, 0), key=jax.random.key(0), epochs=12)
+    data = _simulated(tmp_path, 0)
+    fit = identify(rig, data, key=jax.random.key(0), epochs=12)
     found = parameter_table(fit)
     assert abs(found["goal.kp"][0] / KP - 1) < 0.05
     assert abs(found["goal.delay"][0] - DELAY) < 1e-3
     v = np.linspace(-3.0, 3.0, 61)
     curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
     assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
+    part = jax.tree.map(lambda a: a[:2], data)
+    ahead = horizon_errors(predict(fit, part, 1.0, key=jax.random.key(1), samples=20), fit, part, 1.0, (1.0, 3.0))
+    assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is .001
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
     assert parameter_table(again) == found and again.rig == rig

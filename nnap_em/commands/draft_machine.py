@@ -14,6 +14,7 @@ from ..data.mjcf import read_machine
 from ..data.recordings.files import reader
 from ..data.recordings.recording import Address, Topic
 from ..data.rig import SystemSpec, toml_text
+from ..data.servo import TORQUE
 from .draft import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
 from .draft_recorded import COMMAND, columns_table, commands, others
 
@@ -107,16 +108,21 @@ def _kinds(fields: Sequence[tuple[Address, str]]) -> dict[str, Address]:
 
 
 def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Address, str]]:
-    """Columns of torques, where they are, and the joint of each: of the motors, or of joints where there are none."""
+    """Columns of torques, where they are, and the joint of each: of the motors, or of joints where there are none.
+
+    A measured effort is the torque of a motor, and no command of a servo.
+    """
     fields, order = _fields(topics), commands(topics)
-    kinds = _kinds(fields)
+    kinds, servos = _kinds(fields), {motor.name for motor in machine.motors if motor.kind != TORQUE}
     wanted = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
     wanted = wanted or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]
     out: dict[str, tuple[Address, str]] = {}
     for i, (name, joint) in enumerate(wanted):
-        at = _first(fields, [name, f"effort[{name}]"]) or (order[i] if len(order) == len(wanted) else None)
+        own = [name] if name in servos else [name, f"effort[{name}]"]
+        at = _first(fields, own) or (order[i] if len(order) == len(wanted) else None)
         at = at or next((at for at, word in fields if joint in word and COMMAND.search(word)), None)
-        at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(wanted) == 1 else None)
+        if name not in servos:
+            at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(wanted) == 1 else None)
         if at is not None:
             out[name] = at, joint
     return out
@@ -151,6 +157,7 @@ def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
     """The inputs; no lines where they are the motors of the file."""
     if machine.motors and len(joints) == len(machine.motors):
         yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
+        yield from _servos(machine)
         return
     mark = "" if joints else "# "
     columns = f"[{', '.join(map(toml_text, joints))}]" if joints else "..."
@@ -158,6 +165,17 @@ def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
     if not machine.motors:
         places = f"[{', '.join(map(toml_text, joints.values()))}]" if joints else "..."
         yield f"{mark}joints = {places}    # the joint that each drives"
+
+
+def _servos(machine: Machine) -> Iterator[str]:
+    """Lines with the numbers of servos of the file that may be uncertain."""
+    for motor in machine.motors:
+        if motor.kind == TORQUE:
+            continue
+        numbers = ", ".join(f"{key} = {value:.4g}" for key, value in motor.numbers if value)
+        yield f"# [input.{toml_text(motor.name)}]    # the goal of a {motor.kind} servo; in the file {numbers}"
+        yield from (f"# {key} = {{ mean = {x:.4g}, std = {0.2 * abs(x):.2g} }}" for key, x in motor.numbers if x)
+        yield "# delay = { mean = 0.01, std = 0.01 }    # s"
 
 
 def _addresses(topics: Sequence[Topic], found: Mapping[str, Address]) -> Iterator[str]:

@@ -11,16 +11,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig, RigError
-from ..data.servo import KINDS, TORQUE
-from ..model import hooks
+from ..data.servo import TORQUE
 from ..model.friction import FrictionNetwork, NoFriction
-from ..model.servo import Servo, unlimited
 from ..model.state_space import SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
+from .servos import MOST_STEPS, build_servos, steps_of_sample
 
 NO_MACHINE = "the declared masses and inertias make no machine"
 
@@ -60,48 +59,6 @@ def build_system(rig: Rig) -> AbstractSystem:
 @eqx.filter_jit
 def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof dof"]:
     return jax.vmap(system.mass)(q)
-
-
-def build_servos(rig: Rig) -> tuple[Servo, ...]:
-    """The declared drives, at the mean of what is uncertain; none where all inputs are torques."""
-    numbers = {name: jnp.asarray(rig.parameters[name].mean, float) for name in {*rig.parameters} - {*rig.bodies}}
-
-    def servo(column: str, kind: str) -> Servo:
-        there = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
-        return Servo(column, kind, {key: numbers[f"{column}.{key}"] for key in there})
-
-    return tuple(servo(*pair) for pair in rig.kinds.items()) if rig.input_kinds else ()
-
-
-STIFF, MOST_STEPS = 0.5, 64
-"""Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
-bears 2.8, and the most steps of a sample."""
-
-
-def servo_rate(system: AbstractSystem, servos: tuple[Servo, ...]) -> float:
-    """Fastest eigenvalue of the machine under its servos at rest in some poses [1/s]: of their stiffness and damping.
-
-    Of M a = -K q - D v, K and D the slopes of the torques.
-    """
-    if not servos:
-        return 0.0
-    dof = len(system.coordinates)
-    q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
-    slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
-    state = np.concatenate([np.concatenate([np.zeros((32, dof, dof)), np.tile(np.eye(dof), (32, 1, 1))], 2), slopes], 1)
-    return float(np.max(np.abs(np.linalg.eigvals(state))))
-
-
-@eqx.filter_jit
-def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof state"]:
-    """Derivatives of the accelerations that the servos give by position and rate, under a unit of what is fed."""
-    fed, still = jnp.ones(len(servos)), jnp.zeros(q.shape[1])
-
-    def one(q):
-        force = lambda x, v: system.drive(hooks.driven((), servos, system, fed, x, v))  # noqa: E731
-        return jnp.linalg.solve(system.mass(q), jnp.concatenate(jax.jacfwd(force, (0, 1))(q, still), axis=1))
-
-    return jax.vmap(one)(q)
 
 
 def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
@@ -217,7 +174,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         log_r=jnp.asarray(2 * np.log(np.hypot(noise, shaken))),
         measured=tuple(places),
         dt=rig.dt,
-        substeps=min(max(SUBSTEPS, math.ceil(servo_rate(system, servos) * rig.dt / STIFF)), MOST_STEPS),
+        substeps=min(max(SUBSTEPS, math.ceil(steps_of_sample(system, servos, rig.dt))), MOST_STEPS),
         servos=servos or None,
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)

@@ -18,20 +18,11 @@ from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .build import (
-    LAG,
-    MOST_STEPS,
-    NO_MACHINE,
-    STIFF,
-    Scales,
-    build_servos,
-    measure_scales,
-    reading_noise,
-    servo_rate,
-)
+from .build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
 from .felt import felt, sentences
 from .identify import begin
 from .scale import untold
+from .servos import MOST_STEPS, build_servos, steps_of_sample
 from .stops import at_stops
 
 OK, LOOK, BAD = "ok", "look", "bad"
@@ -246,7 +237,7 @@ def drives(
 
 def _stiff(rig: Rig, system: AbstractSystem) -> Iterator[CheckResult]:
     """A servo that no integration step of a sample can follow."""
-    steps = servo_rate(system, build_servos(rig)) * rig.dt / STIFF
+    steps = steps_of_sample(system, build_servos(rig), rig.dt)
     if steps > MOST_STEPS:
         text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
         yield CheckResult(BAD, "servo", f"{text}: look at the units of its gains, or sample faster")

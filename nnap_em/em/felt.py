@@ -15,6 +15,7 @@ from ..systems import AbstractSystem
 LEAST = 1e-6
 """Share of a parameter's own column that must be left when those of the others are taken out of it."""
 _MOMENTS = ("delay", "limit")
+"""Numbers of a servo that the slopes of its torque do not know."""
 
 
 class Felt(NamedTuple):

@@ -27,10 +27,17 @@ def fed(
     effects: Effects, servos: Sequence[Servo], system: AbstractSystem, u: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
     """What the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`)."""
+    given = jnp.stack([servo.fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
+    return late(effects, servos, system, given, dt)
+
+
+def late(
+    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, fed: Float[Array, "time input"], dt: float
+) -> Float[Array, "time input"]:
+    """What reaches the drives of what commands set, with the effects that take time."""
     columns = []
     for i, (joint, servo) in enumerate(zip(system.joints, servos, strict=True)):
-        column = servo.fed(u[:, i], dt)
-        before = servo.before(column)
+        column, before = fed[:, i], servo.before(fed[:, i])
         for effect in effects:
             if effect.joint == joint:
                 column = before + effect.input(column - before, dt)

@@ -95,6 +95,19 @@ class StateSpaceModel(AbstractModel):
         torque = hooks.driven(self.effects, self.servos, system, u.u, q, v) if self.servos else u.u
         return Scene(system, q, v, system.drive(torque), u.time, self.unknown(v), self.unknown)
 
+    def driving(
+        self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs
+    ) -> Float[Array, "time dof"]:
+        """Generalised force of the inputs along states, with `effects` on top of what reaches the drives [N m]."""
+        if not (servos := self.servos):
+            return jax.vmap(self.system.drive)(hooks.reaching(effects, self.system, u.u, self.dt))
+        fed, dof = hooks.late(effects, servos, self.system, u.u, self.dt), len(self.system.coordinates)
+
+        def at(x: Float[Array, " state"], fed: Float[Array, " input"]) -> Float[Array, " dof"]:
+            return self.system.drive(hooks.driven(effects, servos, self.system, fed, x[:dof], x[dof : 2 * dof]))
+
+        return jax.vmap(at)(x, fed)
+
     def rate(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> Float[Array, " state"]:
         """Time derivative of the state under inputs u and an extra generalised force [N m]."""
         return jnp.stack(self.slopes(x, u, force))

@@ -1,0 +1,141 @@
+"""Position servos in every joint, from commands and encoders alone: their gains and delays, and the joints' friction.
+
+    python benchmarks/servos.py [--joints 6] [--seeds 0 1] [--sequences 8] [--seconds 4]
+
+MuJoCo is the truth: its own `<position>` actuators on the arm of `machines.py` (one joint: a pendulum), each command
+late by a time of its own, Coulomb, Stribeck and viscous friction as an applied force. Declared are gains 25 % too low
+(std 40 %) and delays of 10 +- 10 ms; the damping of the servos is known. A row is a joint: errors of gain [%] and delay
+[ms], and of friction as root mean square error over that of the true curve.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from machines import arm
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Rig, read_rig
+from nnap_em.em.identify import Identified, identify, parameter_table
+from nnap_em.systems import specs
+
+jax.config.update("jax_enable_x64", True)
+DT, INNER = 0.01, 20
+NOISE = 2e-4
+"""Of the encoders [rad]."""
+KP = (400.0, 400.0, 250.0, 60.0, 40.0, 15.0)
+KD = (20.0, 20.0, 12.0, 2.0, 1.0, 0.3)
+COULOMB = (4.0, 4.0, 2.5, 0.8, 0.5, 0.2)
+DELAY = (0.017, 0.0125, 0.0085, 0.0215, 0.006, 0.0142)
+"""[s]"""
+SHARE = 0.75
+"""Declared gain over the true one."""
+PENDULUM = """<mujoco><worldbody><body><joint name="joint1" axis="0 1 0" armature="0.05"/>
+<inertial pos="0 0 -.3" mass="3" diaginertia=".1 .1 .1"/></body></worldbody><actuator>
+<motor name="tau1" joint="joint1"/></actuator></mujoco>"""
+RIG = """format = 1
+name = "servos"
+[model]
+type = "mjcf"
+file = "servos.xml"
+friction = "unknown"
+[sampling]
+dt = {dt}
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = [{joints}]
+[input]
+delay = {{ mean = 0.01, std = 0.01 }}
+"""
+
+
+def write(folder: Path, joints: int) -> Rig:
+    """The machine file with servos of a gain that is not the true one, and what its owner declares."""
+    text = PENDULUM if joints == 1 else arm(joints)
+    for i in range(joints):
+        servo = f'<position name="goal{i + 1}" joint="joint{i + 1}" kp="{KP[i]}" kv="{KD[i]}"/>'
+        text = text.replace(f'<motor name="tau{i + 1}" joint="joint{i + 1}"/>', servo)
+    (folder / "servos.xml").write_text(text)
+    names = ", ".join(f'"joint{i + 1}"' for i in range(joints))
+    tables = [f"[input.goal{i + 1}]\nkp = {{ mean = {SHARE * KP[i]}, std = {0.4 * KP[i]} }}\n" for i in range(joints)]
+    (folder / "rig.toml").write_text(RIG.format(dt=DT, joints=names) + "".join(tables))
+    return read_rig(folder / "rig.toml", specs)
+
+
+def friction(v: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """True friction at joint rates [N m]."""
+    return -level * ((1.0 + 0.5 * np.exp(-((v / 0.15) ** 2))) * np.tanh(v / 0.03) + 0.6 * v)
+
+
+def simulated(path: Path, joints: int, sequences: int, rows: int, seed: int) -> Dataset:
+    """Logs of commands and encoders, as MuJoCo moves."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.timestep, model.opt.integrator = DT / INNER, mujoco.mjtIntegrator.mjINT_RK4
+    rng, t, level = np.random.default_rng(seed), DT * np.arange(rows), np.asarray(COULOMB[:joints])
+    late = np.asarray(DELAY[:joints]) / DT
+    commands, readings = np.empty((2, sequences, rows, joints))
+    for s in range(sequences):
+        size, period, phase = np.moveaxis(rng.uniform((0.1, 0.6, 0.0), (0.4, 3.0, 6.3), (4, joints, 3)), -1, 0)[
+            ..., None
+        ]
+        u = np.sum(size * np.sin(2 * np.pi * t / period + phase), axis=0)
+        u = u + np.repeat(rng.uniform(-0.3, 0.3, (joints, -(-rows // 80))), 80, axis=1)[:, :rows]
+        data = mujoco.MjData(model)
+        data.qpos[:] = u[:, 0]
+        for k in range(rows):
+            readings[s, k] = data.qpos + NOISE * rng.normal(size=joints)
+            for j in range(INNER):
+                row = np.maximum(np.floor(k + (j + 1e-6) / INNER - late), 0).astype(int)
+                data.ctrl[:] = u[np.arange(joints), row]
+                data.qfrc_applied[:] = friction(data.qvel, level)
+                mujoco.mj_step(model, data)
+        commands[s] = u.T
+    times = np.broadcast_to(t, (sequences, rows))
+    return Dataset(times, commands, readings, np.ones((sequences, rows), bool))
+
+
+def judged(fit: Identified, joints: int, data: Dataset) -> list[str]:
+    """A row of the table for every joint."""
+    found, out = parameter_table(fit), []
+    speed = np.percentile(np.abs(np.diff(np.asarray(data.y), axis=1)) / DT, 99, axis=(0, 1))
+    v = speed[:, None] * np.linspace(-1.0, 1.0, 101)
+    curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v.T))).T
+    for i in range(joints):
+        gain = 100 * (found[f"goal{i + 1}.kp"][0] / KP[i] - 1)
+        delay = 1e3 * (found[f"goal{i + 1}.delay"][0] - DELAY[i])
+        truth = friction(v[i], np.asarray(COULOMB[i]))
+        missed = np.linalg.norm(curve[i] - truth) / np.linalg.norm(truth)
+        out.append(f"| joint{i + 1} | {gain:+.1f} | {delay:+.2f} | {missed:.3f} |")
+    return out
+
+
+def main() -> None:
+    """Print a table for every seed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--joints", type=int, default=6, choices=(1, 6))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--sequences", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--epochs", type=int, default=20)
+    args = parser.parse_args()
+    for seed in args.seeds:
+        with TemporaryDirectory() as folder:
+            rig = write(Path(folder), args.joints)
+            rows = round(args.seconds / DT) + 1
+            data = simulated(Path(folder) / "servos.xml", args.joints, args.sequences, rows, seed)
+        began = time.perf_counter()
+        fit = identify(rig, data, key=jax.random.key(seed), epochs=args.epochs)
+        took = time.perf_counter() - began
+        print(f"seed {seed}: {took:.0f} s, {fit.model.steps} integration steps of a sample")
+        print("| joint | kp [%] | delay [ms] | friction NRMSE |\n| --- | --- | --- | --- |")
+        print("\n".join(judged(fit, args.joints, data)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

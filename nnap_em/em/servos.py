@@ -1,0 +1,54 @@
+"""The servos that a rig declares, and the integration step that their stiffness requires."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..data.rig import Rig
+from ..data.servo import KINDS
+from ..model import hooks
+from ..model.servo import Servo, unlimited
+from ..systems import AbstractSystem
+
+STIFF, MOST_STEPS = 0.5, 64
+"""Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
+bears 2.8, and the most steps of a sample."""
+
+
+def build_servos(rig: Rig) -> tuple[Servo, ...]:
+    """The declared drives, at the mean of what is uncertain; none where all inputs are torques."""
+    numbers = {name: jnp.asarray(rig.parameters[name].mean, float) for name in {*rig.parameters} - {*rig.bodies}}
+
+    def servo(column: str, kind: str) -> Servo:
+        there = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
+        return Servo(column, kind, {key: numbers[f"{column}.{key}"] for key in there})
+
+    return tuple(servo(*pair) for pair in rig.kinds.items()) if rig.input_kinds else ()
+
+
+def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], dt: float) -> float:
+    """Integration steps that a sample needs, by the fastest eigenvalue of the machine under its servos.
+
+    Of M a = -K q - D v at rest in some poses, K and D the slopes of the torques.
+    """
+    if not servos:
+        return 0.0
+    dof = len(system.coordinates)
+    q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
+    slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
+    state = np.concatenate([np.concatenate([np.zeros((32, dof, dof)), np.tile(np.eye(dof), (32, 1, 1))], 2), slopes], 1)
+    return float(np.max(np.abs(np.linalg.eigvals(state)))) * dt / STIFF
+
+
+@eqx.filter_jit
+def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof state"]:
+    """Derivatives of the accelerations that the servos give by position and rate, under a unit of what is fed."""
+    fed, still = jnp.ones(len(servos)), jnp.zeros(q.shape[1])
+
+    def one(q):
+        force = lambda x, v: system.drive(hooks.driven((), servos, system, fed, x, v))  # noqa: E731
+        return jnp.linalg.solve(system.mass(q), jnp.concatenate(jax.jacfwd(force, (0, 1))(q, still), axis=1))
+
+    return jax.vmap(one)(q)

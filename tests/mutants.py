@@ -565,18 +565,11 @@ MUTANTS = (
         "test_fit.py::test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best",
     ),
     Mutant(
-        "noise moves in the first passes of a refit",
-        "diagnose/refit.py",
-        "m_step if count >= HELD else still",
-        "m_step",
-        "test_fit.py::test_a_refit_holds_the_noise_in_its_first_passes",
-    ),
-    Mutant(
         "noise of a refit not held",
         "diagnose/refit.py",
         "count >= HELD",
         "count >= 0",
-        "test_fit.py::test_a_refit_without_noise_gives_the_m_step_no_room_for_it",
+        "test_fit.py::test_a_refit_holds_the_noise_in_its_first_passes",
     ),
     Mutant(
         "curvature of the weights before the finish",

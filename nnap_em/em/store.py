@@ -177,7 +177,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            later = place in LATER or ("/effects/" in place and value is None)  # a number that effects have had since
+            since = "/effects/" in place or place.endswith("/servos")  # numbers that effects and models have had since
+            later = place in LATER or (since and value is None)
             return value if later else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)

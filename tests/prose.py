@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-EXEMPT = ("data/rig.py", "data/mjcf.py", "model/")
-"""Files and folders of the package that are not checked yet."""
 START = re.compile(
     r"(What|Where|Whether|Who|Whose|Whom|Which|How|When|Why|Of|For|As|With|Without|In|On|At|From|To|By|That|If|After"
     r"|Before|Because)\b"
@@ -54,11 +52,10 @@ def mistakes(source: str) -> list[tuple[int, str]]:
     return sorted(found)
 
 
-def in_package(*, exempt: bool = False) -> dict[str, list[tuple[int, str]]]:
-    """Mistakes by file of the package: of files that are checked, or of those `exempt`."""
+def in_package() -> dict[str, list[tuple[int, str]]]:
+    """Mistakes by file of the package."""
     paths = {str(path.relative_to(ROOT / "nnap_em")): path for path in sorted((ROOT / "nnap_em").rglob("*.py"))}
-    some = {name: path for name, path in paths.items() if name.startswith(EXEMPT) == exempt}
-    found = {name: mistakes(path.read_text()) for name, path in some.items()}
+    found = {name: mistakes(path.read_text()) for name, path in paths.items()}
     return {name: lines for name, lines in found.items() if lines}
 
 

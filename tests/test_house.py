@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from prose import EXEMPT, in_package, mistakes
+from prose import in_package, mistakes
 from shell import ROOT
 
 FOLDERS = ("numerics", "storage", "data", "systems", "effects", "model", "smoother", "em", "residual", "curves",
@@ -50,11 +50,6 @@ def test_no_test_imports_another():
 
 def test_docstrings_and_comments_speak_the_language_of_the_field():
     assert in_package() == {}
-
-
-def test_only_files_that_need_it_are_exempt_from_the_check_of_sentences():
-    wrong = in_package(exempt=True)
-    assert [entry for entry in EXEMPT if not any(name.startswith(entry) for name in wrong)] == []
 
 
 def test_the_check_of_sentences_sees_starts_and_words():

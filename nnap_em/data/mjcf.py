@@ -19,7 +19,7 @@ _FREE, _BALL, _SLIDE, _HINGE = range(4)
 
 
 class MachineError(RigError):
-    """A machine file that cannot be used: the message names the file, what stands in the way, and the mend."""
+    """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
 
 
 class Part(NamedTuple):
@@ -46,7 +46,7 @@ _WHOLE = Part()
 def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
     """The tree of bodies and joints of an MJCF or URDF file, or a part of it, in SI units.
 
-    Joints that are held without a value stand where the file has them, or where the joint that they follow says.
+    Joints that are held without a value stand where the file has them, or where the joint that they follow puts them.
     Raises MachineError at what has no place in a model of a tree with a fixed base.
     """
     root = _parse(path)
@@ -143,7 +143,7 @@ def _flag(name: str) -> int:
 
 
 def _parse(path: Path) -> ET.Element:
-    """The root of the file, which says what it is."""
+    """The root of the file, by which MJCF and URDF are distinguished."""
     try:
         root = ET.parse(path).getroot()
     except OSError as error:
@@ -186,7 +186,7 @@ def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
 
 
 def _mend(said: str) -> str:
-    """What to do about the commonest errors of the compiler."""
+    """Remedies for the commonest errors of the compiler."""
     mends = {
         r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
         r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
@@ -239,7 +239,7 @@ def _couplings(model: Any) -> dict[str, Follows]:
 
 
 def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
-    """What MuJoCo would say in its own words, or not at all."""
+    """Refusals where the message of MuJoCo is unclear, or where it has none."""
     links = {str(link.get("name")): link for link in root.findall("link")}
     parents: dict[str, str] = {}
     for joint in root.findall("joint"):
@@ -281,7 +281,7 @@ def _link(joint: ET.Element, end: str) -> str:
 
 
 def _carries(link: str, root: ET.Element) -> bool:
-    """Whether a link without mass carries one that has, fixed to it."""
+    """True if a link without mass carries one that has, fixed to it."""
     for joint in root.findall("joint"):
         if joint.get("type") == "fixed" and _link(joint, "parent") == link:
             name = _link(joint, "child")
@@ -292,7 +292,7 @@ def _carries(link: str, root: ET.Element) -> bool:
 
 
 def _bare_urdf(root: ET.Element) -> str:
-    """Without shapes: they weigh nothing here, and their files are elsewhere."""
+    """Root of the file without shapes: they weigh nothing here, and their files are elsewhere."""
     for link in root.findall("link"):
         for shape in (*link.findall("visual"), *link.findall("collision")):
             link.remove(shape)
@@ -356,7 +356,7 @@ def _refuse_all(path: Path, model: Any, part: Part) -> None:
 
 
 def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
-    """What stands in the way, by name, with the mend."""
+    """Obstacles by name, each with its remedy."""
     held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
     for j in range(model.njnt):
         if held[j]:

@@ -1,4 +1,4 @@
-"""What the owner declares about a rig: `rig.toml` in, `Rig` out, every mistake refused with its mend."""
+"""Declaration of a rig: `rig.toml` in, `Rig` out, every mistake refused with its remedy."""
 
 import dataclasses
 import difflib
@@ -49,7 +49,7 @@ _MEND = {  # how the line of a key or table should look
 
 
 class RigError(ValueError):
-    """A mistake in rig.toml: the message names the file, the table and key, what was found and the mend."""
+    """A mistake in rig.toml: the message names the file, the table and key, what was found and the remedy."""
 
 
 class RigWarning(UserWarning):
@@ -58,7 +58,7 @@ class RigWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Declared:
-    """A number as its owner believes it: mean and standard deviation, both in its SI unit; std = 0 is trusted."""
+    """A declared number: mean and standard deviation, both in its SI unit; std = 0 is trusted."""
 
     mean: float
     std: float
@@ -69,22 +69,22 @@ class Declared:
 
 @dataclass(frozen=True)
 class SystemSpec:
-    """What a registered system calls its states and parameters (optional ones: with default), and its joint count."""
+    """Names of states and parameters of a registered system (optional ones: with default), and its joint count."""
 
     states: tuple[str, ...]
     parameters: tuple[str, ...]
     optional: Mapping[str, float]
     joints: int
     driven: int = 1
-    """The joint that an input drives whose name does not tell it."""
+    """The joint of an input whose name does not determine it."""
     sensors: tuple[str, ...] = ()
     """Columns that are read beside states."""
     declare: "Callable[[_Table], Told] | None" = None
-    """For a system whose names come from a file that rig.toml names: what the file and the whole table declare."""
+    """Declaration by the file that rig.toml names and by the whole table, for a system with names from a file."""
 
 
 class Told(NamedTuple):
-    """What [model] and [input] declare."""
+    """Declaration of [model] and [input]."""
 
     spec: SystemSpec
     parameters: Mapping[str, Declared]
@@ -109,7 +109,7 @@ class Rig:
     measured: tuple[str, ...]
     noise_std: Mapping[str, float]  # a measured column that is absent: to be estimated
     start: Mapping[str, Declared]
-    limits: Bounds = UNBOUNDED  # what it may be asked to do; what is absent: as far as the logs went
+    limits: Bounds = UNBOUNDED  # of designed experiments; what is absent: as far as the logs went
     machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
     input_kinds: tuple[str, ...] = ()  # of `servo.KINDS`, one per column; none given: all are torques
 
@@ -132,14 +132,14 @@ class Rig:
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
 
     def _turns(self, column: str) -> bool:
-        """True where an input drives an angle; without a file, as far as the names of what is read tell."""
+        """True where an input drives an angle; without a file, by the names of the readings."""
         joint = self.input_joints[self.input_columns.index(column)] - 1
         if self.machine:
             return not unpacked(self.machine).joints[joint].slide
         return not all(parameter_unit(name).startswith("m") for name in self.measured)
 
     def pairs(self) -> list[tuple[str, str]] | None:
-        """Every coordinate with its rate, where the names do not tell: the rate of x is dx."""
+        """Every coordinate with its rate, where names do not determine it: the rate of x is dx."""
         states = unpacked(self.machine).states if self.machine else ()
         dof = len(states) // 2
         return list(zip(states[:dof], states[dof:], strict=True)) if states else None
@@ -253,7 +253,7 @@ def flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, obje
 
 
 def nearest(word: str, known: Collection[str]) -> str:
-    """The mend for a misspelt name: the known name nearest to it, then all that are possible."""
+    """The remedy for a misspelt name: the known name nearest to it, then all that are possible."""
     same = [name for name in known if name.casefold() == word.strip().casefold()]
     close = same or difflib.get_close_matches(word, known, n=1)
     question = f"did you mean {close[0]!r}? " if close else ""
@@ -367,7 +367,7 @@ def _parameter(model: _Table, key: str) -> Declared:
 
 
 def _declared(root: _Table, spec: SystemSpec) -> Told:
-    """What [model] and [input] say of a system of these parameters."""
+    """Declaration of a system of these parameters by [model] and [input]."""
     model = root.table("model")
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))

@@ -1,4 +1,4 @@
-"""What smoothers and EM ask of a model, and a sequence as they take it: prepared once, handed on by name."""
+"""Interface of a model to smoothers and EM, and a sequence as they take it: prepared once, handed on by name."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from ..numerics.gaussian import Gaussian
 
 
 class AbstractModel(eqx.Module):
-    """All that smoothers and EM ask of a model."""
+    """All that smoothers and EM require of a model."""
 
     start: eqx.AbstractVar[Gaussian]
     """Prior of the state in the first row."""
@@ -34,7 +34,7 @@ class AbstractModel(eqx.Module):
         """Mean of the reading; `u` is a row of `inputs`."""
 
     def inputs(self, seq: Dataset) -> Any:
-        """What acts from outside in every row: an array, or a structure of arrays, with leading axis time."""
+        """External inputs in every row: an array, or a structure of arrays, with leading axis time."""
         return jnp.asarray(seq.u)
 
 
@@ -42,7 +42,7 @@ class Prepared(NamedTuple):
     """A sequence as a filter takes it; the fields carry a leading time axis."""
 
     inputs: Any
-    """What acts from outside, in the model's own form."""
+    """External inputs, in the model's own form."""
     y: Float[Array, "*seq time obs"]
     """0 where there is no reading."""
     observed: Bool[Array, "*seq time obs"]

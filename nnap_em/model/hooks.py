@@ -15,7 +15,7 @@ Effects = Sequence[AbstractEffect]
 def reaching(
     effects: Effects, system: AbstractSystem, u: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
-    """What reaches the joints of the commanded torques of a sequence [N m]."""
+    """Torques at the joints of the commanded torques of a sequence [N m]."""
     for effect in effects:
         if effect.joint in system.joints:
             i = system.joints.index(effect.joint)
@@ -26,7 +26,7 @@ def reaching(
 def fed(
     effects: Effects, servos: Sequence[Servo], system: AbstractSystem, u: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
-    """What the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`)."""
+    """Values that the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`)."""
     given = jnp.stack([servo.fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
     return late(effects, servos, system, given, dt)
 
@@ -34,7 +34,7 @@ def fed(
 def late(
     effects: Effects, servos: Sequence[Servo], system: AbstractSystem, fed: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
-    """What reaches the drives of what commands set, with the effects that take time."""
+    """Values at the drives of those that commands set, with the effects that take time."""
     columns = []
     for i, (joint, servo) in enumerate(zip(system.joints, servos, strict=True)):
         column, before = fed[:, i], servo.before(fed[:, i])
@@ -74,7 +74,7 @@ def machine(effects: Effects, system: AbstractSystem, time: Scalar) -> AbstractS
 def acceleration(
     effects: Effects, scene: Scene, memory: Float[Array, " memory"], force: Float[Array, " dof"]
 ) -> tuple[Scalar, ...]:
-    """Of every joint, under the inputs, all that acts in the scene, and an extra generalised force [N m]."""
+    """Acceleration of every joint under the inputs, all effects in the scene, and an extra generalised force [N m]."""
     return scene.system.acceleration(scene.q, scene.v, _total(effects, scene, memory, scene.drive + force))
 
 
@@ -112,7 +112,7 @@ def read(
     values: Float[Array, " readable"],
     past: Callable[[Scalar], Float[Array, " readable"]],
 ) -> Float[Array, " readable"]:
-    """What sensors on `values` read; `past(delay)` are the values some seconds ago."""
+    """Readings of sensors on `values`; `past(delay)` are the values some seconds ago."""
     for effect in effects:
         for i, name in enumerate(names):
             if effect.channel in (name, "all"):

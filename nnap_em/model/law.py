@@ -51,7 +51,7 @@ class LawFit(NamedTuple):
 
     value: Float[np.ndarray, "dof param"]
     std: Float[np.ndarray, "dof param"]
-    """What the curve leaves undetermined has the standard deviation of the prior: the curve's whole range."""
+    """Numbers that the curve leaves undetermined have the standard deviation of the prior: the curve's whole range."""
     velocity: Float[np.ndarray, "dof node"]
     """[rad/s]"""
     difference: Float[np.ndarray, "dof node"]

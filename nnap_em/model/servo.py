@@ -1,4 +1,4 @@
-"""What turns a command into torque: the law of a drive that feels the position and rate of its joint."""
+"""Servos: the law of a drive that makes torque of a command and of the position and rate of its joint."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -18,9 +18,9 @@ class Law(NamedTuple):
     """A torque [N m, or N on a slide] in two parts: what the command sets, then what position and rate make of it."""
 
     feed: Callable[[Values, Float[Array, " time"]], Float[Array, " time"]]
-    """Of the command u, row by row."""
+    """Function of the command u, row by row."""
     torque: Callable[[Values, Scalar, Scalar, Scalar], Scalar]
-    """Of what was fed, the coordinate q and the rate v, at one moment."""
+    """Function of what was fed, the coordinate q and the rate v, at one moment."""
 
 
 LAWS: Mapping[str, Law] = {
@@ -31,7 +31,7 @@ LAWS: Mapping[str, Law] = {
     "damper": Law(lambda p, u: p["kv"] * u, lambda p, fed, q, v: -fed * v),
     "affine": Law(lambda p, u: p["gain"] * u, lambda p, fed, q, v: fed - p.get("kp", 0.0) * q - p.get("kd", 0.0) * v),
 }
-"""By the kinds of `data/servo.py`; without bias, limit and delay, which all have but the torque itself.
+"""Coefficients of the kinds of `data/servo.py`; without bias, limit and delay, which all have but the torque itself.
 
     position   kp (u - q) - kd v            velocity   kv (u - v)
     voltage    k (u - k v) / R              damper     -kv u v
@@ -47,7 +47,7 @@ class Servo(eqx.Module):
     """
 
     column: str = eqx.field(static=True)
-    """Of the command."""
+    """Name of the command."""
     kind: str = eqx.field(static=True)
     values: dict[str, Scalar]
     """Numbers by their keys in rig.toml, in the units of `data/servo.py`; what is not there is none."""
@@ -63,14 +63,14 @@ class Servo(eqx.Module):
         return self.kind != "torque"
 
     def fed(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
-        """What the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m]."""
+        """Values that the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m]."""
         if "delay" in self.values:
             first = u[:1]
             u = first + InputDelay(self.values["delay"], joint=0).input(u - first, dt)
         return LAWS[self.kind].feed(self.values, u)
 
     def before(self, fed: Float[Array, " time"]) -> Float[Array, " 1"]:
-        """What was set before the first row."""
+        """Value that was set before the first row."""
         return fed[:1] if self.feeds_back else jnp.zeros_like(fed[:1])
 
     def torque(self, fed: Scalar, q: Scalar, v: Scalar) -> Scalar:

@@ -100,7 +100,7 @@ class Sweep(NamedTuple):
     period: tuple[float, float]
     """[s]"""
     first: tuple[float, float]
-    """Of the first coordinate in the first row [rad or m]; the other states follow the model's prior."""
+    """Range of the first coordinate in the first row [rad or m]; the other states follow the model's prior."""
 
 
 paper_sweep = Sweep((0.05, 0.3), (0.5, 3.0), (math.pi / 2, 3 * math.pi / 2))

@@ -20,16 +20,16 @@ from .base import AbstractModel
 from .servo import Servo
 
 SUBSTEPS = 2
-"""Integration steps of one sample where nothing asks for more."""
+"""Integration steps of one sample where nothing requires more."""
 
 
 class Inputs(NamedTuple):
-    """What acts on a machine from outside, in every row or in one."""
+    """External inputs of a machine, in every row or in one."""
 
     u: Float[Array, "*time input"]
-    """What reaches the joints [N m, or N]; with servos what commands set in them (`Servo.fed`)."""
+    """Torques at the joints [N m, or N]; with servos what commands set in them (`Servo.fed`)."""
     before: Float[Array, "*time input"]
-    """That one row before; 0 in the first row."""
+    """Torques one row before; 0 in the first row."""
     time: Float[Array, "*time"]
     """The clock in the middle of the step [s]."""
     age: Float[Array, "*time"]
@@ -62,9 +62,9 @@ class StateSpaceModel(AbstractModel):
     """Sample interval [s]."""
     substeps: int = eqx.field(static=True, default=SUBSTEPS)
     effects: tuple[AbstractEffect, ...] = ()
-    """What the declared physics lacks."""
+    """Laws that the declared physics lacks."""
     servos: tuple[Servo, ...] | None = None
-    """What makes torque of every input; None where the inputs are torques."""
+    """Law that makes torque of every input; None where the inputs are torques."""
 
     def __str__(self) -> str:
         names = self.system.readable
@@ -79,7 +79,7 @@ class StateSpaceModel(AbstractModel):
         return f"{effect.name}{joint}{''.join(values)}"
 
     def inputs(self, seq: Dataset) -> Inputs:
-        """What acts from outside in every row, as the effects have it."""
+        """External inputs in every row, as the effects change them."""
         u, t = jnp.asarray(seq.u), jnp.asarray(seq.t)
         if self.servos:
             u = hooks.fed(self.effects, self.servos, self.system, u, self.dt)
@@ -88,7 +88,7 @@ class StateSpaceModel(AbstractModel):
         return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1])
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
-        """What the effects see at one moment."""
+        """State of the machine at one moment, as effects get it."""
         dof = len(self.system.coordinates)
         q, v = x[:dof], x[dof : 2 * dof]
         system = hooks.machine(self.effects, self.system, u.time)
@@ -136,13 +136,13 @@ class StateSpaceModel(AbstractModel):
 
     @property
     def steps(self) -> int:
-        """Integration steps of one sample, as many as the stiffest effect asks for."""
+        """Integration steps of one sample, as many as the stiffest effect requires."""
         return max([self.substeps, *(effect.substeps for effect in self.effects)])
 
     def true(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " readable"]:
-        """Coordinates, rates, and what the sensors beside these feel, at inputs u and an extra generalised force."""
+        """Coordinates, rates, and readings of the sensors beside these, at inputs u and an extra generalised force."""
         dof, count = len(self.system.coordinates), len(self.system.sensors)
         if not count:
             return x[: 2 * dof]
@@ -157,7 +157,7 @@ class StateSpaceModel(AbstractModel):
     def readable(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " readable"]:
-        """What sensors on all coordinates and rates, and the others, would read without noise."""
+        """Readings, without noise, of sensors on all coordinates and rates, and of the others."""
         names = self.system.readable
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:

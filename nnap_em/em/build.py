@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig, RigError
-from ..data.servo import TORQUE
 from ..model.friction import FrictionNetwork, NoFriction
 from ..model.state_space import SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -19,7 +18,7 @@ from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
-from .servos import MOST_STEPS, build_servos, steps_of_sample
+from .servos import LAG, MOST_STEPS, build_servos, steps_of_sample, torque_along
 
 NO_MACHINE = "the declared masses and inertias make no machine"
 
@@ -88,14 +87,11 @@ def _loads(system: AbstractSystem):
     return jnp.diag(system.mass(still)), system.bias(still.at[0].set(jnp.pi / 2), still)
 
 
-LAG = 5
-"""Rows over which differences are taken."""
-
-
 def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
     """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy.
 
-    The torque of a servo, which nobody logs, is taken to be what the accelerations need.
+    The torque of a servo, which nobody logs, is that of its declared numbers at the readings, or where its joint is
+    not read, what the accelerations need.
     """
     dof = len(system.coordinates)
     y, u = np.asarray(data.y), np.asarray(data.u)
@@ -118,9 +114,15 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
         energy = np.nanmean(scale**2 * mass) if np.any(np.isfinite(scale)) else 1.0
         scale[np.isnan(scale)] = np.sqrt(energy / mass[np.isnan(scale)])
     drive = np.zeros(dof)
-    for i, (joint, kind) in enumerate(zip(rig.input_joints, rig.kinds.values(), strict=True)):
-        given = abs(system.gears[i]) * np.sqrt(np.mean(u[..., i][np.asarray(data.valid)] ** 2))
-        drive[joint - 1] = given if kind == TORQUE else mass[joint - 1] * acceleration[joint - 1]
+    servos, valid = build_servos(rig), np.asarray(data.valid)
+    for i, joint in enumerate(rig.input_joints):
+        given, position = u[..., i], system.coordinates[joint - 1]
+        if servos and servos[i].feeds_back and position not in rig.measured:
+            drive[joint - 1] = mass[joint - 1] * acceleration[joint - 1]
+            continue
+        if servos and servos[i].feeds_back:
+            given = torque_along(servos[i], given, system.gears[i] * y[..., rig.measured.index(position)], rig.dt)
+        drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(given[valid] ** 2))
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 

@@ -16,6 +16,9 @@ STIFF, MOST_STEPS = 0.5, 64
 """Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
 bears 2.8, and the most steps of a sample."""
 
+LAG = 5
+"""Rows over which differences are taken."""
+
 
 def build_servos(rig: Rig) -> tuple[Servo, ...]:
     """The declared drives, at the mean of what is uncertain; none where all inputs are torques."""
@@ -52,3 +55,17 @@ def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -
         return jnp.linalg.solve(system.mass(q), jnp.concatenate(jax.jacfwd(force, (0, 1))(q, still), axis=1))
 
     return jax.vmap(one)(q)
+
+
+def torque_along(
+    servo: Servo, u: Float[np.ndarray, "seq time"], q: Float[np.ndarray, "seq time"], dt: float
+) -> Float[np.ndarray, "seq time"]:
+    """Torque of a servo at logged commands and positions of the motor's side [N m, or N]; NaN where none is read.
+
+    Rates are differences over `LAG` rows before and after, so that noise of the readings adds little.
+    """
+    ahead = np.concatenate([q[:, LAG:], np.repeat(q[:, -1:], LAG, axis=1)], axis=1)
+    behind = np.concatenate([np.repeat(q[:, :1], LAG, axis=1), q[:, :-LAG]], axis=1)
+    fed = jax.vmap(lambda u: servo.fed(u, dt))(jnp.asarray(u, float))
+    each = jax.vmap(jax.vmap(servo.torque))
+    return np.asarray(each(fed, jnp.asarray(q, float), jnp.asarray((ahead - behind) / (2 * LAG * dt), float)))

@@ -119,16 +119,16 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
     return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
 
 
-def search(context: SearchContext) -> Closed:
+def search(context: SearchContext, *, white: bool) -> Closed:
     """Search for what the declared model lacks.
 
-    Where readings carry white noise, one-step errors are searched first, and the outcome is kept if its innovations are
+    Where readings carry `white` noise, one-step errors are searched first, and the outcome is kept if its innovations are
     white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors decide,
     from the declared model on.
     """
     before, data = context.before, context.data
     begun = _quantised(context)
-    found = _by_one_step(context, *begun) if white_readings(data) else None
+    found = _by_one_step(context, *begun) if white else None
     now, state, steps = found or _search(context, *begun, [_first(context)])
     if not now.found or state is None:
         return Closed(before, before, (), tuple(steps))
@@ -254,9 +254,9 @@ def close_the_loop(
         say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
     if white_readings(data):
-        return search(SearchContext(before, stages, data, MultiStep(), effort, say))
+        return search(SearchContext(before, stages, data, MultiStep(), effort, say), white=True)
     before, data, touches, pieces = disturbance_free(identified, before, data)
     if touches:
         say(f"{len(touches)} external disturbances: their rows are left out")
-    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces))
+    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces), white=False)
     return closed._replace(interventions=touches, pieces=pieces)

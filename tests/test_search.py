@@ -323,7 +323,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "identify", lambda *_, **__: _context().before)
     monkeypatch.setattr(search, "_search", run)
     monkeypatch.setattr(search, "quantised", lambda context, now: (now, None))
-    monkeypatch.setattr(search, "white_readings", lambda data: white or bool(cut))  # pieces may look white
+    monkeypatch.setattr(search, "white_readings", lambda data: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     monkeypatch.setattr(search, "apart", lambda closed, data: closed)

@@ -122,9 +122,9 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
 def search(context: SearchContext, *, white: bool) -> Closed:
     """Search for what the declared model lacks.
 
-    Where readings carry `white` noise, one-step errors are searched first, and the outcome is kept if its innovations are
-    white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors decide,
-    from the declared model on.
+    Where readings carry `white` noise, one-step errors are searched first, and the outcome is kept if its innovations
+    are white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors
+    decide, from the declared model on.
     """
     before, data = context.before, context.data
     begun = _quantised(context)

@@ -1,5 +1,6 @@
 """Identity of effects, their names for a reader, and the laws that complete or replace one another."""
 
+import re
 from collections.abc import Sequence
 
 import jax
@@ -27,7 +28,7 @@ def words(key: Key) -> str:
     return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
 
 
-MASS_NOUNS = ("air_drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "loss", "emf")
+MASS_NOUNS = ("air_drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "emf")
 """Last words of the laws that take no article."""
 
 
@@ -35,7 +36,7 @@ def with_article(key: Key) -> str:
     """Name of an effect with its article, as in a sentence."""
     if key[0].endswith(MASS_NOUNS):
         return words(key)
-    return ("an " if key[0][0] in "aeiou" else "a ") + words(key)
+    return ("an " if re.match("[aeiu]|o(?!ne)", key[0]) else "a ") + words(key)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What each function that is written by hand for speed gains over the usual one: a table of docs/results/elementary.md.
+"""Gain of each function that is written by hand for speed over the usual one: the table of docs/results/elementary.md.
 
     JAX_NUM_CPU_DEVICES=1 taskset -c 0 python benchmarks/elementary.py [--rounds 30]
 

@@ -1,4 +1,4 @@
-"""What a Runge-Kutta step of a machine from a file costs, by its number of joints: a table of docs/results/machines.md.
+"""Time of a Runge-Kutta step of a machine from a file by its number of joints: the table of docs/results/machines.md.
 
     JAX_NUM_CPU_DEVICES=1 taskset -c 0 python benchmarks/machines.py [--rounds 7]
 

@@ -1,4 +1,4 @@
-"""What rough logs cost: the table of docs/results/rough.md.
+"""Errors of fits to rough logs: the table of docs/results/rough.md.
 
     python benchmarks/rough.py [--system acrobot slide] [--only clean spikes_10 ...] [--trust]
 

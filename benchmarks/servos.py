@@ -27,7 +27,7 @@ from nnap_em.systems import specs
 jax.config.update("jax_enable_x64", True)
 DT, INNER = 0.01, 20
 NOISE = 2e-4
-"""Of the encoders [rad]."""
+"""Standard deviation of the encoders [rad]."""
 KP = (400.0, 400.0, 250.0, 60.0, 40.0, 15.0)
 KD = (20.0, 20.0, 12.0, 2.0, 1.0, 0.3)
 COULOMB = (4.0, 4.0, 2.5, 0.8, 0.5, 0.2)

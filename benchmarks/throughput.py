@@ -1,4 +1,4 @@
-"""How fast the smoothers are, beside their peers and beside the limit of the machine: docs/results/throughput.md.
+"""Throughput of the smoothers beside their peers and the limit of the machine: docs/results/throughput.md.
 
     python benchmarks/throughput.py [--quick] [--only filter growth ...]
 

@@ -10,10 +10,10 @@ from nnap_em.data.rig import Rig, read_rig
 from nnap_em.systems import specs
 
 GRAVITY, MASS, LENGTH, INERTIA = 9.81, 1.2, 0.25, 0.01
-"""Of the rod: its centre [m] below the axis, its inertia about it [kg m^2]."""
+"""Gravity [m/s^2]; mass of the rod [kg], its centre below the axis [m], its inertia about that centre [kg m^2]."""
 DT, ROWS, SEQUENCES = 0.02, 150, 6
 NOISE = (1e-3, 1e-2)
-"""Of the readings [rad, rad/s]."""
+"""Standard deviations of the readings [rad, rad/s]."""
 FILE = f"""<mujoco><compiler angle="radian"/><worldbody><body name="rod"><joint name="hinge" axis="0 -1 0"/>
 <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
 <site name="tip" pos="0 0 -0.4"/></body></worldbody><actuator><motor name="tau" joint="hinge"/></actuator></mujoco>"""

@@ -29,7 +29,7 @@ def _dip(v):
 
 
 def _square(u, c):
-    """Of the smaller torque while it is dragged along; none where both pull the same way."""
+    """Quadratic part of the smaller torque while it is dragged along; none where both pull the same way."""
     return np.where(u * c > 0, np.where(np.abs(u) > np.abs(c), 0.07 * c**2, 0.04 * u**2), 0.0)
 
 
@@ -54,7 +54,7 @@ def model(tmp_path) -> StateSpaceModel:
 
 
 def _forces(law: LoadFriction, model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
-    """Of a law [N m] at angles, rates and torques."""
+    """Forces of a law [N m] at angles, rates and torques."""
 
     def force(q, v, u):
         scene = model.scene(jnp.stack([q, v]), Inputs(u[None], u[None], a(0.0), a(0.0)))
@@ -111,7 +111,7 @@ def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
 
 @pytest.fixture
 def around_rod(model):
-    """What a search knows of the rod."""
+    """Candidates' surroundings of the rod."""
     one = np.ones(1)
     return Around(
         model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,

@@ -8,7 +8,7 @@ from nnap_em import close_the_loop, findings
 from nnap_em.effects import catalogue
 
 MASS, PLACE = 0.5, (0.15, -0.3)
-"""Of what hangs on the rod [kg], and where in the plane of its motion [m]."""
+"""Mass of the load [kg], and its place in the plane of motion [m]."""
 
 
 def test_mass_and_centre_of_a_load_on_one_joint_are_found(tmp_path):

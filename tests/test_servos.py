@@ -14,6 +14,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.data.servo import KINDS
+from nnap_em.diagnose.search import close_the_loop
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.check import BAD, LOOK, OK, check
@@ -431,3 +432,9 @@ def test_a_servo_with_other_numbers_keeps_its_own():
     servo = Servo("goal", "position", {"kp": jnp.asarray(1.0), "kd": jnp.asarray(2.0)})
     other = servo.with_values({"goal.kp": jnp.asarray(3.0), "elbow.kd": jnp.asarray(4.0)})
     assert (float(other.values["kp"]), float(other.values["kd"])) == (3.0, 2.0)
+
+
+def test_a_diagnosis_of_a_servo_is_refused_with_what_to_log(tmp_path):
+    rig = _servo(tmp_path, 'kind = "position"\nkp = 9.0\n')
+    with pytest.raises(RigError, match=r"goal \(position\) is the command of a servo; log the torque"):
+        close_the_loop(rig, _logs(np.zeros((2, 20, 1))), key=jax.random.key(0))

@@ -240,8 +240,8 @@ def close_the_loop(
     if rig.input_kinds:  # candidates are computed from logged torques
         servos = ", ".join(f"{name} ({kind})" for name, kind in rig.kinds.items() if kind != TORQUE)
         raise RigError(
-            f"diagnose needs the torques of the drives, and {servos} is the command of a servo; log the torque and name "
-            "it in [input] columns, or fit the servo with identify"
+            f"diagnose needs the torques of the drives, and {servos} is the command of a servo; log the torque and "
+            "name it in [input] columns, or fit the servo with identify"
         )
     data = jax.device_put(data)
     stages: Stages = {}

@@ -206,6 +206,8 @@ def test_effects_are_compared_and_those_of_one_fit_are_a_difference(unchanged):
     found = compare(_with_effect(first, 0.1), second, names=("may", "june"))
     assert found.differences == ("load friction of u and dx at joint 1 is in may, not in june",)
     assert found.numbers[-1].test is None and not found.changed
+    assert found.verdict.startswith("No tested quantity changed between may and june")
+    assert found.verdict.endswith("at 1%. Load friction of u and dx at joint 1 is in may, not in june.")
     name = "mu of load friction of u and dx at joint 1"
     for value, news in ((0.11, ()), (0.2, (name,))):  # known to .01 each
         found = compare(_with_effect(first, 0.1), _with_effect(second, value), names=("may", "june"))

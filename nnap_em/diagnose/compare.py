@@ -138,11 +138,17 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The outcome in one sentence."""
+        """The outcome: the quantities that changed, then the effects and parameters that some fits lack."""
+        return " ".join([self._tested, *(f"{text[0].upper()}{text[1:]}." for text in self.differences)])
+
+    @property
+    def _tested(self) -> str:
+        """The outcome of the tests in one sentence."""
         tests = sum(number.test is not None for number in self.numbers) + len(self.curves)
         between = f"between {listed(self.names)}"
         if not self.changed:
-            return f"Nothing changed {between} beyond the stated errors: {_counted(tests)} tested at {CHANGED:.0%}."
+            nothing = "No tested quantity" if self.differences else "Nothing"
+            return f"{nothing} changed {between} beyond the stated errors: {_counted(tests)} tested at {CHANGED:.0%}."
         told = []
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
@@ -154,7 +160,7 @@ class Comparison(NamedTuple):
         return text[0].upper() + text[1:]
 
     def __str__(self) -> str:
-        return "\n  ".join(["Comparison", self.verdict, *self.differences, *self.warnings])
+        return "\n  ".join(["Comparison", self.verdict, *self.warnings])
 
 
 def _counted(quantities: int, kind: str = "") -> str:

@@ -159,8 +159,7 @@ def table(comparison: Comparison) -> str:
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     # the name of a curve stands over its empty columns
     widths[0] = max(len(line[0]) for line in lines if any(line[1:-2]))
-    text = [comparison.verdict, *(f"Difference: {told}." for told in comparison.differences)]
-    text += [f"Warning: {told}." for told in comparison.warnings]
+    text = [comparison.verdict, *(f"Warning: {told}." for told in comparison.warnings)]
     text += ["", *(_aligned(line, widths) for line in lines), "", LEGEND]
     return comparison.fits[0].fitted.rig.named("\n".join(text))
 

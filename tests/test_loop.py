@@ -119,7 +119,7 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
     assert verdict(found, None) == "The model lacks a payload at joint 2."
     sized = found[0]._replace(parameters={"mass": Estimate(0.4567, 0.0123, "kg"), "centre_x": Estimate(0.1, 0.2, "m")})
-    assert verdict([sized], None) == "The model lacks a payload at joint 2 (mass = 0.457 ± 0.01 kg)."
+    assert verdict([sized], None) == "The model lacks a payload at joint 2 (mass = 0.457 ± 0.012 kg)."
     drawn = found[0]._replace(
         effect=catalogue["air_drag"](jnp.zeros(())),
         curve=Curve("x", "rad", 1, "N m", False, *np.asarray([[0.0, 1.0], [-1.0, 2.0], [0.1, 0.1]])),

@@ -8,9 +8,10 @@ import pytest
 
 from nnap_em.diagnose.keys import words
 from nnap_em.effects import catalogue
+from nnap_em.numerics.digits import number, with_std
 from nnap_em.report.page import MOST, Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
-from nnap_em.report.wording import label, number, with_std
+from nnap_em.report.wording import label
 from nnap_em.residual.statistics import LEVEL
 
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)

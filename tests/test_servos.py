@@ -14,7 +14,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.data.servo import KINDS
-from nnap_em.diagnose.search import close_the_loop
+from nnap_em.diagnose.columns import candidate_columns, tracks
+from nnap_em.effects import Candidate
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.check import BAD, LOOK, OK, check
@@ -25,6 +26,7 @@ from nnap_em.em.servos import build_servos
 from nnap_em.em.store import load, save
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
+from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.portable.export import ExportError, export
 from nnap_em.systems import specs
 
@@ -434,7 +436,19 @@ def test_a_servo_with_other_numbers_keeps_its_own():
     assert (float(other.values["kp"]), float(other.values["kd"])) == (3.0, 2.0)
 
 
-def test_a_diagnosis_of_a_servo_is_refused_with_what_to_log(tmp_path):
-    rig = _servo(tmp_path, 'kind = "position"\nkp = 9.0\n')
-    with pytest.raises(RigError, match=r"goal \(position\) is the command of a servo; log the torque"):
-        close_the_loop(rig, _logs(np.zeros((2, 20, 1))), key=jax.random.key(0))
+def test_columns_of_candidates_are_changes_of_the_torque_of_the_servo(tmp_path):
+    """The second way is the drive of the model that holds the law, at the same states."""
+    model = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0\nkd = 0.5'))
+    rng = np.random.default_rng(4)
+    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 1)), 4, axis=1)))
+    mean = 0.3 * jnp.asarray(rng.normal(size=(1, 24, 2)))
+    inputs, first = jax.vmap(model.inputs)(data), jax.tree.map(lambda a: a[0], data)
+    track = tracks(model, Gaussian(mean, jnp.zeros((1, 24, 2, 2))), inputs)
+    for law in (Saturation.of(0.5, joint=1), MotorGain.of(-0.2, joint=1), InputDelay.of(0.013, joint=1)):
+        found = candidate_columns(model, [Candidate(law, (law,), law)])(track).force[0, 0]
+        drive = [
+            jax.vmap(lambda x, u, m=m: m.scene(x, u).drive)(track.middle[0], m.inputs(first))
+            for m in (with_effects(model, (law,)), model)
+        ]
+        assert np.abs(found).max() > 0.1
+        np.testing.assert_allclose(found, drive[0] - drive[1], atol=1e-6)

@@ -55,7 +55,8 @@ def _track(null: StateSpaceModel, one) -> Track:
     along = lambda x, rate, u: jax.jvp(lambda x: null.true(x, u), (x,), (rate,))  # noqa: E731
     true, past = jax.vmap(along)(mean, now, inputs)
     past = past.at[0].set(0.0)  # the first row has none
-    drive, friction = jax.vmap(null.system.drive)(inputs.u), jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
+    drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, inputs)
+    friction = jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
     return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
 
 
@@ -63,7 +64,7 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     """Columns that `effect` adds, by its own hooks, to the machine `base` along a track."""
     alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
     x = track.x
-    drive = jax.vmap(system.drive)(hooks.reaching(alone, system, track.inputs.u, base.dt))
+    drive, plain = (base.driving(laws, track.middle, track.inputs) for laws in (alone, ()))
     driven = scenes._replace(drive=drive)
 
     def remember(m, scene):
@@ -76,7 +77,7 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     def one(scene, memory, acceleration):
         return hooks.added(alone, _scene(base, scene), memory, acceleration)
 
-    force = jax.vmap(one)(driven, memory, track.acceleration) + drive - scenes.drive
+    force = jax.vmap(one)(driven, memory, track.acceleration) + drive - plain
 
     def read(true, rate):
         read = hooks.read(alone, system.readable, true, lambda delay: true - delay * rate)

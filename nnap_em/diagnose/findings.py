@@ -14,6 +14,7 @@ from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..em.identify import Identified, friction_table
+from ..numerics.digits import with_std
 from ..systems import AbstractSystem
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, rest_of, with_article, words
@@ -94,12 +95,10 @@ def findings(closed: Closed) -> list[Finding]:
             continue  # reported with the law that it completes
         drawn = effect.curve(numbers, model.system)
         parameters = estimates(effect, numbers, model.system)
-        numbers_told = ", ".join(
-            f"{n} = {p.value:.4g} ± {p.std:.2g} {p.unit}".rstrip(" -") for n, p in parameters.items()
-        )
+        sizes = ", ".join(f"{n} = {with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items())
         rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
         form, remains = (shape(one) if one else None for one in (drawn, rest))
-        sentence = ": ".join(filter(None, (words(key_of(effect)), numbers_told, form.words if form else "")))
+        sentence = ": ".join(filter(None, (words(key_of(effect)), sizes, form.words if form else "")))
         if rest is not None and remains is not None:
             left = f"{np.ptp(rest.mean):.2g} {rest.unit}: {remains.words}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
@@ -169,7 +168,7 @@ def _sized(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
     name, curve = with_article(key_of(finding.effect)), finding.curve
     for symbol, number in finding.parameters.items():
-        return f"{name} ({symbol} = {number.value:.3g} ± {number.std:.1g} {number.unit}".rstrip(" -") + ")"
+        return f"{name} ({symbol} = {with_std(number.value, number.std)} {number.unit}".rstrip(" -") + ")"
     return f"{name} ({np.ptp(curve.mean):.2g} {curve.unit} from trough to peak)" if curve else name
 
 

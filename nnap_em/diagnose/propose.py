@@ -12,7 +12,7 @@ from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..effects import AbstractEffect, Around, Candidate, catalogue, free_form
 from ..em.build import measure_scales
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
 from .keys import key_of
@@ -27,6 +27,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
     low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
     y = np.asarray(data.y)
     clock = np.asarray(data.t)[valid]
+    drive = np.nan_to_num(np.asarray(_drives(model, jnp.asarray(path.mean), data)))
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
@@ -39,8 +40,9 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         viscous,
         low,
         high,
-        np.abs(model.system.gears)
-        * np.max(np.abs(np.where(valid[..., None], np.asarray(data.u), 0.0)), axis=(0, 1), initial=0.0),
+        np.max(np.abs(np.where(valid[..., None], drive, 0.0)), axis=(0, 1), initial=0.0)[
+            [joint - 1 for joint in model.system.joints]
+        ],
         rig.measured,
         np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
         rig.dt,
@@ -50,6 +52,13 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         rig.friction,
         rig.input_columns,
     )
+
+
+@eqx.filter_jit
+def _drives(model: StateSpaceModel, x: Float[Array, "seq time state"], data: Dataset) -> Float[Array, "seq time dof"]:
+    """Generalised force of the inputs along the smoothed paths [N m, or N]."""
+    plain = with_effects(model, ())
+    return jax.vmap(lambda x, seq: plain.driving((), x, plain.inputs(seq)))(x, data)
 
 
 @eqx.filter_jit

@@ -11,8 +11,7 @@ from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
 
 from ..data.dataset import Dataset
-from ..data.rig import Rig, RigError
-from ..data.servo import TORQUE
+from ..data.rig import Rig
 from ..em.identify import Identified, finished, identify
 from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
@@ -235,14 +234,8 @@ def close_the_loop(
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
 
     Where readings do not carry white noise, as on real machines, external disturbances are left out before.
-    Raises FitError when no sequence can be followed, RigError for a rig whose inputs are commands of servos.
+    Raises FitError when no sequence can be followed.
     """
-    if rig.input_kinds:  # candidates are computed from logged torques
-        servos = ", ".join(f"{name} ({kind})" for name, kind in rig.kinds.items() if kind != TORQUE)
-        raise RigError(
-            f"diagnose needs the torques of the drives, and {servos} is the command of a servo; log the torque and "
-            "name it in [input] columns, or fit the servo with identify"
-        )
     data = jax.device_put(data)
     stages: Stages = {}
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from ..diagnose.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Number
 from ..diagnose.pooling import JointTest, Pooled
+from ..numerics.digits import number, with_std
 from ..storage.files import replace_text
 from .compare_plots import comparison_figure
 from .document import versions
 from .page import Picture, picture, rendered
 from .tables import write_json
-from .wording import number, p_value, with_std
+from .wording import p_value
 
 SHOWN = 5
 """Velocities of a curve in the table; compare.json has all."""

@@ -12,13 +12,13 @@ from ..data.formats import write_csv
 from ..design.experiment import Design
 from ..design.questions import Told, after
 from ..diagnose.keys import key_of, listed, words
+from ..numerics.digits import number
 from ..residual.residual import names_of
 from ..storage.files import replace_text
 from .design_plots import bands_figure, motion_figure
 from .document import versions
 from .page import Picture, picture, rendered
 from .tables import write_json
-from .wording import number
 
 Say = Callable[[str], None]
 INPUTS, MOTIONS = "inputs", "motion"

@@ -10,12 +10,12 @@ from ..data.recordings.bring import Brought, TopicFacts
 from ..data.recordings.declared import Plan
 from ..data.recordings.delays import Delay
 from ..data.rig import Rig
+from ..numerics.digits import number
 from ..storage.files import replace_text
 from .document import versions
 from .import_plot import timeline
 from .page import picture, rendered
 from .tables import write_json
-from .wording import number
 
 NOTABLE = 0.2
 """Share of a row from which on a delay, where it is surely one, is pointed out."""

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
+from ..numerics.digits import finite, number
 from ..residual.statistics import LEVEL
 from . import wording
 from .vocabulary import MEANINGS, WORDS
-from .wording import finite, number, ratio
+from .wording import ratio
 
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""

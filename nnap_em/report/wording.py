@@ -5,42 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..diagnose.keys import words
-
-
-def finite(value: Any) -> bool:
-    """True for a finite number."""
-    return isinstance(value, int | float) and math.isfinite(value)
-
-
-def number(value: Any, digits: int = 3) -> str:
-    """A number in so many significant digits; a dash where there is none, a text as it is."""
-    if isinstance(value, str):
-        return value
-    if not finite(value):
-        return "–"
-    if value == 0 or (isinstance(value, int) and abs(value) < 1e6):
-        return str(int(value))
-    size = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    if -4 <= size < 6:
-        return _minus(f"{value:.{max(digits - 1 - size, 0)}f}")
-    return _minus(f"{value / 10.0**size:.{digits - 1}f}") + power(size)
-
-
-def with_std(value: Any, std: Any) -> str:
-    """A value and its standard deviation, both to the second digit of the latter."""
-    if not finite(value) or not finite(std) or std <= 0:
-        return number(value, 4)
-    places, size = 1 - math.floor(math.log10(std)), math.floor(math.log10(max(abs(value), std)))
-    if -4 <= size < 6:
-        places = min(max(places, 0), 12)
-        return _minus(f"{value:.{places}f} ± {std:.{places}f}")
-    places = min(max(places + size, 0), 12)
-    return _minus(f"({value / 10.0**size:.{places}f} ± {std / 10.0**size:.{places}f})") + power(size)
-
-
-def power(exponent: int) -> str:
-    """A factor of a power of ten."""
-    return f" × {_ten(exponent)}"
+from ..numerics.digits import finite, number, ten, with_std
 
 
 def chance(p: float) -> str:
@@ -48,13 +13,13 @@ def chance(p: float) -> str:
     if p < 1e-12:
         return "less than one in a million million"
     if p < 1e-3:
-        return f"about one in {_ten(round(-math.log10(p)))}"
+        return f"about one in {ten(round(-math.log10(p)))}"
     return f"about one in {1 / p:.0f}" if p < 0.1 else number(p, 2)
 
 
 def p_value(p: Any) -> str:
     """A p-value; one that is too small for a number is below the smallest."""
-    return f"< {_ten(-300)}" if p == 0 else number(p, 2)
+    return f"< {ten(-300)}" if p == 0 else number(p, 2)
 
 
 def ratio(before: Any, after: Any) -> str:
@@ -81,13 +46,5 @@ def label(effect: Mapping[str, Any]) -> str:
 
 def sentence(text: Any) -> str:
     """Text with a capital, a full stop, and no underscores."""
-    told = str(text or "").replace("_", " ").rstrip(".")
-    return f"{told[:1].upper()}{told[1:]}." if told else ""
-
-
-def _ten(exponent: int) -> str:
-    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-def _minus(text: str) -> str:
-    return text.replace("-", "−")
+    plain = str(text or "").replace("_", " ").rstrip(".")
+    return f"{plain[:1].upper()}{plain[1:]}." if plain else ""

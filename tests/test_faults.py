@@ -5,6 +5,7 @@ a process of its own; `benchmarks/faults.py` kills many, at moments drawn from a
 """
 
 import errno
+import json
 import math
 import os
 import re
@@ -231,6 +232,8 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     code, said = _struck(_order(command, rig, out, "--resume"), out, signal.SIGINT, 2)
     assert code == 130, said
     assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _told(said))
+    if command is DIAGNOSE:
+        _answered_in_time(rig, out)
     run = _start(_order(command, rig, out, "--resume"))
     _, said = run.communicate(timeout=300)
     assert run.returncode == 0 and "resumed" in said, said
@@ -239,6 +242,20 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     assert left == numbers(whole[command[0]])
     assert all(len(left[name][0]) > 20 for name in left if name.endswith(".npz"))
     assert [effect["name"] for effect in left["report"].get("effects", [])] == FOUND[command[0]]
+
+
+def _answered_in_time(rig: Path, out: Path) -> None:
+    """An answer after the first fit, since no more time is left, and what goes on from there."""
+    steps = len(_steps(out))
+    run = _start(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"))
+    _, said = run.communicate(timeout=300)
+    assert run.returncode == 0 and re.search(r"\[\d+:\d\d over\] ", said), said
+    assert re.search(r"finished steps kept; to go on: nnap-em diagnose .*--resume", _told(said))
+    report = json.loads((out / "report.json").read_text())
+    assert not report["complete"] and not report["effects"]
+    assert "The search was not finished" in report["verdict"] and report["verdict"] in said
+    assert "No effect of the catalogue" not in (out / "report.html").read_text()
+    assert len(_steps(out)) >= steps
 
 
 # --- files that are not what they should be

@@ -81,6 +81,7 @@ test/ serves for the reported prediction error only, never for the fit.
 _DIAGNOSE = """\
 examples:
   nnap-em diagnose bench --out found
+  nnap-em diagnose bench --out found --minutes 5    answer in that time; what was not tried is tried with --resume
   nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
 
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
@@ -216,6 +217,9 @@ def parser() -> argparse.ArgumentParser:
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
+    diagnose.add_argument(
+        "--minutes", type=_minutes, metavar="M", help="answer within M minutes with what is found by then"
+    )
     design = command("design", "find the inputs to play next", _DESIGN)
     design.add_argument("folder", metavar="FIT", type=Path, help="model.npz or after.npz, or the folder that holds it")
     design.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
@@ -381,6 +385,10 @@ def _natural(text: str) -> int:
 
 def _time(text: str) -> float:
     return _number(text, float, 0.0, "seconds, 0 or more")
+
+
+def _minutes(text: str) -> float:
+    return _number(text, float, math.ulp(0.0), "minutes, more than 0")
 
 
 def _part(text: str) -> float:

@@ -162,8 +162,10 @@ def log_of(fitted: Identified, logs: Logs) -> Channel:
 
 
 @contextmanager
-def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[None]:
+def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Journal]:
     """Keep every finished step of what is done inside until all of it is; with --resume go on from what is kept.
+
+    A journal that is left `open` is kept after the end, too.
 
     Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
     """
@@ -174,7 +176,7 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[None
         journal.check()
         found = f"resumed with {len(journal)} finished steps"
         say(found if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
-    with _folder(args.out), _telling(lambda: _how_to_go_on(args, journal)):
+    with _folder(args.out), _telling(lambda: go_on(args, journal)):
         if args.resume:
             sweep(journal.folder)
         else:
@@ -182,8 +184,9 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[None
         count, rows = bench.train.data.valid.shape
         say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
-            yield
-        journal.clear()
+            yield journal
+        if not journal.open:
+            journal.clear()
 
 
 def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
@@ -192,7 +195,8 @@ def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[st
     return {name: value for name, value in found.items() if none or value is not None}
 
 
-def _how_to_go_on(args: argparse.Namespace, journal: Journal) -> str:
+def go_on(args: argparse.Namespace, journal: Journal) -> str:
+    """The finished steps that are kept, and the command that goes on from them."""
     if not len(journal):
         return "stopped before the end of the first step; nothing was kept"
     command = ["nnap-em", args.command, str(args.folder), "--out", str(args.out)]

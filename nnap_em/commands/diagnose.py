@@ -1,6 +1,7 @@
 """nnap-em diagnose: find what the declared model lacks."""
 
 import argparse
+import math
 import time
 
 import jax
@@ -9,21 +10,41 @@ from ..diagnose.findings import findings
 from ..diagnose.search import close_the_loop
 from ..em.store import fingerprint, save
 from ..report.diagnosis import write_diagnosis
-from .common import Say, read_bench, resumable, warn_of_torques
+from .common import Say, go_on, read_bench, resumable, warn_of_torques
+
+SHARE = 0.8
+"""Share of the minutes given after which the search begins no new step: the last step, the fit of the last law over the
+whole length and the page take the rest (10 to 25 % of a whole run on two rigs of two joints)."""
 
 
 def run(args: argparse.Namespace, say: Say) -> None:
     """Find it, and report; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
+    seconds = SHARE * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
-    with resumable(args, bench, say):
-        told = lambda text: say(bench.rig.named(text))  # noqa: E731
-        closed = close_the_loop(bench.rig, bench.train.data, key=jax.random.key(args.seed), say=told)
+    with resumable(args, bench, say) as journal:
+
+        def report(text: str) -> None:
+            left = f"[{_clock(60.0 * args.minutes - (time.perf_counter() - began))}] " if args.minutes else ""
+            say(left + bench.rig.named(text))
+
+        spent = time.perf_counter() - began
+        key = jax.random.key(args.seed)
+        closed = close_the_loop(bench.rig, bench.train.data, key=key, say=report, seconds=seconds - spent)
+        journal.open = not closed.complete
         found, mark = findings(closed), fingerprint(bench.train.data)
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, say=told)
+        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, say=report)
+    if journal.open:
+        say(go_on(args, journal))
+
+
+def _clock(seconds: float) -> str:
+    """Time that is left, or by which it is exceeded, in minutes and seconds."""
+    minutes, rest = divmod(round(abs(seconds)), 60)
+    return f"{minutes}:{rest:02} {'left' if seconds > 0 else 'over'}"

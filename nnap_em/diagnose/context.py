@@ -61,6 +61,8 @@ class SearchContext(NamedTuple):
     say: Say
     pieces: tuple[int, ...] = ()
     """Recording that every sequence is a piece of; empty: each is a recording."""
+    until: float = math.inf
+    """Moment of `time.monotonic()` after which no new round or refit begins."""
 
     @property
     def longest(self) -> int:

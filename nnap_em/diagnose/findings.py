@@ -120,10 +120,15 @@ def verdict(
     failed: int = 0,
     rivals: Sequence[Key] = (),
     suspects: Sequence["SuspectReport"] = (),
+    complete: bool = True,
 ) -> str:
     """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
-    `rivals` explain the same of what is left, and `suspects` remove more than chance.
+    `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one where the search is
+    not `complete`.
     """
+    if not complete:
+        first = verdict(found, error, failed, rivals, suspects) if found or rivals or suspects else "Nothing yet."
+        return f"{first} The search was not finished in the time given: more may be missing."
     if not found and rivals:
         return (
             f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "

@@ -48,6 +48,8 @@ class Step(NamedTuple):
     """Laws of other causes that explain the same, so that none of them was added."""
     suspects: tuple[Suspect, ...] = ()
     """Best first; empty where a law was accepted."""
+    untried: int = 0
+    """Candidates over their bar that were not refitted before the time was up."""
 
 
 class Closed(NamedTuple):
@@ -61,6 +63,8 @@ class Closed(NamedTuple):
     """External disturbances, whose rows are in no fit."""
     pieces: tuple[int, ...] = ()
     """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
+    complete: bool = True
+    """False where the time was up before the search had ended: more may be missing."""
 
     @property
     def last(self) -> tuple[Step, ...]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..effects import AbstractEffect
 from ..model.state_space import StateSpaceModel
+from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
 from .context import SearchContext
 from .keys import Key, contains, covered, free_signals, key_of, replaced, rest_of, words
@@ -48,20 +49,24 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     admitted = [s for s in ranked if s.reached]
     tried: list[Refit] = []
     fitting = fit, context.loss, context.effort.passes
-    null = fitted(fit.now, fit.path, *fitting) if admitted else None
-    while admitted and len(tried) < context.effort.shortlist:
-        first = min(s.band for s in admitted)
-        entries = _entries([s for s in admitted if s.band == first], model)
-        even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
-        group = even + _inside(even, admitted, model)
-        cases = [with_candidate(s, cast(Trial, null), *fitting) for s in group]
-        tried += cases
-        for case in cases:
-            _log(case, context)
-        sound = [case for case in cases if case.rejection is None]
-        if sound:
-            return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
-        admitted = [s for s in admitted if not any(s is other for other in group)]
+    try:
+        null = fitted(fit.now, fit.path, *fitting) if admitted else None
+        while admitted and len(tried) < context.effort.shortlist:
+            first = min(s.band for s in admitted)
+            entries = _entries([s for s in admitted if s.band == first], model)
+            even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
+            group = even + _inside(even, admitted, model)
+            cases = []
+            for s in group:
+                cases.append(with_candidate(s, cast(Trial, null), *fitting))
+                _log(cases[-1], context)
+            tried += cases
+            sound = [case for case in cases if case.rejection is None]
+            if sound:
+                return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
+            admitted = [s for s in admitted if not any(s is other for other in group)]
+    except TimeUp:
+        step = step._replace(untried=len(admitted))
     others = [s for s in ranked if not any(s is case.screened for case in tried)]
     suspects = _suspects(others) if context.loss.predicts else ()
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)

@@ -2,7 +2,8 @@
 
 import functools
 import math
-from typing import Any, cast
+import time
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.programs import let_go
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
+from ..storage.deadline import TimeUp, until
 from .context import EFFORT, SHORT, Effort, Say, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, replaced, rest_of, words
@@ -42,6 +44,8 @@ def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[S
         return now
     found = screening_round(fit, context)
     steps.append(found.step)
+    if found.step.untried:
+        raise TimeUp
     return now if found.accepted is None else _with(now, found.accepted, _found(found, context.loss), context)
 
 
@@ -128,13 +132,13 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     """
     before, data = context.before, context.data
     begun = _quantised(context)
-    found = _by_one_step(context, *begun) if white else None
-    now, state, steps = found or _search(context, *begun, [_first(context)])
+    one_step = _by_one_step(context, *begun) if white else None
+    now, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
     if not now.found or state is None:
-        return Closed(before, before, (), tuple(steps))
+        return Closed(before, before, (), tuple(steps), complete=complete)
     outcome = finished(_outcome(before, now, state), data)
-    closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps))
-    if found is None:
+    closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps), complete=complete)
+    if one_step is None:
         return closed
     try:
         return apart(closed, data)
@@ -143,17 +147,15 @@ def search(context: SearchContext, *, white: bool) -> Closed:
         return closed
 
 
-def _by_one_step(
-    context: SearchContext, now: Hypothesis, state: EMState | None
-) -> tuple[Hypothesis, EMState | None, list[Step]] | None:
+def _by_one_step(context: SearchContext, now: Hypothesis, state: EMState | None) -> "_Searched | None":
     """Outcome of a search by one-step errors; None where its innovations are not white, so that it proves nothing."""
-    now, state, steps = _search(context._replace(loss=OneStep()), now, state, _ladder(context))
-    white = white_innovations(_outcome(context.before, now, state), context.data)
+    found = _search(context._replace(loss=OneStep()), now, state, _ladder(context))
+    white = white_innovations(_outcome(context.before, found.now, found.state), context.data)
     if not white:
         context.say(
             "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
         )
-    return (now, state, steps) if white else None
+    return found if white else None
 
 
 def _quantised(context: SearchContext) -> tuple[Hypothesis, EMState | None]:
@@ -188,12 +190,21 @@ def _outcome(before: Identified, now: Hypothesis, state: EMState | None) -> Iden
     return before if state is None else before._replace(state=state, m_step=now.m_step)
 
 
-def _search(
-    context: SearchContext, now: Hypothesis, state: EMState | None, lengths: list[int]
-) -> tuple[Hypothesis, EMState | None, list[Step]]:
-    """Forward selection and backward elimination by one loss, until neither changes anything.
+class _Searched(NamedTuple):
+    """Outcome of a search by one loss."""
 
-    The rounds look at `lengths` rows in turn, then, and after the first law at once, at all.
+    now: Hypothesis
+    state: EMState | None
+    """Its fit over the whole length; None for the declared model."""
+    steps: list[Step]
+    complete: bool = True
+
+
+def _search(context: SearchContext, now: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
+    """Forward selection and backward elimination by one loss, until neither changes anything or the time is up.
+
+    The rounds look at `lengths` rows in turn, then, and after the first law at once, at all.  A law that was accepted
+    in time is fitted over the whole length, however long that takes.
     """
     searched: set[frozenset] = set()
     steps: list[Step] = []
@@ -203,23 +214,28 @@ def _search(
         length = ahead.pop(0)
         best = state.best if state else context.stages[length][0].best if length < longest else context.before.model
         now = now.refitted(cast(StateSpaceModel, best))
-        more = _forward(context, now, length, steps)
-        if more.found is now.found and ahead:
-            continue
-        searched.add(_names(now))
-        if _names(more) in searched:  # nothing new, or one law in the place of another and back
-            steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
-            more = _backward(context, now)
-            if more.found is now.found:
-                return now, state, steps
+        try:
+            with until(context.until):
+                more = _forward(context, now, length, steps)
+                if more.found is now.found and ahead:
+                    continue
+                searched.add(_names(now))
+                if _names(more) in searched:  # nothing new, or one law in the place of another and back
+                    steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
+                    more = _backward(context, now)
+                    if more.found is now.found:
+                        return _Searched(now, state, steps)
+        except TimeUp:
+            context.say("the time is up: the search is not finished")
+            return _Searched(now, state, steps, complete=False)
         try:
             now, state = more, extend(context, more, length) if more.found else None
         except FitError as error:
             context.say(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
-            return now, state, steps
+            return _Searched(now, state, steps)
         if _names(now) in searched:
-            return now, state, steps
+            return _Searched(now, state, steps)
         ahead = [longest]
 
 
@@ -230,12 +246,16 @@ def close_the_loop(
     key: PRNGKeyArray,
     effort: Effort = EFFORT,
     say: Say = lambda text: None,
+    seconds: float = math.inf,
 ) -> Closed:
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
 
     Where readings do not carry white noise, as on real machines, external disturbances are left out before.
+    After `seconds` [s] no new round or refit begins, and the outcome is what was accepted until then, not `complete`;
+    the first fit, and that of an accepted law over the whole length, are always done.
     Raises FitError when no sequence can be followed.
     """
+    end = time.monotonic() + seconds
     data = jax.device_put(data)
     stages: Stages = {}
 
@@ -254,9 +274,9 @@ def close_the_loop(
         say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
     if white_readings(data):
-        return search(SearchContext(before, stages, data, MultiStep(), effort, say), white=True)
+        return search(SearchContext(before, stages, data, MultiStep(), effort, say, until=end), white=True)
     before, data, touches, pieces = disturbance_free(identified, before, data)
     if touches:
         say(f"{len(touches)} external disturbances: their rows are left out")
-    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces), white=False)
+    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces, end), white=False)
     return closed._replace(interventions=touches, pieces=pieces)

@@ -66,7 +66,8 @@ def write_diagnosis(
     disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
     failed = sum(t.p_value < 0.01 and not t.slight for t in told["before"])
     document = shared(closed.before, train, test, seed=seed, began=began) | {
-        "verdict": verdict(found, error, failed, rivals, suspects),
+        "verdict": verdict(found, error, failed, rivals, suspects, closed.complete),
+        "complete": closed.complete,
         "effects": [entry(f) for f in found],
         "interventions": [_touch(touch, train.files) for touch in closed.interventions],
         "error": error,
@@ -187,6 +188,7 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
         "screened": [_told(*each) for each in step.screened[:10]],
         "refitted": [_told(*each) for each in step.refitted],
         "accepted": words(step.accepted) if step.accepted else None,
+        "untried": step.untried,
     }
 
 

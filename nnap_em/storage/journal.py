@@ -5,7 +5,8 @@
 
 A step is a function that gives the same for the same arguments, and a file holds the outcome of one call.  It is found
 again by a digest of all that the function was given: a resumed run computes what is not there, and a step whose
-arguments differ in one bit is computed anew.  Outside `keeping` nothing of this happens.
+arguments differ in one bit is computed anew.  Outside `keeping` nothing of this happens.  After a deadline
+(`deadline.py`) no new step begins.
 """
 
 import contextlib
@@ -24,6 +25,7 @@ import numpy as np
 
 from .. import __version__
 from ..numerics.parallel import everywhere
+from .deadline import in_time
 from .files import Kind, read_arrays, refuse, sweep, write_arrays
 from .leaves import describe, is_key, name_of, plain, restore
 
@@ -42,6 +44,8 @@ class Journal:
 
     def __init__(self, folder: Path, of: Mapping[str, Any]):
         self.folder = folder
+        self.open = False
+        """True for a computation that was not finished in its time, and is to be continued."""
         self.of = json.loads(json.dumps(dict(of)))
         self.by = {"nnap_em": __version__, "jax": jax.__version__}
 
@@ -116,11 +120,13 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
         def remembered(*args, **options):
             journal = _journal.get()
             if journal is None:
+                in_time()
                 return function(*args, **options)
             name = f"{name_of(function)}-{digest(name_of(function), args, options)[:32]}"
             outcome = journal.find(name, form(*args, **options))
             if everywhere(outcome is not None):
                 return outcome
+            in_time()
             outcome = function(*args, **options)
             journal.keep(name, outcome)
             return outcome

@@ -16,6 +16,7 @@ from ..data.servo import TORQUE
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
+from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
@@ -71,7 +72,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
     rows = min(data.valid.shape[1], round(SECONDS / rig.dt) + 1)
     head = Dataset(*(part[:SEQUENCES, :rows] for part in horizon(data, rows)))
-    along = Along(*(np.asarray(part) for part in _along(model, problem.smoother, head)))
+    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
     return [
         *amount,
         *_sampling(rig, along, scales),
@@ -82,18 +83,13 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     ]
 
 
-@eqx.filter_jit
-def _along(model: StateSpaceModel, smoother: AbstractSmoother, data: Dataset) -> tuple[Array, ...]:
-    """The parts of Along."""
-    still = jnp.zeros(len(model.system.coordinates))
-
-    def one(seq: Dataset) -> tuple[Array, ...]:
-        prepared = prepare(model, seq)
-        x, u = smoother(model, prepared, key=jax.random.key(0)).state.mean, prepared.inputs
-        slopes = (model.transition, model.emission, lambda x, u: model.rate(x, u, still))
-        return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
-
-    return jax.vmap(one)(data)
+def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:
+    """The parts of Along of one sequence."""
+    model, smoother = common
+    prepared, still = prepare(model, seq), jnp.zeros(len(model.system.coordinates))
+    x, u = smoother(model, prepared, key=jax.random.key(0)).state.mean, prepared.inputs
+    slopes = (model.transition, model.emission, lambda x, u: model.rate(x, u, still))
+    return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
 
 
 def _mark(look: object, bad: object = False) -> str:

@@ -16,7 +16,7 @@ from nnap_em.em import identify, loop, multistep, stated
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import ScoringMStep
-from nnap_em.em.multistep import Forks
+from nnap_em.em.multistep import Followed, Forks
 from nnap_em.numerics.gaussian import Gaussian
 
 MODEL, RULE = slide()
@@ -30,6 +30,11 @@ def _heavy(mass: float):
 
 def _mass(model) -> float:
     return float(model.system.m)
+
+
+def _followed(model, *_) -> Followed:
+    """`model` along no path."""
+    return Followed(model, *(5 * [None]))
 
 
 def _state(top, stride: float = 0.6, **changes) -> EMState:
@@ -144,11 +149,12 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
     size = lambda model: 0.01 + abs(float(RULE.prior.read(model)[0]) - 0.5)  # noqa: E731
     many = lambda model: np.full((4, 3, 2, 1), size(model))  # noqa: E731
     one = lambda model: np.ones((4, 3, 2, 1, RULE.weights(model).nodes.size + 1))  # noqa: E731
-    monkeypatch.setattr(multistep, "forks", lambda model, *_: Forks(many(model), one(model), np.ones(2)))
-    monkeypatch.setattr(multistep, "errors", lambda model, *_: many(model))
+    monkeypatch.setattr(multistep, "followed", _followed)
+    monkeypatch.setattr(multistep, "forks", lambda along, *_: Forks(many(along.model), one(along.model), np.ones(2)))
+    monkeypatch.setattr(multistep, "errors", lambda along, *_: many(along.model))
     monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
     begun = RULE.prior.write(MODEL, jnp.zeros(1))
-    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool))
+    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool)).model
     assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
 
 
@@ -161,11 +167,12 @@ def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
         return np.broadcast_to(scale[:, None], (4, 3, len(horizons), 1))
 
     one = np.ones((4, 3, 2, 1, RULE.weights(MODEL).nodes.size + 1))
-    monkeypatch.setattr(multistep, "forks", lambda model, *_: Forks(many(model, (0, 0)), one, np.ones(2)))
-    monkeypatch.setattr(multistep, "errors", lambda model, *given: many(model, given[3]))
+    monkeypatch.setattr(multistep, "followed", _followed)
+    monkeypatch.setattr(multistep, "forks", lambda along, *_: Forks(many(along.model, (0, 0)), one, np.ones(2)))
+    monkeypatch.setattr(multistep, "errors", lambda along, horizons: many(along.model, horizons))
     monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
     begun = RULE.prior.write(MODEL, jnp.zeros(1))
-    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool))
+    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool)).model
     assert float(RULE.prior.read(done)[0]) == 0.0
 
 
@@ -174,6 +181,7 @@ def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(mo
     nodes, asked = RULE.weights(MODEL).nodes.size, []
     columns = np.ones((4, 3, 2, 1, nodes + 1))
     told = Forks(np.ones((4, 3, 2, 1)), columns, np.ones(2))
+    monkeypatch.setattr(multistep, "followed", _followed)
     monkeypatch.setattr(multistep, "forks", lambda *_: told)
     monkeypatch.setattr(multistep, "errors", lambda *_: told.error)
     monkeypatch.setattr(
@@ -204,6 +212,7 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
         50,
     )
     monkeypatch.setattr(stated, "unsaid", lambda *_, **__: None)
+    monkeypatch.setattr(stated, "followed", lambda *_: None)
     monkeypatch.setattr(stated, "forks", lambda *_: told)
     monkeypatch.setattr(stated, "size", lambda *_: force)
     hessian = jnp.full((1, 1), 1.0 + likelihood)
@@ -264,14 +273,15 @@ def _finished(monkeypatch, error):
 
     def finish(model, m_step, path, data, mask, shaped):
         masks.append(mask)
-        return _heavy(10.0 + len(masks))
+        return _followed(_heavy(10.0 + len(masks)))
 
-    def errors(model, *_):
-        place = round(_mass(model)) - 11
+    def errors(along, *_):
+        place = round(_mass(along.model)) - 11
         each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
     fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
+    fakes["followed"] = _followed
     fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
     for name, value in fakes.items():

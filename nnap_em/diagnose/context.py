@@ -14,7 +14,7 @@ from ..data.dataset import Dataset, horizon
 from ..em.identify import Identified
 from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
 from ..em.mstep import kept
-from ..em.multistep import JUDGED, errors, ratio
+from ..em.multistep import JUDGED, errors, followed, ratio
 from ..model.state_space import StateSpaceModel
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss
@@ -147,7 +147,7 @@ def _predicting(context: SearchContext, now: Hypothesis, state: EMState) -> EMSt
     (a, one), (b, other) = (smooth(context, each, context.longest) for each in (now, reached))
     if not (one & other).any():
         return state
-    before, after = (errors(f.model, f.m_step.prior, f.path, context.data, JUDGED) for f in (a, b))
+    before, after = (errors(followed(f.model, f.m_step.prior, f.path, context.data), JUDGED) for f in (a, b))
     if ratio(before, after, one & other) <= 1:
         return state
     begun = start_state(now.model, now.m_step, key=state.key)._replace(epoch=1)

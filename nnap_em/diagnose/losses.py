@@ -6,7 +6,7 @@ screen of `screen.py` works.
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -17,7 +17,20 @@ from jaxtyping import Array, Float, Int
 from ..data.dataset import Dataset
 from ..effects import Candidate
 from ..em.local import locals_along
-from ..em.multistep import HORIZONS, JUDGED, SOON, errors, finish, forks, ratio, read_columns, starts, weighed
+from ..em.multistep import (
+    HORIZONS,
+    JUDGED,
+    SOON,
+    Followed,
+    errors,
+    finish,
+    followed,
+    forks,
+    ratio,
+    read_columns,
+    starts,
+    weighed,
+)
 from ..em.quadratic import friction_columns, whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.parallel import each, turns
@@ -66,8 +79,8 @@ class AbstractLoss(eqx.Module):
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
     @abstractmethod
-    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
-        """Model of a `trial` after what its fit by likelihood leaves to do."""
+    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+        """A `trial` after what its fit by likelihood leaves to do."""
 
     @abstractmethod
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
@@ -100,7 +113,12 @@ class MultiStep(AbstractLoss):
         track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
         along = candidate_columns(_machine(fit), candidates)
         every = tuple(sorted(set(sum(self.bands, ()))))
-        found = forks(model, weights, path, data, lambda some: along(jax.tree.map(lambda a: a[some], track)), every)
+        found = forks(
+            followed(model, weights.prior, path, data),
+            weights,
+            lambda some: along(jax.tree.map(lambda a: a[some], track)),
+            every,
+        )
         rows, weight = starts(model, data, every), weighed(found, fit.used)
         bands = [[every.index(h) for h in band] for band in self.bands]
         return tuple(
@@ -114,13 +132,14 @@ class MultiStep(AbstractLoss):
             for band in bands
         )
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
-        """Model after Gauss-Newton steps on the multi-step errors."""
-        return finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
+    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+        """The trial after Gauss-Newton steps on the multi-step errors."""
+        along = finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
+        return trial._replace(model=along.model, along=along)
 
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
         """Ratio of robust squares, each fit along its own smoothed paths."""
-        before, after = (errors(t.model, t.m_step.prior, t.path, fit.data, self.judged[band]) for t in (null, full))
+        before, after = (errors(cast(Followed, t.along), self.judged[band]) for t in (null, full))
         return ratio(before, after, fit.used)
 
 
@@ -150,9 +169,9 @@ class OneStep(AbstractLoss):
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> StateSpaceModel:
-        """Model as it is: likelihood leaves nothing to do."""
-        return trial.model
+    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+        """The trial as it is: likelihood leaves nothing to do."""
+        return trial
 
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
         """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..em.local import locals_along
 from ..em.mstep import Core, ScoringMStep, between
+from ..em.multistep import Followed
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
@@ -36,6 +37,8 @@ class Trial(NamedTuple):
     loglik: Float[np.ndarray, " seq"]
     hessian: Float[Array, "weight weight"]
     """Posterior precision of network weights and parameters."""
+    along: Followed | None = None
+    """The model along its paths, where multi-step errors finished it."""
 
 
 def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:

@@ -56,8 +56,8 @@ class Refit(NamedTuple):
 def fitted(now: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
     """`now` after some passes from a path, finished before and after on what the loss looks at."""
     begun = Trial(now.model, now.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
-    trial = refit(loss.finish(fit, begun), now.m_step.early(), path, fit.data, fit.used, passes=passes)
-    return trial._replace(model=loss.finish(fit, trial))
+    begun = loss.finish(fit, begun)
+    return loss.finish(fit, refit(begun.model, now.m_step.early(), path, fit.data, fit.used, passes=passes))
 
 
 def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:

@@ -20,7 +20,7 @@ from ..smoother.start import StartBank
 from .build import build, build_system
 from .loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
 from .mstep import ScoringMStep, kept
-from .multistep import FALLS, JUDGED, errors, finish, ratio
+from .multistep import FALLS, JUDGED, errors, finish, followed, ratio
 from .noise import white_readings
 from .scale import holding, untold
 from .stated import widened
@@ -138,12 +138,12 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     if used.sum() < PARTS:
         return fitted
     part = np.where(used, np.cumsum(used) % PARTS, -1)
-    before, falls = errors(fitted.model, fitted.m_step.prior, path, data, JUDGED), []
+    before, falls = errors(followed(fitted.model, fitted.m_step.prior, path, data), JUDGED), []
     for out in range(PARTS):
         trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out), shaped=True)
-        falls.append(ratio(before, errors(trial, fitted.m_step.prior, path, data, JUDGED), part == out))
+        falls.append(ratio(before, errors(trial, JUDGED), part == out))
     if np.mean(falls) < 1 - FALLS:
-        model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True)
+        model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))

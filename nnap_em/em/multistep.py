@@ -88,45 +88,52 @@ def channels(model: StateSpaceModel) -> tuple[int, ...]:
     return tuple(i for i, s in enumerate(model.measured) if s not in rates) or tuple(range(len(model.measured)))
 
 
+class Followed(NamedTuple):
+    """A model along smoothed paths, and the filter about them: what its multi-step errors begin from."""
+
+    model: StateSpaceModel
+    data: Dataset
+    here: Local
+    middle: Float[Array, "seq time state"]
+    """States halfway between a path and its next state by the model."""
+    state: Float[Array, "seq time state"]
+    """Filtered means."""
+    gain: Float[Array, "seq time obs state"]
+
+
+def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Followed:
+    """`model` along the paths of all sequences."""
+    here, exact = _wide(model, prior, path, data)
+    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
+    return Followed(model, data, here, 0.5 * (path.mean + exact), state, gain)
+
+
 def forks(
-    model: StateSpaceModel,
+    along: Followed,
     weights: Weights,
-    path: Gaussian,
-    data: Dataset,
     extra: Callable[[Int[np.ndarray, " some"]], Columns] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
 ) -> Forks:
-    """Multi-step errors of `model` on all sequences along their smoothed paths; `extra` returns more columns of
-    some.
-    """
-    grid = _grid(model, data, horizons)
-    here, exact = _wide(model, weights.prior, path, data)
-    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
-    error = np.array(each(_errors, (model, grid), (state, here.seq)))
-    rows, dof = path.mean.shape[1], len(model.system.coordinates)
+    """Multi-step errors of all sequences and their derivatives; `extra` returns more columns of some."""
+    (rows, obs), dof = along.data.y.shape[1:], len(along.model.system.coordinates)
+    grid = _grid(along.model, along.data, horizons)
 
     def none(some) -> Columns:
-        return Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, data.y.shape[-1])))
+        return Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
 
-    middle, columns, see = 0.5 * (path.mean + exact), [], channels(model)
-    for some, part in turns(len(error), here, gain, middle):  # columns of all would be gigabytes at six joints
+    columns, see = [], channels(along.model)
+    for some, part in turns(len(along.state), along.here, along.gain, along.middle):  # all would be gigabytes
         sens = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(some)), together=1)
         columns.append(np.asarray(sens)[..., see, :])
     overlap = np.asarray(grid.ages) / grid.stride
-    return Forks(error[..., see], np.concatenate(columns)[: len(error)], overlap)
+    return Forks(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
 
 
-def errors(
-    model: StateSpaceModel,
-    prior: ParameterPrior,
-    path: Gaussian,
-    data: Dataset,
-    horizons: tuple[float, ...] = HORIZONS,
-) -> Float[np.ndarray, "seq start horizon obs"]:
-    """The errors alone."""
-    here, _ = _wide(model, prior, path, data)
-    state, _ = each(_filtered, (model.log_q, model.log_r, model.start), here)
-    return np.asarray(each(_errors, (model, _grid(model, data, horizons)), (state, here.seq)))[..., channels(model)]
+def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
+    """The errors alone [rad, or m]; NaN where there is none."""
+    grid = _grid(along.model, along.data, horizons)
+    found = each(_errors, (along.model, grid), (along.state, along.here.seq))
+    return np.asarray(found)[..., channels(along.model)]
 
 
 def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
@@ -285,17 +292,19 @@ def finish(
     used: Bool[np.ndarray, " seq"],
     *,
     shaped: bool = False,
-) -> StateSpaceModel:
+) -> Followed:
     """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until it predicts
     better over all horizons at which a model is judged.
 
     Friction, parameters and effects move, where it is `shaped` friction under the prior of its shape; noise and start
     stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
     """
-    here = errors(model, m_step.prior, path, data, JUDGED)
+    best = followed(model, m_step.prior, path, data)
+    here = errors(best, JUDGED)
     for _ in range(STEPS):
+        model = best.model
         weights = m_step.weights(model)
-        now = forks(model, weights, path, data)
+        now = forks(best, weights)
         weight = weighed(now, used)
         keep = weight > 0
         jac, e, w = now.columns[keep].astype(float), now.error[keep], weight[keep]
@@ -307,14 +316,14 @@ def finish(
             score = score.at[nodes].add(-pull[nodes])
         goal = _goal(weights, model.unknown, start, score, information)
         for share in (1.0, 0.5, 0.25):
-            trial = weights.write(model, start + share * (goal - start))
-            there = errors(trial, m_step.prior, path, data, JUDGED)
+            trial = followed(weights.write(model, start + share * (goal - start)), m_step.prior, path, data)
+            there = errors(trial, JUDGED)
             if ratio(here, there, used) < 1 - FALLS:
-                model, here = trial, there
+                best, here = trial, there
                 break
         else:
             break
-    return model
+    return best
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
 from .local import locals_along
 from .mstep import ScoringMStep
-from .multistep import Columns, Forks, forks, read_columns, weighed
+from .multistep import Columns, Forks, followed, forks, read_columns, weighed
 from .quadratic import friction_columns
 from .weights import Weights
 
@@ -75,7 +75,8 @@ def widened(
     """
     weights = m_step.weights(model)
     other = unsaid(model, weights, path, data, used, key=key)
-    now = forks(model, weights, path, data, lambda some: jax.tree.map(lambda a: a[some], other))
+    along = followed(model, m_step.prior, path, data)
+    now = forks(along, weights, lambda some: jax.tree.map(lambda a: a[some], other))
     prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
     here, scores = _rows(now, weighed(now, used), len(jac))
     own = here.own @ jac

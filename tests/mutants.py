@@ -530,11 +530,11 @@ MUTANTS = (
         "test_forks.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone",
     ),
     Mutant(
-        "all readings must be white",
+        "one white coordinate is enough",
         "em/noise.py",
-        "return min((third_differences",
-        "return max((third_differences",
-        "test_forks.py::test_one_white_reading_is_enough",
+        "return max(coordinates or",
+        "return min(coordinates or",
+        "test_forks.py::test_all_measured_coordinates_must_be_white_or_where_none_is_measured_one_reading",
     ),
     Mutant(
         "second differences for third",
@@ -995,15 +995,15 @@ MUTANTS = (
     Mutant(
         "one-step errors decide where innovations are not white",
         "diagnose/search.py",
-        "white = white_innovations(_outcome(context.before, now, state), context.data)",
+        "white = white_innovations(_outcome(context.before, found.now, found.state), context.data)",
         "white = True",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
     Mutant(
         "external disturbances sought in white noise",
         "diagnose/search.py",
-        "    if white_readings(data):\n        return search(",
-        "    if not white_readings(data):\n        return search(",
+        "    if white_readings(data, before.model):\n        return search(",
+        "    if not white_readings(data, before.model):\n        return search(",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
     Mutant(

@@ -280,7 +280,7 @@ def _finished(monkeypatch, error):
         each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
-    fakes = {"white_readings": lambda data: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
+    fakes = {"white_readings": lambda *_: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
     fakes["followed"] = _followed
     fakes["e_step"] = lambda *_, **__: SimpleNamespace(state=PATH)
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)

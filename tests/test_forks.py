@@ -18,6 +18,7 @@ from nnap_em.em.multistep import Forks, errors, finish, followed, forks, grid_of
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.shape import friction_prior
+from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 
@@ -203,14 +204,27 @@ def test_a_ratio_of_errors_is_that_of_the_sequences_used():
     assert ratio(gone, ran, used) == pytest.approx(0.25)  # what was not read says nothing
 
 
-def test_one_white_reading_is_enough():
+@pytest.mark.parametrize(
+    ("measured", "enough"),
+    [((0, 1), "one one"), ((0, 2), "one paired"), ((0, 2), "one one"), ((2, 3), "paired one"), ((2, 3), "one paired")],
+)
+def test_all_measured_coordinates_must_be_white_or_where_none_is_measured_one_reading(measured, enough):
+    """Of a system of two coordinates: places 0 and 1 of what can be read are coordinates, 2 and 3 rates."""
     rng = np.random.default_rng(3)
     motion, white = np.sin(np.linspace(0, 20, 2000))[None], rng.normal(size=(1, 2000))
     one, paired = motion + 0.01 * white, motion + 0.005 * (white + np.roll(white, 1))
     valid = np.ones((1, 2000), bool)
-    data = lambda *y: Dataset(0.0 * motion, motion[..., None], np.stack(y, axis=-1), valid)  # noqa: E731
-    assert white_readings(data(one, paired)) and white_readings(data(paired, one))
-    assert not white_readings(data(paired, paired)) and not white_readings(data(motion, paired))
+    readings = {"one": one, "paired": paired}
+    model = replace(paper_model(), measured=measured)
+
+    def seen(*names: str) -> bool:
+        y = np.stack([readings[name] for name in names], axis=-1)
+        return white_readings(Dataset(0.0 * motion, motion[..., None], y, valid), model)
+
+    assert seen(*enough.split())
+    assert not seen("paired", "paired")
+    assert seen("one", "paired") == (0 not in measured or 1 not in measured)
+    assert seen("paired", "one") == (0 not in measured)
 
 
 def test_white_noise_is_told_from_a_filtered_sensor():

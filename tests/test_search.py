@@ -1,6 +1,7 @@
 """Decisions of the search on numbers: laws that enter a model or leave it, and the loss that decides."""
 
 import dataclasses
+import time
 
 import equinox as eqx
 import jax
@@ -31,6 +32,8 @@ from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
 from nnap_em.model.state_space import with_effects
+from nnap_em.storage.deadline import TimeUp, until
+from nnap_em.storage.journal import HERE, step
 
 MODEL, RULE = slide()
 BARE = Hypothesis(MODEL, RULE)
@@ -193,6 +196,7 @@ def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypat
     smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
     monkeypatch.setattr(context_of, "fit", fit)
     monkeypatch.setattr(context_of, "smooth", lambda *_: (smoothed, np.ones(6, bool)))
+    monkeypatch.setattr(context_of, "followed", lambda *_: None)
     monkeypatch.setattr(context_of, "errors", lambda *_: None)
     monkeypatch.setattr(context_of, "ratio", lambda *_: worse)
     assert context_of.extend(_context(loss), _with("motor_gain"), 9).top[0] == kept
@@ -255,8 +259,8 @@ def _rounds(monkeypatch, *laws):
 def test_laws_are_added_until_none_is_accepted(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.4, "air_drag": 0.3})
     _rounds(monkeypatch, _law("motor_gain", 0.5), _law("air_drag", 0.5))
-    now, state, steps = search._search(_context(), BARE, None, [9])
-    assert _names(now.model) == ["motor_gain", "air_drag"] and state is not None
+    now, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert _names(now.model) == ["motor_gain", "air_drag"] and state is not None and complete
     assert [step.accepted is not None for step in steps] == [True, True, False]
     found = now.found[0]
     assert (found.gain, found.removed, found.share) == (80.0, 0.5, 0.4) and np.isnan(found.held_out)
@@ -266,8 +270,39 @@ def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
     """Accepted in every round, and needless in every backward pass."""
     _pretend(monkeypatch, {"motor_gain": 0.01})
     _rounds(monkeypatch, _law("motor_gain", 0.5), None, _law("motor_gain", 0.5), None)
-    now, state, steps = search._search(_context(), BARE, None, [9])
-    assert now.found == () and state is None and len(steps) == 2
+    now, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert now.found == () and state is None and len(steps) == 2 and complete
+
+
+@pytest.mark.parametrize("left", [0, 3])
+def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, left):
+    """In the second round: before its screen, or with candidates left that were not refitted."""
+    _pretend(monkeypatch, {"motor_gain": 0.4})
+    _rounds(monkeypatch, _law("motor_gain", 0.5))
+    rounds = search.screening_round
+
+    def late(fit, context):
+        if not fit.now.found:
+            return rounds(fit, context)
+        if not left:
+            raise TimeUp
+        return Round(Step(9, (), (), None, 400, untried=left), None, None)
+
+    monkeypatch.setattr(search, "screening_round", late)
+    now, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert _names(now.model) == ["motor_gain"] and state is not None and not complete
+    assert [step.untried for step in steps] == ([0, left] if left else [0])
+
+
+def test_no_step_begins_after_the_deadline():
+    count = []
+    toy = step(lambda: HERE)(lambda: count.append(1) or np.zeros(1))
+    with until(time.monotonic() + 3600):
+        toy()
+    with until(time.monotonic() - 1), pytest.raises(TimeUp):
+        toy()
+    toy()
+    assert len(count) == 2
 
 
 @pytest.mark.parametrize(
@@ -310,7 +345,8 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     def run(context, now, state, lengths):
         ran.append(type(context.loss))
         one_step = isinstance(context.loss, OneStep)
-        return (_with("motor_gain"), _emstate(MODEL, 1.0), []) if one_step else (now, state, [])
+        laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (now, state)
+        return search._Searched(*laws, [])
 
     def white_innovations(fitted, data):
         assert fitted.m_step is not RULE  # of the outcome: what is missing colours those of the declared model
@@ -323,7 +359,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "identify", lambda *_, **__: _context().before)
     monkeypatch.setattr(search, "_search", run)
     monkeypatch.setattr(search, "quantised", lambda context, now: (now, None))
-    monkeypatch.setattr(search, "white_readings", lambda data: white or bool(cut))
+    monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     monkeypatch.setattr(search, "apart", lambda closed, data: closed)

@@ -273,7 +273,7 @@ def close_the_loop(
     if len(data.t) < 2:
         say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
-    if white_readings(data):
+    if white_readings(data, before.model):
         return search(SearchContext(before, stages, data, MultiStep(), effort, say, until=end), white=True)
     before, data, touches, pieces = disturbance_free(identified, before, data)
     if touches:

@@ -131,7 +131,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     curvature is its precision.
     """
     data = jax.device_put(data)
-    if white_readings(data):
+    if white_readings(data, fitted.model):
         return fitted
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))

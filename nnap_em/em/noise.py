@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..data.dataset import Dataset
+from ..model.state_space import StateSpaceModel
 
 READINGS = -0.55
 """Lag-1 correlation of third differences below which readings are white noise at the sampling: that has -.75, a
@@ -20,7 +21,13 @@ def third_differences(y) -> float:
     return float(np.sum((d[:, 1:] * d[:, :-1])[both]) / np.sum((d[:, 1:] ** 2)[both]))
 
 
-def white_readings(data: Dataset) -> bool:
-    """True where some reading carries white noise that is sampled as it is."""
-    y = np.asarray(data.y)
-    return min((third_differences(y[..., i]) for i in range(y.shape[-1])), default=0.0) < READINGS
+def white_readings(data: Dataset, model: StateSpaceModel) -> bool:
+    """True where the readings of all measured coordinates carry white noise that is sampled as it is.
+
+    Where no coordinate is measured, one other reading is enough.  Rates and accelerations are no evidence against it:
+    they may change within a sample.
+    """
+    lags = [third_differences(y) for y in np.moveaxis(np.asarray(data.y), -1, 0)]
+    dof = len(model.system.coordinates)
+    coordinates = [lag for lag, place in zip(lags, model.measured, strict=True) if place < dof]
+    return max(coordinates or [min(lags, default=0.0)]) < READINGS

@@ -47,13 +47,17 @@ def logs(seed: int, *, mass: float = 0.0, at: tuple[float, float] = (0.0, 0.0), 
     return Dataset(np.tile(t, (SEQUENCES, 1)), u[..., None], y, np.ones((SEQUENCES, ROWS), bool))
 
 
-def rig(folder: Path) -> Rig:
-    """The rod as its file declares it, without what `logs` adds."""
+def rig(folder: Path, *, pendulum: bool = False) -> Rig:
+    """The rod as its file declares it, without what `logs` adds; as a `pendulum` its programs are compiled sooner."""
     (folder / "rod.xml").write_text(FILE)
+    joint, model, inputs = "hinge", 'type = "mjcf"\nfile = "rod.xml"', ""
+    if pendulum:
+        joint, inputs = "theta1", '[input]\ncolumns = ["tau"]\njoints = [1]\n'
+        model = f'type = "pendulum"\nm = {MASS}\nlc = {LENGTH}\nI = {INERTIA}\ng = {GRAVITY}'
     (folder / "rig.toml").write_text(
-        'format = 1\nname = "rod"\n[model]\ntype = "mjcf"\nfile = "rod.xml"\nfriction = "unknown"\n'
+        f'format = 1\nname = "rod"\n[model]\n{model}\nfriction = "unknown"\n{inputs}'
         f'[sampling]\ndt = {DT}\ninput_hold = "zero-order"\nclock = "sequence"\n'
-        '[measurement]\ncolumns = ["hinge", "dhinge"]\n'
-        f"[measurement.noise_std]\nhinge = {NOISE[0]}\ndhinge = {NOISE[1]}\n"
+        f'[measurement]\ncolumns = ["{joint}", "d{joint}"]\n'
+        f"[measurement.noise_std]\n{joint} = {NOISE[0]}\nd{joint} = {NOISE[1]}\n"
     )
     return read_rig(folder / "rig.toml", specs)

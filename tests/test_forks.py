@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
+from nnap_em.diagnose import columns as columns_of
 from nnap_em.diagnose.columns import candidate_columns, tracks
 from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.losses import MultiStep
 from nnap_em.diagnose.propose import proposals, surroundings
 from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
@@ -89,7 +91,7 @@ def test_columns_are_difference_quotients(question, known, name):
     candidates = _candidates(question, name)
     inputs = jax.vmap(known.model.inputs)(known.data)
     extra = candidate_columns(known.model, candidates)(tracks(known.model, known.path, inputs))
-    some = lambda index: jax.tree.map(lambda a: a[index], extra)  # noqa: E731
+    some = lambda index: [jax.tree.map(lambda a: a[index], extra)]  # noqa: E731
     along = followed(known.model, known.m_step.prior, known.path, known.data)
     before = forks(along, known.m_step.weights(known.model), some)
     start, probe = candidates[0].start, candidates[0].probes[0]
@@ -99,6 +101,19 @@ def test_columns_are_difference_quotients(question, known, name):
     column = before.columns[..., -len(candidates[0].probes)]
     # the force is held over a step, the slopes are as wide as predictions err: 2 % at most with this key
     assert np.linalg.norm(column - quotient) < 0.05 * np.linalg.norm(quotient)
+
+
+def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
+    """Blocks of at most 40 columns, of which the last is filled up, and groups of one stack; in single precision."""
+    _, q = question
+    candidates = _candidates(question, "torsional_spring") + _candidates(question, "cogging")
+    whole = MultiStep().linearise(q, candidates)
+    assert sum(len(c.probes) for c in candidates) % 40
+    monkeypatch.setattr(columns_of, "BLOCK", 40)
+    parts = MultiStep().linearise(q, candidates)
+    for one, other in zip(parts, whole, strict=True):
+        assert one.columns.shape == other.columns.shape
+        np.testing.assert_allclose(one.columns, other.columns, rtol=1e-4, atol=1e-5 * np.abs(other.columns).max())
 
 
 def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):

@@ -1,7 +1,6 @@
 """Columns of candidates along the smoothed motion: force and reading of each of their probes."""
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -91,6 +90,9 @@ def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
     return numbers._replace(system=base.system, map=base.unknown)
 
 
+BLOCK = 1024
+"""Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm; machines of two joints
+have fewer in all."""
 BUNCH = 4
 """Stacks are filled up to a multiple of this, so that one more probe is no other program."""
 
@@ -138,6 +140,19 @@ def _stack_columns(common, track: Track) -> list[Columns]:
     return [jax.vmap(one, in_axes=(axes,))(stack) for stack, axes in stacks]
 
 
+def _groups(stacks: Sequence[Stack]) -> list[list[Stack]]:
+    """Stacks whose columns one program computes: those of a class, as far as they are no more than BLOCK columns."""
+    groups: list[list[Stack]] = []
+    for stack in stacks:
+        last = groups[-1] if groups else []
+        same = bool(last) and type(last[0].probes) is type(stack.probes)
+        if same and sum(len(other.places) for other in last) + len(stack.places) <= BLOCK:
+            last.append(stack)
+        else:
+            groups.append([stack])
+    return groups
+
+
 def candidate_columns(
     base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0
 ) -> Callable[[Track], Columns]:
@@ -146,7 +161,7 @@ def candidate_columns(
     Tracks are padded to `rows`, so that horizons share the largest program.
     """
     stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
-    groups = [list(group) for _, group in itertools.groupby(stacks, key=lambda stack: type(stack.probes))]
+    groups = _groups(stacks)
     size = sum(len(stack.places) for stack in stacks)
 
     def along(track: Track) -> Columns:
@@ -161,6 +176,15 @@ def candidate_columns(
             for stack, found in zip(group, every, strict=True):
                 for whole, own in ((force, found.force), (reading, found.reading)):
                     whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
-        return Columns(jnp.asarray(force), jnp.asarray(reading))
+        return Columns(force, reading)
 
     return along
+
+
+def blocks(columns: Columns) -> Iterator[Columns]:
+    """The columns in equal blocks of at most BLOCK, of which the last is filled up with zeros."""
+    size = columns.force.shape[1]
+    width = -(-size // max(1, -(-size // BLOCK)))
+    for first in range(0, max(size, 1), max(width, 1)):
+        part = [np.asarray(a)[:, first : first + width] for a in columns]
+        yield Columns(*(np.pad(a, [(0, 0), (0, width - a.shape[1]), (0, 0), (0, 0)]) for a in part))

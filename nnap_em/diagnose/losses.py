@@ -35,7 +35,7 @@ from ..em.quadratic import friction_columns, whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.parallel import each, turns
 from ..smoother.kalman import CUBATURE, kalman_filter
-from .columns import candidate_columns, tracks
+from .columns import blocks, candidate_columns, tracks
 from .refit import Trial
 from .smoothed import SmoothedFit
 from .verdict import MULTI_STEP, ONE_STEP, Bars
@@ -116,15 +116,16 @@ class MultiStep(AbstractLoss):
         found = forks(
             followed(model, weights.prior, path, data),
             weights,
-            lambda some: along(jax.tree.map(lambda a: a[some], track)),
+            lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),
             every,
         )
+        size = len(weights.nodes.ravel()) + len(weights.prior.names) + sum(len(c.probes) for c in candidates)
         rows, weight = starts(model, data, every), weighed(found, fit.used)
         bands = [[every.index(h) for h in band] for band in self.bands]
         return tuple(
             Linearised(
                 _flat(found.error[:, :, band]),
-                _flat(found.columns[:, :, band], 1),
+                _flat(found.columns[:, :, band, :, :size], 1),
                 _flat(weight[:, :, band]),
                 float(np.mean(found.overlap[band])),
                 rows,

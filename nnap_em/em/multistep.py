@@ -5,7 +5,7 @@ filter up to the start and of the open loop from there on, so that the errors ar
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -43,9 +43,9 @@ HUBER = 2.0
 class Columns(NamedTuple):
     """Additions along a path."""
 
-    force: Float[Array, "*seq column time dof"]
+    force: Float[Array | np.ndarray, "*seq column time dof"]
     """Generalised force held over the step [N m]."""
-    reading: Float[Array, "*seq column time obs"]
+    reading: Float[Array | np.ndarray, "*seq column time obs"]
 
 
 class Grid(eqx.Module):
@@ -111,20 +111,27 @@ def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data
 def forks(
     along: Followed,
     weights: Weights,
-    extra: Callable[[Int[np.ndarray, " some"]], Columns] | None = None,
+    extra: Callable[[Int[np.ndarray, " some"]], Iterable[Columns]] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
 ) -> Forks:
-    """Multi-step errors of all sequences and their derivatives; `extra` returns more columns of some."""
+    """Multi-step errors of all sequences and their derivatives; `extra` returns blocks of more columns of some.
+
+    Columns of all sequences, or of all candidates at six joints, would be gigabytes.
+    """
     (rows, obs), dof = along.data.y.shape[1:], len(along.model.system.coordinates)
     grid = _grid(along.model, along.data, horizons)
 
-    def none(some) -> Columns:
-        return Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
+    def none(some) -> Iterable[Columns]:
+        yield Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
 
     columns, see = [], channels(along.model)
-    for some, part in turns(len(along.state), along.here, along.gain, along.middle):  # all would be gigabytes
-        sens = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(some)), together=1)
-        columns.append(np.asarray(sens)[..., see, :])
+    for some, part in turns(len(along.state), along.here, along.gain, along.middle):
+        found: list[np.ndarray] = []
+        for block in (extra or none)(some):
+            sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]
+            own = sens.shape[-1] - block.force.shape[1]
+            found.append(sens[..., own if found else 0 :])  # those of what is estimated once
+        columns.append(np.concatenate(found, axis=-1))
     overlap = np.asarray(grid.ages) / grid.stride
     return Forks(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
 

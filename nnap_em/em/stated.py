@@ -76,7 +76,7 @@ def widened(
     weights = m_step.weights(model)
     other = unsaid(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
-    now = forks(along, weights, lambda some: jax.tree.map(lambda a: a[some], other))
+    now = forks(along, weights, lambda some: [jax.tree.map(lambda a: a[some], other)])
     prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
     here, scores = _rows(now, weighed(now, used), len(jac))
     own = here.own @ jac

@@ -3,9 +3,8 @@
 python benchmarks/memory.py [--cases lugre dahl bristle static] [--hidden] [--seeds 1]
 python benchmarks/memory.py --measured ../shared/data/measured
 
-The simulated machines and friction laws are NumPy here and share no code with the library: an acrobot with
-both joints driven by gravity and one input, LuGre [Canudas de Wit et al. 1995], Dahl [1968] and an elasto-plastic
-bristle [Dupont et al. 2002] at joint 1, static Stribeck friction at joint 2.
+The simulated acrobot and its friction laws are NumPy here and share no code with the library: at joint 1 LuGre [Canudas
+de Wit et al. 1995], Dahl [1968] or an elasto-plastic bristle [Dupont et al. 2002], at joint 2 static Stribeck friction.
 """
 
 import argparse

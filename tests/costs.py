@@ -17,6 +17,7 @@ SECONDS = {
     "test_machines.py": 80,
     "test_docs.py": 60,
     "test_calibration.py": 60,
+    "test_memory.py": 60,
     "test_written_back.py": 54,
     "test_measured.py": 50,
     "test_kalman.py": 50,

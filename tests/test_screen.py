@@ -11,11 +11,12 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.losses import OneStep
-from nnap_em.diagnose.propose import extended, proposals, seeded, surroundings
+from nnap_em.diagnose.propose import proposals, seeded, surroundings
 from nnap_em.diagnose.screen import overlaps, project, screen
 from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import catalogue
 from nnap_em.em.local import local
+from nnap_em.em.memory import extended
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.kalman import CUBATURE, kalman_filter

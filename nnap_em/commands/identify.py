@@ -27,7 +27,8 @@ def run(args: argparse.Namespace, say: Say) -> None:
     warn_of_torques(args.folder, bench)
     data, epochs = bench.train.data, []
     with resumable(args, bench, say):
-        watch, key = _watch(bench.rig, args.epochs, epochs, say), jax.random.key(args.seed)
+        most = args.epochs * (1 + bench.rig.memory)
+        watch, key = _watch(bench.rig, most, epochs, say), jax.random.key(args.seed)
         fitted = identify(bench.rig, data, key=key, smoother=smoother(args), epochs=args.epochs, watch=watch)
         for name in ("report.json", "report.html"):  # older ones are not of the model that is written now
             (args.out / name).unlink(missing_ok=True)

@@ -21,7 +21,7 @@ from .servo import lines as drive_lines
 from .servo import named as drive_numbers
 from .units import parameter_unit, quantities, with_names
 
-_FRICTION = {"unknown": True, "none": False}
+_FRICTION = ("unknown", "dynamic", "none")
 _CLOCKS = ("sequence", "session")
 _MEND = {  # how the line of a key or table should look
     "format": "format = 1",
@@ -35,7 +35,7 @@ _MEND = {  # how the line of a key or table should look
     "limits": "a table [limits] with lines such as u = 0.3 or theta1 = [-2.0, 2.0]",
     "rate": "a table [limits.rate] with lines such as u = 5.0 (N m/s)",
     "type": 'type = "acrobot"',
-    "friction": 'friction = "unknown" (to be learned) or friction = "none"',
+    "friction": 'friction = "unknown" (to be learned), friction = "dynamic" (with memory) or friction = "none"',
     "actuated_joint": "actuated_joint = 2 (or a table [input] with columns and joints)",
     "columns": 'a list of different names, columns = ["theta1", "dtheta1"]',
     "joints": "a list of different joints, one per column, joints = [1, 2]",
@@ -101,7 +101,7 @@ class Rig:
     name: str
     system: str
     parameters: Mapping[str, Declared]
-    friction: bool  # True: a static map velocity -> torque in each joint, to be learned
+    friction: bool  # True: a map velocity -> torque in each joint, to be learned
     input_columns: tuple[str, ...]  # N m
     input_joints: tuple[int, ...]  # counted from 1
     dt: float  # s
@@ -112,6 +112,7 @@ class Rig:
     limits: Bounds = UNBOUNDED  # of designed experiments; what is absent: as far as the logs went
     machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
     input_kinds: tuple[str, ...] = ()  # of `servo.KINDS`, one per column; none given: all are torques
+    memory: bool = False  # True: friction may have a hidden state in each joint
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -161,7 +162,7 @@ class Rig:
             f"inputs: {', '.join(inputs) or 'none'}",
             f"reads: {', '.join(reads)}",
             f"start: {quantities(self.start, self.unit) or 'from the readings'}",
-            f"friction: {'to be learned' if self.friction else 'none'}",
+            f"friction: {'to be learned' if self.friction else 'none'}{', with memory' if self.memory else ''}",
         ]
         return "\n  ".join(lines)
 
@@ -188,7 +189,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         name=root.text("name"),
         system=system,
         parameters=told.parameters,
-        friction=_FRICTION[model.choice("friction", _FRICTION)],
+        friction=model.choice("friction", _FRICTION) != "none",
         input_columns=told.input_columns,
         input_joints=told.input_joints,
         dt=sampling.positive("dt"),
@@ -199,6 +200,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         limits=read_bounds(root.table("limits", absent={}), told.input_columns, spec.states),
         machine=told.machine,
         input_kinds=told.input_kinds,
+        memory=model.text("friction") == "dynamic",
     )
 
 
@@ -208,7 +210,9 @@ def write_rig(rig: Rig, path: Path) -> None:
     told = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
     lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else told
-    lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
+    friction = "dynamic" if rig.memory else "unknown" if rig.friction else "none"
+    kind = "map with memory" if rig.memory else "static map velocity -> torque"
+    lines += [f'friction = "{friction}"    # {kind} in each joint']
     lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
     unit = "" if rig.input_kinds else "    # N m, or N on a slide"
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]

@@ -53,12 +53,12 @@ def _reported(effect: AbstractEffect):
     """The reported parameters, and how they move with the effect's own numbers."""
 
     def reported(numbers: Float[Array, " param"]) -> dict[str, Float[Array, ""]]:
-        return _filled(effect, numbers).values()
+        return filled(effect, numbers).values()
 
     return reported(flat(effect)), jax.jacfwd(reported)(flat(effect))
 
 
-def _filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> AbstractEffect:
+def filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> AbstractEffect:
     """The effect with other parameters."""
     old = [getattr(effect, name) for name in fields(effect)]
     parts = jnp.split(numbers, np.cumsum([np.size(part) for part in old])[:-1])

@@ -14,7 +14,6 @@ from ..effects import AbstractEffect, Around, Candidate, catalogue, free_form
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
-from ..numerics.ode import integrate
 from .keys import key_of
 
 
@@ -87,23 +86,3 @@ def seeded(candidate: Candidate, coefficients: Float[np.ndarray, " probe"]) -> A
         return jnp.asarray(start + far, start.dtype)
 
     return jax.tree.map(combine, candidate.start, *candidate.probes)
-
-
-@eqx.filter_jit
-def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
-    """`path` of the model without its last effect, with the memory that this effect would have along it."""
-    size, width = model.effects[-1].memory, path.mean.shape[-1]
-    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
-
-    def one(mean, cov, seq):
-        def step(m, slices):
-            x, u = slices
-            rest = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
-            return integrate(rest, m, model.dt, model.steps), m
-
-        _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
-        wide = jnp.zeros((mean.shape[0], width + size, width + size), cov.dtype)
-        wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
-        return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
-
-    return jax.vmap(one)(path.mean, path.cov, data) if size else path

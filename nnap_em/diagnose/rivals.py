@@ -10,12 +10,13 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
 from ..em.identify import Identified, finished
+from ..em.memory import extended
 from .context import EFFORT, SearchContext, extend, smooth
 from .hypothesis import Hypothesis
 from .keys import Key, key_of
 from .losses import OneStep
 from .outcome import Closed
-from .propose import extended, proposals, seeded, surroundings
+from .propose import proposals, seeded, surroundings
 from .refit import Trial, refit
 from .screen import screen
 from .smoothed import SmoothedFit

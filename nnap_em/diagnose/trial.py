@@ -6,12 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import AbstractEffect, Candidate, flat
+from ..em.memory import extended
 from ..numerics.gaussian import Gaussian
 from .findings import estimates
 from .hypothesis import Hypothesis, blocks
 from .keys import free_signals, replaced
 from .losses import AbstractLoss
-from .propose import extended, seeded
+from .propose import seeded
 from .refit import Trial, refit
 from .screen import Screened
 from .smoothed import SmoothedFit

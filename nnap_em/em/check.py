@@ -31,6 +31,9 @@ SEQUENCES, SECONDS = 6, 1.0
 """Number and length of the sequences smoothed with the first model: a wrong one loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
+REVERSALS = 20
+"""Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
+distance over which friction turns and its size."""
 _WIDTH = 1.0  # s, of the readings that must determine the state
 
 
@@ -79,6 +82,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
         *_noise(rig, model, data),
         *torques(rig, system, data, scales),
         *_motion(rig, model, data, along),
+        *(memory(rig, model, data, along, scales) if rig.memory else ()),
         *_observability(model, along, np.asarray(head.valid)),
     ]
 
@@ -294,6 +298,34 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         ]
         said = [mend for holds, mend in mends if holds]
         yield CheckResult(_mark(said and rig.friction), "motion", "; ".join([text, *said]))
+
+
+def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales: Scales) -> Iterator[CheckResult]:
+    """Reversals, and the shortest presliding distance that the samples and readings resolve, of every joint."""
+    system = model.system
+    for joint, name in enumerate(system.coordinates):
+        v, hidden = _velocity(rig, model, data, along, joint)
+        q = np.asarray(data.y)[..., rig.measured.index(name)] if name in rig.measured else along.x[..., joint]
+        low, high = np.nanpercentile(q, [1, 99])
+        top = float(np.nanpercentile(np.abs(v), 99))
+        turns = int(sum(_turns(row, 0.02 * top) for row in v))
+        travel = 2 * float(scales.acceleration[joint]) * rig.dt**2
+        noise = rig.noise_std.get(name, 0.0)
+        least, unit = max(travel, noise), system.unit(name)
+        cause = "the noise of its reading" if noise > travel else "its travel over two samples after a reversal"
+        text = (
+            f"joint {joint + 1}{hidden}: {turns} reversals; a presliding distance below {least:.2g} {unit}, {cause}, "
+        )
+        text += "looks like a static map"
+        said = [
+            (
+                turns < REVERSALS,
+                f"fewer than {REVERSALS} reversals: move it to and fro, slowly and with small amplitudes",
+            ),
+            (least > 0.1 * (high - low), "that is more than a tenth of its range: sample faster, or move more gently"),
+        ]
+        mends = [mend for holds, mend in said if holds]
+        yield CheckResult(_mark(mends), "memory", "; ".join([text, *mends]))
 
 
 def _velocity(

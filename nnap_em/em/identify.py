@@ -19,6 +19,7 @@ from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
 from .build import build, build_system
 from .loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
+from .memory import remember
 from .mstep import ScoringMStep, kept
 from .multistep import FALLS, JUDGED, errors, finish, followed, ratio
 from .noise import white_readings
@@ -42,6 +43,8 @@ class Identified(NamedTuple):
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     unsaid: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
+    memory: str = ""
+    """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -117,7 +120,11 @@ def identify(
     now = begin(rig, data, key=key) if start is None else start
     now = now if smoother is None else now._replace(smoother=smoother(now.bank))
     state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)
-    return finished(now._replace(state=state), data)
+    now = now._replace(state=state)
+    if rig.memory and start is None:
+        found = remember(state, now.m_step, now.smoother, data, epochs=epochs, watch=watch)
+        now = now._replace(state=found.state, m_step=found.m_step, memory="\n".join(found.sentences))
+    return finished(now, data)
 
 
 PARTS = 2

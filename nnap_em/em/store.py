@@ -20,6 +20,7 @@ from ..data.dataset import Dataset
 from ..data.limits import Bounds
 from ..data.rig import Declared, Rig
 from ..effects import catalogue, parts
+from ..model.dynamic_friction import DynamicFriction
 from ..smoother import kinds
 from ..smoother.gaussian import CubatureSmoother
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
@@ -39,7 +40,7 @@ KIND = Kind(
 )
 
 
-LATER = ("/unsaid", "/m_step/rough")
+LATER = ("/unsaid", "/m_step/rough", "/memory")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 
@@ -177,7 +178,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            since = "/effects/" in place or place.endswith("/servos")  # numbers that effects and models have had since
+            # numbers that effects and models have had since
+            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest"))
             later = place in LATER or (since and value is None)
             return value if later else differs(place, "missing in the file")
         seen.add(place)
@@ -198,7 +200,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value
 
-    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts)}
+    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts, DynamicFriction)}
     effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header.get("effects", []))
     tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
     del tree["smoother"]

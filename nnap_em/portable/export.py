@@ -245,6 +245,7 @@ def _friction(fitted: Identified) -> dict[str, Any]:
         "network": {
             "form": "scale * mlp(v / speed, asinh(v / knee) / asinh(speed / knee)), tanh layers, one network per joint",
             **{name: np.asarray(getattr(unknown, name)).tolist() for name in ("speed", "knee", "scale")},
+            **({} if unknown.rest is None else {"straight_below": np.asarray(unknown.rest).tolist()}),
             "layers": [
                 {"weight": np.asarray(layer.weight).tolist(), "bias": np.asarray(layer.bias).tolist()}
                 for layer in unknown.mlp.layers

@@ -16,6 +16,7 @@ from ..em.identify import FrictionTable, Identified, friction_table
 from ..em.predict import smooth
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
+from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, visited
 from .error_plots import error_figure
 from .friction_plots import friction_figure
@@ -47,6 +48,10 @@ def write_identification(
         laws = friction_law(fitted, table)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
         figures.append(_draw(out / "friction.png", fitted, table, velocities))
+    bristles = contacts(fitted)
+    if bristles:
+        caption = "Slow cycles as wide as the presliding distance on either side, with their 90 % band."
+        figures.append(picture("found", "Presliding", caption, hysteresis_figure(bristles, names)))
     sides = {"fit": fitted}
     error = errors(predictions(sides, test), sides, test) if test else None
     if error:
@@ -60,6 +65,8 @@ def write_identification(
         "noise": noise(fitted),
         "parameters": parameters(fitted),
         "friction_law": laws,
+        "friction_memory": [*fitted.memory.splitlines(), *(one.text for one in bristles)],
+        "contacts": [one.document() for one in bristles],
         "log_likelihood": fitted.state.loglik.tolist(),
         "epochs": each,
         "left_out": each[-1]["left_out"],
@@ -87,6 +94,8 @@ def _counted(count: int, noun: str) -> str:
 def _tell(document: dict[str, Any], say: Say) -> None:
     for law in document["friction_law"] or []:
         say(law["text"])
+    for text in document["friction_memory"]:
+        say(text)
     error = document["error"] or {"fit": {}}
     for name, values in error["fit"].items():
         pairs = zip(error["horizons_s"], values, strict=True)
@@ -101,7 +110,8 @@ def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -
     valid = np.array(train.data.valid)
     valid[epochs[-1]["left_out"]] = False
     inside = valid & np.isfinite(mean).all(axis=-1)
-    return mean[inside][:, mean.shape[-1] // 2 :]
+    dof = len(fitted.model.system.coordinates)
+    return mean[inside][:, dof : 2 * dof]
 
 
 def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[np.ndarray, "sample dof"]) -> Picture:

@@ -1,0 +1,178 @@
+"""Friction with memory: passive, odd, the static map in its limits; found and recovered where it is, and only there."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
+from nnap_em.effects import Scene
+from nnap_em.em.identify import identify
+from nnap_em.em.store import load, save
+from nnap_em.model.dynamic_friction import SHAPES, DynamicFriction, hysteresis
+from nnap_em.report.contacts import contacts
+from nnap_em.systems import specs
+
+KNEE = 1e-3
+PHYSICS = {"m": 0.5, "lc": 0.2, "I": 0.01, "g": 9.81}
+
+
+def _contact(*, level=0.3, distance=0.02, damping=1e-9, rise=1e-9, shape=None) -> DynamicFriction:
+    shape = jnp.zeros(SHAPES) if shape is None else shape
+    numbers = map(jnp.log, jnp.asarray([level, distance, damping, rise, 0.2]))
+    return DynamicFriction(*numbers, shape, knee=KNEE, stiffest=1e9, fastest=1e9, joint=1)
+
+
+def _scene(v) -> Scene:
+    v, still = jnp.ravel(jnp.asarray(v, float)), jnp.zeros(1)
+    return Scene(None, still, v, still, jnp.zeros(()), still, None)  # type: ignore[arg-type]
+
+
+def _random(key) -> DynamicFriction:
+    key_shape, key_numbers = jax.random.split(key)
+    level, distance, damping, rise = jnp.exp(jax.random.normal(key_numbers, (4,))) * jnp.asarray([0.3, 0.02, 0.01, 0.5])
+    shape = 2 * jax.random.normal(key_shape, (SHAPES,))
+    return _contact(level=level, distance=distance, damping=damping, rise=rise, shape=shape)
+
+
+def test_no_closed_cycle_gives_energy():
+    """At any rates on the way: the hidden state returns to where it began, and the contact has taken energy."""
+
+    @jax.jit
+    @jax.vmap
+    def energies(key):
+        key_contact, key_amplitude, key_phase = jax.random.split(key, 3)
+        effect, n = _random(key_contact), jnp.arange(1.0, 6.0)
+        amplitude = jax.random.normal(key_amplitude, (5,)) / n
+        phase = jax.random.uniform(key_phase, (5,), maxval=2 * jnp.pi)
+        dt, rows = 1e-3, 1000
+
+        def step(s, k):
+            v = 0.5 * jnp.sum(amplitude * jnp.sin(2 * jnp.pi * n * k.astype(float) / rows + phase))
+            scene = _scene(v)
+            slid = effect.force(scene, s[None])[0] - jnp.exp(effect.log_level) * effect.level(v) * jnp.tanh(v / KNEE)
+            half = s + 0.5 * dt * effect.drift(scene, s[None])[0]
+            return s + dt * effect.drift(scene, half[None])[0], -slid * v * dt
+
+        def period(s, _):
+            after, taken = jax.lax.scan(step, s, jnp.arange(rows))
+            return after, (jnp.sum(taken), jnp.sum(jnp.abs(taken)), after - s)
+
+        _, found = jax.lax.scan(period, jnp.zeros(()), None, length=30)
+        return jax.tree.map(lambda a: a[-1], found)
+
+    taken, size, moved = energies(jax.random.split(jax.random.key(0), 16))
+    assert np.abs(moved).max() < 1e-4  # the last period is closed
+    assert np.all(taken > -1e-3 * size)  # the integrator's own error
+    assert np.mean(taken / size) > 0.1
+
+
+def test_friction_is_odd():
+    for key in jax.random.split(jax.random.key(0), 5):
+        key, key_v, key_s = jax.random.split(key, 3)
+        effect, v, s = _random(key), jax.random.normal(key_v), jax.random.uniform(key_s, (1,), minval=-1.0)
+        for hook in (effect.force, effect.drift):
+            np.testing.assert_allclose(hook(_scene(-v), -s), -hook(_scene(v), s), rtol=1e-12)
+
+
+def test_steady_sliding_is_the_static_map():
+    """The state rests at the level of its rate, and there the contact adds nothing."""
+    for v, key in zip((-1.3, -0.05, 0.2, 2.0), jax.random.split(jax.random.key(0), 4), strict=True):
+        effect = _random(key)
+        steady = (effect.level(jnp.asarray(v)) * jnp.sign(v))[None]
+        np.testing.assert_allclose(effect.drift(_scene(v), steady), 0.0, atol=1e-12)
+        np.testing.assert_allclose(effect.force(_scene(v), steady), 0.0, atol=1e-12)
+
+
+def test_no_level_is_the_static_map_and_a_short_distance_is_its_sign():
+    faint = eqx.tree_at(lambda e: (e.log_level, e.log_damping), _contact(), (jnp.asarray(-60.0), jnp.asarray(-60.0)))
+    np.testing.assert_allclose(faint.force(_scene(0.3), jnp.asarray([-1.0])), 0.0, atol=1e-20)
+    short = hysteresis(_contact(distance=1e-9), 0.1)
+    np.testing.assert_allclose(short.torque[2:100], -0.3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("amplitude", [0.01, 0.05])
+def test_hysteresis_of_dahls_contact(amplitude):
+    """The closed loop of s' = v (1 - s sign v) / delta ends at tanh(amplitude / delta)."""
+    effect = _contact(distance=0.02)
+    loop = hysteresis(effect, amplitude)
+    delta = effect.values()["distance"]
+    np.testing.assert_allclose(delta, 0.04, rtol=1e-6)
+    np.testing.assert_allclose(loop.torque[100], -0.3 * jnp.tanh(amplitude / delta), rtol=1e-4)
+    np.testing.assert_allclose(loop.torque[0], loop.torque[-1], rtol=1e-4)
+
+
+def test_an_elastic_contact_that_yields_is_stiff_until_it_slides():
+    """All of the fall behind: Phi is nearly 1 up to s = 0, whose stiffness is then twice that of Dahl's contact."""
+    late = _contact(shape=jnp.asarray([-20.0] * (SHAPES - 1) + [20.0]))
+    ratio = late.values()["stiffness"] / _contact().values()["stiffness"]
+    np.testing.assert_allclose(ratio, 2 * (1 - 0.5**SHAPES), rtol=1e-6)
+
+
+def _logs(stiffness: float | None, seed: int, sequences: int = 16, rows: int = 60) -> Dataset:
+    """A pendulum with Dahl friction of .08 N m and .02 N m s/rad, or with its static limit; both states read."""
+    rng, dt, sub = np.random.default_rng(seed), 0.02, 20
+    t = dt * np.arange(rows)
+    amplitude, period, phase = (rng.uniform(*r, sequences) for r in ((0.1, 0.6), (0.5, 2.0), (0.0, 6.3)))
+    u = amplitude * np.sin(2 * np.pi * t[:, None] / period + phase)
+    q, v, s, y = rng.uniform(-1, 1, sequences), np.zeros(sequences), np.zeros(sequences), []
+    inertia, h = PHYSICS["I"] + PHYSICS["m"] * PHYSICS["lc"] ** 2, dt / sub
+    for now in u:
+        y.append(np.stack([q, v], axis=-1))
+        for _ in range(sub):
+            weight = PHYSICS["m"] * PHYSICS["g"] * PHYSICS["lc"] * np.sin(q)
+            dry = np.tanh(v / 0.02) if stiffness is None else s
+            v = v + h * (now - weight - 0.08 * dry - 0.02 * v) / inertia
+            q = q + h * v
+            if stiffness is not None:
+                s = np.sign(v) + (s - np.sign(v)) * np.exp(-np.abs(v) * h * stiffness / 0.08)
+    read = np.stack(y, axis=1) + rng.normal(size=(sequences, rows, 2)) * [0.002, 0.02]
+    return Dataset(np.tile(t, (sequences, 1)), u.T[..., None], read, np.ones(read.shape[:2], bool))
+
+
+def _rig(**changes) -> Rig:
+    physics = {name: Declared(value, 0.0) for name, value in PHYSICS.items()}
+    noise = {"theta1": 0.002, "dtheta1": 0.02}
+    rig = Rig("m", "pendulum", physics, True, ("u",), (1,), 0.02, "sequence", tuple(noise), noise, {}, memory=True)
+    return replace(rig, **changes)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """Fit to logs with memory."""
+    return identify(_rig(), _logs(4.0, 0), key=jax.random.key(0))
+
+
+def test_a_fit_recovers_dahls_friction(fitted):
+    """Within three of the stated standard deviations, which are themselves small."""
+    assert fitted.memory.startswith("joint 1: memory")
+    (found,) = contacts(fitted)
+    for name, truth in (("coulomb", 0.08), ("stiffness", 4.0)):
+        number = found.parameters[name]
+        assert abs(number.value - truth) < 3 * number.std < 0.4 * truth
+    assert found.joint == 1 and "presliding stiffness" in found.text and "N m/rad" in found.text
+    assert np.ptp(found.loop.torque) == pytest.approx(2 * 0.08 * np.tanh(1.0), rel=0.15)  # at its distance, by Dahl
+
+
+def test_a_static_map_is_kept_where_there_is_no_memory():
+    fitted = identify(_rig(), _logs(None, 0), key=jax.random.key(0))
+    assert fitted.model.effects == ()
+    assert fitted.memory.startswith("joint 1: the static map is kept, no memory")
+
+
+def test_a_fit_with_memory_is_stored(fitted, tmp_path):
+    save(tmp_path / "model.npz", fitted)
+    again = load(tmp_path / "model.npz")
+    assert again.memory == fitted.memory
+    for a, b in zip(jax.tree.leaves(again.model), jax.tree.leaves(fitted.model), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_dynamic_friction_is_declared_and_written(tmp_path):
+    write_rig(_rig(), tmp_path / "rig.toml")
+    assert 'friction = "dynamic"' in (tmp_path / "rig.toml").read_text()
+    assert read_rig(tmp_path / "rig.toml", specs) == _rig()

@@ -68,7 +68,35 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     keys = jax.random.split(key, sequences)
     together = max(1, smoother.room // (rows * smoother.bytes_per_row))
     outcomes = [each(_smooth, (model, one), (data, keys), together=together) for one in smoother.tries()]
-    return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+    posterior = outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+    return _seconded(model, data, smoother.second(), keys, posterior)
+
+
+def _seconded(
+    model: AbstractModel, data: Dataset, second: AbstractSmoother | None, keys, first: Posterior
+) -> Posterior:
+    """`first`, with the outcome of the second smoother where a sequence is wide and that is likelier.
+
+    What is part of a larger program has no numbers to decide by, and stays as it is.
+    """
+    if second is None or first.width is None or isinstance(first.width, jax.core.Tracer):
+        return first
+    some = np.flatnonzero(~(np.asarray(first.width) <= second.wide))
+    if not some.size:
+        return first
+    size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
+    index = np.resize(some, size)
+    together = max(1, second.room // (data.t.shape[1] * second.bytes_per_row))
+    batch = jax.tree.map(lambda a: a[index], (data, keys))
+    return _replaced(first, each(_smooth, (model, second), batch, together=together), index)
+
+
+@eqx.filter_jit
+def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
+    """`second` at the places `index` of `first`, where it is likelier."""
+    better = ~(first.loglik[index] >= second.loglik) & jnp.isfinite(second.loglik)
+    pick = lambda a, b: jnp.where(better.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
+    return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 
 
 @eqx.filter_jit

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
-from ..numerics.gaussian import Gaussian, cholesky, cubature, lower, product
+from ..numerics.gaussian import Gaussian
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, relinearised, rts
+from .linear import linear_posterior
+from .mixture import MixtureSmoother, width
 from .posterior import AbstractSmoother, Posterior, likeliest
 from .start import StartBank
 
@@ -35,6 +37,11 @@ class GaussianSmoother(AbstractSmoother):
     def tolerant(self) -> "GaussianSmoother":
         """The smoother with looser first passes."""
         return dataclasses.replace(self, inflations=(1.0, 10.0, 100.0))
+
+    def second(self) -> MixtureSmoother | None:
+        """The mixture, where an angle is not read."""
+        options = self.bank, self.linearise, self.window, self.iterations
+        return MixtureSmoother(*options) if self.bank.hidden else None
 
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""
@@ -61,17 +68,13 @@ class GaussianSmoother(AbstractSmoother):
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""
-        starts, log_weight = self.bank.hypotheses(model.start)
-        if log_weight.shape[0] == 1:
-            return jax.tree.map(lambda a: a[0], starts)
-        head = jax.tree.map(lambda a: a[: self.window], seq)
-        loglik = jax.vmap(lambda start: ekf(model, start, head, self.linearise).loglik)
-        best = likeliest(loglik(starts) + log_weight)
+        starts, score = self.bank.scored(model, seq, self.linearise, self.window)
+        best = likeliest(score)
         return jax.tree.map(lambda a: a[best], starts)
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        return linear_posterior(*self.path(model, seq))
+        return _posterior(*self.path(model, seq), self.bank)
 
 
 class _Loosened(AbstractSmoother):
@@ -88,7 +91,11 @@ class _Loosened(AbstractSmoother):
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
         start = self.smoother.likeliest(model, seq)
-        return linear_posterior(*self.smoother.follow(model, seq, start, self.looser))
+        return _posterior(*self.smoother.follow(model, seq, start, self.looser), self.smoother.bank)
+
+
+def _posterior(filtered: Filtered, smoothed: Smoothed, bank: StartBank) -> Posterior:
+    return linear_posterior(filtered, smoothed)._replace(width=width(filtered, bank.hidden))
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
@@ -99,29 +106,3 @@ def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
 def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:
     """The cubature (sigma-point) filter with RTS smoother."""
     return GaussianSmoother(bank, Cubature(), **options)
-
-
-def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
-    """The posterior of a model that was linearised about a path."""
-    prev, following = pair_nodes(smoothed)
-    endless = jnp.full_like(filtered.loglik, jnp.inf)
-    affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-    kick = following - (jnp.sum(affine.matrix * prev[..., None, :], axis=-1) + affine.offset)
-    return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
-
-
-def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:
-    """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) of every step."""
-
-    def one(mean, cov, gain, mean_next, cov_next):
-        n = mean.shape[0]
-        unit = cubature(2 * n, mean.dtype)
-        later = lower(cholesky(cov_next))
-        left = cov - product(product(gain, cov_next), gain.T)
-        rest = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
-        spread_next = product(unit[:, :n], later.T)
-        following = mean_next[None] + spread_next
-        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], rest.T), following
-
-    mean, cov = smoothed.state
-    return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -25,6 +25,8 @@ class Posterior(NamedTuple):
     loglik: Float[Array, "*seq"]
     ess: Float[Array, "*seq"]
     """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
+    width: Float[Array, "*seq"] | None = None
+    """Largest standard deviation of an unread angle given the readings before [rad]; None where it is not reported."""
 
 
 class AbstractSmoother(eqx.Module):
@@ -47,6 +49,10 @@ class AbstractSmoother(eqx.Module):
         can.
         """
         return self
+
+    def second(self) -> "AbstractSmoother | None":
+        """The smoother of sequences whose `width` is beyond its `wide`; None where there is none."""
+        return None
 
     def tries(self) -> Sequence["AbstractSmoother"]:
         """Smoothers of one structure, one program for all, of which each sequence keeps the likeliest outcome."""

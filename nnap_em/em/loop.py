@@ -101,11 +101,11 @@ def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
 
 @eqx.filter_jit
 def _likeliest(outcomes: list[Posterior]) -> Posterior:
-    """The likeliest for every sequence."""
+    """The likeliest for every sequence, with the width of the first."""
 
     def one(*tries):
         best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)._replace(width=tries[0].width)
 
     return jax.vmap(one)(*outcomes)
 

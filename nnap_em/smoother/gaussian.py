@@ -50,21 +50,32 @@ class GaussianSmoother(AbstractSmoother):
 
     def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
+        return self.tracked(model, seq)[:2]
+
+    def tracked(self, model, seq: Prepared) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
+        """Filtered and smoothed states of the last iteration, and the width of the first pass."""
         start = self.likeliest(model, seq)
         looser = jnp.log(jnp.asarray(self.inflations, seq.y.dtype))
         tracks = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
         best = likeliest(tracks[0].loglik)
-        return jax.tree.map(lambda a: a[best], tracks)
+        filtered, smoothed = jax.tree.map(lambda a: a[best], tracks[:2])
+        return filtered, smoothed, tracks[2][0]
 
-    def follow(self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]) -> tuple[Filtered, Smoothed]:
-        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model."""
+    def follow(
+        self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]
+    ) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
+        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model.
+
+        With the largest standard deviation of an unread angle in the first pass [rad].
+        """
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
         def again(_, now):
             filtered = relinearised(model, now[1].state, seq, self.linearise)
             return filtered, rts(filtered)
 
-        return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+        smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+        return *smoothed, width(filtered, self.bank.hidden)
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""
@@ -74,7 +85,7 @@ class GaussianSmoother(AbstractSmoother):
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        return _posterior(*self.path(model, seq), self.bank)
+        return _posterior(*self.tracked(model, seq))
 
 
 class _Loosened(AbstractSmoother):
@@ -91,11 +102,11 @@ class _Loosened(AbstractSmoother):
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
         start = self.smoother.likeliest(model, seq)
-        return _posterior(*self.smoother.follow(model, seq, start, self.looser), self.smoother.bank)
+        return _posterior(*self.smoother.follow(model, seq, start, self.looser))
 
 
-def _posterior(filtered: Filtered, smoothed: Smoothed, bank: StartBank) -> Posterior:
-    return linear_posterior(filtered, smoothed)._replace(width=width(filtered, bank.hidden))
+def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) -> Posterior:
+    return linear_posterior(filtered, smoothed)._replace(width=width)
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:

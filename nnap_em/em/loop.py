@@ -63,13 +63,23 @@ class Schedule(eqx.Module):
 
 
 def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
-    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`."""
-    sequences, rows = data.t.shape
-    keys = jax.random.split(key, sequences)
-    together = max(1, smoother.room // (rows * smoother.bytes_per_row))
-    outcomes = [each(_smooth, (model, one), (data, keys), together=together) for one in smoother.tries()]
-    posterior = outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
-    return _seconded(model, data, smoother.second(), keys, posterior)
+    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
+
+    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
+    """
+    keys = jax.random.split(key, data.t.shape[0])
+    return _seconded(model, data, smoother.second(), keys, _first(model, data, smoother, keys))
+
+
+def _first(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
+    outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
+    return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+
+
+def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
+    """Each sequence by itself."""
+    together = max(1, smoother.room // (data.t.shape[1] * smoother.bytes_per_row))
+    return each(_smooth, (model, smoother), (data, keys), together=together)
 
 
 def _seconded(
@@ -86,9 +96,8 @@ def _seconded(
         return first
     size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
     index = np.resize(some, size)
-    together = max(1, second.room // (data.t.shape[1] * second.bytes_per_row))
-    batch = jax.tree.map(lambda a: a[index], (data, keys))
-    return _replaced(first, each(_smooth, (model, second), batch, together=together), index)
+    some_data, some_keys = jax.tree.map(lambda a: a[index], (data, keys))
+    return _replaced(first, _apart(model, some_data, second, some_keys), index)
 
 
 @eqx.filter_jit
@@ -197,7 +206,8 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
     for trial in trials:  # the step that would follow does not count
-        posterior = e_step(trial, data, smoother, key=key)
+        keys = jax.random.split(key, data.t.shape[0])
+        posterior = _first(trial, data, smoother, keys)  # noise as large as the motion makes everything wide
         used = np.asarray(kept(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)
     return trials[int(np.argmax(logliks))]

@@ -39,7 +39,7 @@ KIND = Kind(
 )
 
 
-LATER = ("/unsaid", "/m_step/rough", "/bank/hidden")
+LATER = ("/unsaid", "/m_step/rough", "/bank/angles")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 
@@ -193,7 +193,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        later = place not in settings and ("/effects/" in place or place.endswith("/bank/hidden"))  # its default
+        later = place not in settings and ("/effects/" in place or place.endswith("/bank/angles"))  # its default
         if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value

@@ -41,7 +41,7 @@ class GaussianSmoother(AbstractSmoother):
     def second(self) -> MixtureSmoother | None:
         """The mixture, where an angle is not read."""
         options = self.bank, self.linearise, self.window, self.iterations
-        return MixtureSmoother(*options) if self.bank.hidden else None
+        return MixtureSmoother(*options) if self.bank.angles else None
 
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""
@@ -75,7 +75,7 @@ class GaussianSmoother(AbstractSmoother):
             return filtered, rts(filtered)
 
         smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-        return *smoothed, width(filtered, self.bank.hidden)
+        return *smoothed, width(filtered, self.bank.angles)
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""

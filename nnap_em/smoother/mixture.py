@@ -57,16 +57,16 @@ class Tree(NamedTuple):
     """Of the last row."""
 
 
-def split(before: Components, hidden: tuple[int, ...], wide: float) -> Components:
-    """Two more places: the likeliest of the components that are wide along a `hidden` state becomes three.
+def split(before: Components, angles: tuple[int, ...], wide: float) -> Components:
+    """Two more places: the likeliest of the components that are wide along a `angles` state becomes three.
 
     They lie along the regression of the whole state on that one, and have the moments of the one that is split.
     """
     (mean, cov), log_weight, source = before
-    variance = jnp.diagonal(cov, axis1=1, axis2=2)[:, jnp.asarray(hidden)]
+    variance = jnp.diagonal(cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]
     able = (jnp.max(variance, axis=1) > wide**2) & jnp.isfinite(log_weight)
     which = jnp.argmax(jnp.where(able, log_weight, -jnp.inf))
-    along = jnp.asarray(hidden)[jnp.argmax(variance[which])]
+    along = jnp.asarray(angles)[jnp.argmax(variance[which])]
     direction = cov[which, :, along] / jnp.sqrt(cov[which, along, along])
     narrow = cov[which] - (1 - NARROW**2) * direction[:, None] * direction[None, :]
     shift = DISTANCE * direction
@@ -126,7 +126,7 @@ def mixture_filter(
     log_weight: Float[Array, " component"],
     seq: Prepared,
     linearise: Callable,
-    hidden: tuple[int, ...],
+    angles: tuple[int, ...],
     wide: float = WIDE,
 ) -> Tree:
     """Gaussian-sum filter with as many places as `start` has components; at most one is split in a row.
@@ -142,7 +142,7 @@ def mixture_filter(
         state, whitened, log_variance, gain = jax.vmap(lambda x, c: absorbed(x, c, r, y, observed))(predicted, reading)
         log_weight = log_weight - 0.5 * jnp.sum(whitened**2 + log_variance, axis=1)
         log_weight = jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
-        here = merged(merged(split(Components(state, log_weight, places), hidden, wide)))
+        here = merged(merged(split(Components(state, log_weight, places), angles, wide)))
         affine = jax.vmap(lambda x: linearise(model, x, u))(here.state)
         affine, following = jax.vmap(lambda x, a: moved(x, a, q, active))(here.state, affine)
         row = Filtered(here.state, predicted, whitened, log_variance, gain, affine, reading, here.log_weight)
@@ -198,7 +198,7 @@ class MixtureSmoother(AbstractSmoother):
         free = self.components - most
         log_weight = jnp.pad(jnp.zeros_like(log_weight), (0, free), constant_values=-jnp.inf)
         start = jax.tree.map(lambda a: a[jnp.pad(kept, (0, free))], starts)
-        tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.bank.hidden, self.wide)
+        tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.bank.angles, self.wide)
 
         def follow(last):
             filtered = branch(tree, last)
@@ -218,11 +218,11 @@ class MixtureSmoother(AbstractSmoother):
         filtered, smoothed = self.branches(model, seq)
         best = likeliest(filtered.loglik)
         filtered, smoothed = jax.tree.map(lambda a: a[best], (filtered, smoothed))
-        return linear_posterior(filtered, smoothed)._replace(width=width(filtered, self.bank.hidden))
+        return linear_posterior(filtered, smoothed)._replace(width=width(filtered, self.bank.angles))
 
 
-def width(filtered: Filtered, hidden: tuple[int, ...]) -> Float[Array, ""]:
-    """Largest standard deviation of the `hidden` states given the readings before [rad]; 0 where there are none."""
-    if not hidden:
+def width(filtered: Filtered, angles: tuple[int, ...]) -> Float[Array, ""]:
+    """Largest standard deviation of the `angles` states given the readings before [rad]; 0 where there are none."""
+    if not angles:
         return jnp.zeros_like(filtered.loglik)
-    return jnp.sqrt(jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(hidden)]))
+    return jnp.sqrt(jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]))

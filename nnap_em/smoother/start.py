@@ -28,12 +28,12 @@ class StartBank(eqx.Module):
     shrink: Float[Array, " state"]
     """Standard deviation of a hypothesis over that of the prior."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=())
-    """Places of angles that are not read: they may be in more than one place later, too."""
+    angles: tuple[int, ...] = eqx.field(static=True, default=())
+    """Places of all angles where one of them is not read: what becomes wide there is cut later, too."""
 
-    def __init__(self, counts: tuple[int, ...], hidden: tuple[int, ...] = ()):
+    def __init__(self, counts: tuple[int, ...], angles: tuple[int, ...] = ()):
         """`counts` hypotheses along each state (1: as it is)."""
-        self.hidden = hidden
+        self.angles = angles
         lines = [np.linspace(-REACH, REACH, n) if n > 1 else np.zeros(1) for n in counts]
         grid = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=-1)
         self.offsets = jnp.asarray(grid, float)

@@ -12,12 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
-from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
+from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, kept
 
@@ -83,21 +83,27 @@ def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys
 
 
 def _seconded(
-    model: AbstractModel, data: Dataset, second: AbstractSmoother | None, keys, first: Posterior
+    model: AbstractModel, data: Dataset, second: AbstractBranching | None, keys, first: Posterior
 ) -> Posterior:
-    """`first`, with the outcome of the second smoother where a sequence is wide and that is likelier.
-
-    What is part of a larger program has no numbers to decide by, and stays as it is.
-    """
-    if second is None or first.width is None or isinstance(first.width, jax.core.Tracer):
-        return first
-    some = np.flatnonzero(~(np.asarray(first.width) <= second.wide))
+    """`first`, with the outcome of the second smoother where a sequence is wide and that is likelier."""
+    some = beyond(first, second)
     if not some.size:
         return first
     size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
     index = np.resize(some, size)
     some_data, some_keys = jax.tree.map(lambda a: a[index], (data, keys))
-    return _replaced(first, _apart(model, some_data, second, some_keys), index)
+    found = _apart(model, some_data, second, some_keys)
+    return _replaced(first, found._replace(width=first.width[index]), index)
+
+
+def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:
+    """Sequences that are wider than the first smoother can follow, so that the second one is used.
+
+    None where that is part of a larger program, which has no numbers to decide by.
+    """
+    if second is None or first.width is None or isinstance(first.width, jax.core.Tracer):
+        return np.zeros(0, int)
+    return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, relinearised, rts
 from .linear import linear_posterior
-from .mixture import MixtureSmoother, width
+from .mixture import MixtureSmoother
 from .posterior import AbstractSmoother, Posterior, likeliest
 from .start import StartBank
 
@@ -66,7 +66,7 @@ class GaussianSmoother(AbstractSmoother):
     ) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
         """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model.
 
-        With the largest standard deviation of an unread angle in the first pass [rad].
+        With the largest standard deviation of an angle in the first pass [rad].
         """
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
@@ -75,7 +75,7 @@ class GaussianSmoother(AbstractSmoother):
             return filtered, rts(filtered)
 
         smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-        return *smoothed, width(filtered, self.bank.angles)
+        return *smoothed, _width(filtered, self.bank.angles)
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""
@@ -103,6 +103,13 @@ class _Loosened(AbstractSmoother):
         """Smooth one sequence; it draws nothing."""
         start = self.smoother.likeliest(model, seq)
         return _posterior(*self.smoother.follow(model, seq, start, self.looser))
+
+
+def _width(filtered: Filtered, angles: tuple[int, ...]) -> Float[Array, ""]:
+    """Largest standard deviation of the angles given the readings so far [rad]; 0 where they need no mixture."""
+    if not angles:
+        return jnp.zeros_like(filtered.loglik)
+    return jnp.sqrt(jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]))
 
 
 def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) -> Posterior:

@@ -8,8 +8,9 @@ its path, and the likeliest path is the result.
 Syst. 43(3), for merging]
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from .kalman import Cubature, Filtered, Smoothed, Tangent, absorbed, linear_reading, moved, relinearised, rts
 from .linear import linear_posterior
-from .posterior import AbstractSmoother, Posterior, likeliest
+from .posterior import AbstractBranching, Posterior, likeliest
 from .start import StartBank
 
 WIDE = 0.2
@@ -31,9 +32,11 @@ Three narrower ones of .13 rad, about that of a hypothesis of the start, do. On 
 exceeds .4 rad in every recording in which the arm passed the upright position and could be followed on two branches,
 and is below .13 rad in all others.
 """
-DISTANCE, SIDE, NARROW = 1.0575154615, 0.2252246249, 0.6715662887
-"""The standard normal distribution as three narrower ones: distance of the outer ones from the centre, weight of each
-outer one, and standard deviation of all. [DeMars, Bishop & Jah 2013, J. Guid. Control Dyn. 36(4), table 1]"""
+NARROW = 2 / 3
+"""Standard deviation of each part over that of the component that is split."""
+SIDE, DISTANCE = 1 / 6, math.sqrt(3 * (1 - NARROW**2))
+"""Weight of the two outer parts, and their distance from the centre in standard deviations: Gauss-Hermite nodes, so
+that the parts together have the first five moments of the whole."""
 
 
 class Components(NamedTuple):
@@ -58,9 +61,9 @@ class Tree(NamedTuple):
 
 
 def split(before: Components, angles: tuple[int, ...], wide: float) -> Components:
-    """Two more places: the likeliest of the components that are wide along a `angles` state becomes three.
+    """Two more places: the likeliest of the components that are wide along an angle becomes three.
 
-    They lie along the regression of the whole state on that one, and have the moments of the one that is split.
+    They lie along the regression of the whole state on that one.
     """
     (mean, cov), log_weight, source = before
     variance = jnp.diagonal(cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]
@@ -71,7 +74,9 @@ def split(before: Components, angles: tuple[int, ...], wide: float) -> Component
     narrow = cov[which] - (1 - NARROW**2) * direction[:, None] * direction[None, :]
     shift = DISTANCE * direction
     parts = Components(
-        Gaussian(mean[which] + jnp.stack([0 * shift, -shift, shift]), jnp.broadcast_to(narrow, (3, *narrow.shape))),
+        Gaussian(
+            mean[which][None] + jnp.stack([0 * shift, -shift, shift]), jnp.broadcast_to(narrow, (3, *narrow.shape))
+        ),
         log_weight[which] + jnp.log(jnp.asarray([1 - 2 * SIDE, SIDE, SIDE])),
         jnp.broadcast_to(source[which], 3),
     )
@@ -168,7 +173,7 @@ def branch(tree: Tree, last: Int[Array, ""]) -> Filtered:
     return rows._replace(loglik=rows.loglik[-1])
 
 
-class MixtureSmoother(AbstractSmoother):
+class MixtureSmoother(AbstractBranching):
     """Gaussian-sum filter, smoothed along the ancestors of every final component: the likeliest path."""
 
     bank: StartBank
@@ -179,15 +184,24 @@ class MixtureSmoother(AbstractSmoother):
     """Relinearisations about a smoothed path."""
     components: int = eqx.field(static=True, default=8)
     """Places."""
-    wide: float = eqx.field(static=True, default=WIDE)
-    """Standard deviation of an unread angle beyond which a component is split [rad]."""
+    wide: ClassVar[float] = WIDE
 
     @property
     def bytes_per_row(self) -> int:
         """Memory [B] that a row takes."""
         return 8192 * self.components
 
-    def branches(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
+    @property
+    def angles(self) -> tuple[int, ...]:
+        """Places of the angles in which paths differ."""
+        return self.bank.angles
+
+    def branches(self, model: AbstractModel, seq: Prepared) -> tuple[Gaussian, Float[Array, " path"]]:
+        """Smoothed states along each path, with leading axes path and time, and its log-likelihood."""
+        filtered, smoothed = self.paths(model, seq)
+        return smoothed.state, filtered.loglik
+
+    def paths(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states along the ancestors of every final component, with a leading axis.
 
         The log-likelihood is that of the relinearised model, -inf for a place that is free.
@@ -215,14 +229,7 @@ class MixtureSmoother(AbstractSmoother):
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        filtered, smoothed = self.branches(model, seq)
+        filtered, smoothed = self.paths(model, seq)
         best = likeliest(filtered.loglik)
         filtered, smoothed = jax.tree.map(lambda a: a[best], (filtered, smoothed))
-        return linear_posterior(filtered, smoothed)._replace(width=width(filtered, self.bank.angles))
-
-
-def width(filtered: Filtered, angles: tuple[int, ...]) -> Float[Array, ""]:
-    """Largest standard deviation of the `angles` states given the readings before [rad]; 0 where there are none."""
-    if not angles:
-        return jnp.zeros_like(filtered.loglik)
-    return jnp.sqrt(jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]))
+        return linear_posterior(filtered, smoothed)

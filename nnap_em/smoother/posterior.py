@@ -26,7 +26,7 @@ class Posterior(NamedTuple):
     ess: Float[Array, "*seq"]
     """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
     width: Float[Array, "*seq"] | None = None
-    """Largest standard deviation of an unread angle given the readings before [rad]; None where it is not reported."""
+    """Largest standard deviation of an angle given the readings so far [rad]; None where it is not reported."""
 
 
 class AbstractSmoother(eqx.Module):
@@ -50,13 +50,29 @@ class AbstractSmoother(eqx.Module):
         """
         return self
 
-    def second(self) -> "AbstractSmoother | None":
+    def second(self) -> "AbstractBranching | None":
         """The smoother of sequences whose `width` is beyond its `wide`; None where there is none."""
         return None
 
     def tries(self) -> Sequence["AbstractSmoother"]:
         """Smoothers of one structure, one program for all, of which each sequence keeps the likeliest outcome."""
         return (self,)
+
+
+class AbstractBranching(AbstractSmoother):
+    """A smoother that follows several paths of one sequence; it serves where another finds the posterior too wide."""
+
+    wide: eqx.AbstractClassVar[float]
+    """Largest `Posterior.width` that is left to the other one [rad]."""
+
+    @property
+    @abstractmethod
+    def angles(self) -> tuple[int, ...]:
+        """Places of the angles in which paths differ."""
+
+    @abstractmethod
+    def branches(self, model: AbstractModel, seq: Prepared) -> tuple[Gaussian, Float[Array, " path"]]:
+        """Smoothed states along each path, with leading axes path and time, and its log-likelihood."""
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

@@ -48,17 +48,15 @@ def branches(
         return ()
     out = []
     for sequence in beyond(first, second):
-        one = jax.tree.map(lambda a, s=sequence: a[s : s + 1], data)
+        one = jax.tree.map(lambda a, s=sequence: a[s : s + 1], (data, first.state))
         mean, loglik = (np.asarray(a[0]) for a in each(_paths, (model, second), one))
-        loglik = np.append(np.asarray(first.loglik[sequence]), loglik)
-        mean = np.concatenate([np.asarray(first.state.mean[sequence])[None], mean])
-        angles = mean[:, np.asarray(data.valid[sequence])][..., list(second.angles)]
-        chosen, weight = modes(loglik, angles)
-        for i, share in zip(chosen[1:], weight[1:], strict=True):
-            gap = distance(angles[i], angles[chosen[0]])
+        angles = mean[:, : int(np.sum(data.valid[sequence])), list(second.angles)]
+        smoothed = np.asarray(first.state.mean[sequence])[: angles.shape[1], list(second.angles)]
+        for i, share in zip(*modes(loglik, angles), strict=True):
+            gap = distance(angles[i], smoothed)
             most = int(np.argmax(gap.max(axis=0)))
             there = np.flatnonzero(gap[:, most] > APART / 2)
-            if share >= LEAST:
+            if share >= LEAST and gap.max() > APART:
                 span = int(there[0]), int(there[-1])
                 out.append(Branch(int(sequence), float(share), mean[i], second.angles[most], span))
     return tuple(out)
@@ -81,8 +79,8 @@ def distance(a: Float[np.ndarray, "time angle"], b: Float[np.ndarray, "time angl
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _paths(common, seq) -> tuple[Float[Array, "path time state"], Float[Array, " path"]]:
+def _paths(common, one) -> tuple[Float[Array, "path time state"], Float[Array, " path"]]:
     """Means of the paths of one sequence, and their log-likelihoods."""
-    model, second = common
-    state, loglik = second.branches(model, prepare(model, seq))
-    return state.mean, loglik
+    (model, second), (seq, first) = common, one
+    paths = second.paths(model, prepare(model, seq), first)
+    return paths.state.mean, paths.loglik

@@ -68,7 +68,7 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
     """
     keys = jax.random.split(key, data.t.shape[0])
-    return _seconded(model, data, smoother.second(), keys, _first(model, data, smoother, keys))
+    return _seconded(model, data, smoother.second(), _first(model, data, smoother, keys))
 
 
 def _first(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
@@ -82,18 +82,16 @@ def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys
     return each(_smooth, (model, smoother), (data, keys), together=together)
 
 
-def _seconded(
-    model: AbstractModel, data: Dataset, second: AbstractBranching | None, keys, first: Posterior
-) -> Posterior:
-    """`first`, with the outcome of the second smoother where a sequence is wide and that is likelier."""
+def _seconded(model: AbstractModel, data: Dataset, second: AbstractBranching | None, first: Posterior) -> Posterior:
+    """`first`, with the likeliest path of the second smoother where a sequence is wide."""
     some = beyond(first, second)
-    if not some.size:
+    if second is None or not some.size:
         return first
     size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
     index = np.resize(some, size)
-    some_data, some_keys = jax.tree.map(lambda a: a[index], (data, keys))
-    found = _apart(model, some_data, second, some_keys)
-    return _replaced(first, found._replace(width=first.width[index]), index)
+    batch = jax.tree.map(lambda a: a[index], (data, first.state))
+    together = max(1, second.room // (data.t.shape[1] * second.bytes_per_row))
+    return _replaced(first, each(_likeliest_path, (model, second), batch, together=together), index)
 
 
 def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:
@@ -106,11 +104,17 @@ def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray
     return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
 
+def _likeliest_path(common, one) -> Posterior:
+    (model, second), (seq, first) = common, one
+    paths = second.paths(model, prepare(model, seq), first)
+    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths)
+
+
 @eqx.filter_jit
 def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
-    """`second` at the places `index` of `first`, where it is likelier."""
-    better = ~(first.loglik[index] >= second.loglik) & jnp.isfinite(second.loglik)
-    pick = lambda a, b: jnp.where(better.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
+    """`second` at the places `index` of `first`, but where it is no number."""
+    pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
+    known, second = jnp.isfinite(second.loglik), second._replace(width=first.width[index])
     return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 
 

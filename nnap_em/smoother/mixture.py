@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower
-from .kalman import Cubature, Filtered, Smoothed, Tangent, absorbed, linear_reading, moved, relinearised, rts
+from .kalman import Cubature, Filtered, Tangent, absorbed, linear_reading, moved, relinearised, rts
 from .linear import linear_posterior
 from .posterior import AbstractBranching, Posterior, likeliest
 from .start import StartBank
@@ -180,8 +180,12 @@ class MixtureSmoother(AbstractBranching):
     linearise: Tangent | Cubature
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses of the start compete for a place."""
-    iterations: int = eqx.field(static=True, default=1)
-    """Relinearisations about a smoothed path."""
+    iterations: int = eqx.field(static=True, default=4)
+    """Relinearisations about a smoothed path, the last of which gives its likelihood.
+
+    One is too few to compare paths: on a real double pendulum the likelihood of a diverged path was 27 nats above that
+    of the right one after the first, and 60 nats below it after the second.
+    """
     components: int = eqx.field(static=True, default=8)
     """Places."""
     wide: ClassVar[float] = WIDE
@@ -196,40 +200,33 @@ class MixtureSmoother(AbstractBranching):
         """Places of the angles in which paths differ."""
         return self.bank.angles
 
-    def branches(self, model: AbstractModel, seq: Prepared) -> tuple[Gaussian, Float[Array, " path"]]:
-        """Smoothed states along each path, with leading axes path and time, and its log-likelihood."""
-        filtered, smoothed = self.paths(model, seq)
-        return smoothed.state, filtered.loglik
-
-    def paths(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
-        """Filtered and smoothed states along the ancestors of every final component, with a leading axis.
-
-        The log-likelihood is that of the relinearised model, -inf for a place that is free.
-        """
+    def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
+        """Posterior along the ancestors of every final component, and about the path `first`, with a leading axis."""
         starts, score = self.bank.scored(model, seq, self.linearise, self.window)
         most = min(self.components, len(score))
-        log_weight, kept = jax.lax.top_k(jnp.where(jnp.isfinite(score), score, -jnp.inf), most)
+        _, kept = jax.lax.top_k(jnp.where(jnp.isfinite(score), score, -jnp.inf), most)
         free = self.components - most
-        log_weight = jnp.pad(jnp.zeros_like(log_weight), (0, free), constant_values=-jnp.inf)
         start = jax.tree.map(lambda a: a[jnp.pad(kept, (0, free))], starts)
+        log_weight = jnp.where(jnp.arange(self.components) < most, 0.0, -jnp.inf)
         tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.bank.angles, self.wide)
+        paths = jax.vmap(lambda last: branch(tree, last))(jnp.arange(self.components))
+        smoothed, here = jax.vmap(rts)(paths), jnp.isfinite(tree.log_weight)
+        if first is not None:
+            paths, smoothed = jax.tree.map(lambda a: jnp.concatenate([a, a[:1]]), (paths, smoothed))
+            smoothed = smoothed._replace(state=jax.tree.map(lambda a, b: a.at[-1].set(b), smoothed.state, first))
+            here = jnp.append(here, True)
 
-        def follow(last):
-            filtered = branch(tree, last)
-
+        def follow(filtered, smoothed, here):
             def again(_, now):
                 filtered = relinearised(model, now[1].state, seq, self.linearise)
                 return filtered, rts(filtered)
 
-            filtered, smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-            loglik = jnp.where(jnp.isfinite(tree.log_weight[last]), filtered.loglik, -jnp.inf)
-            return filtered._replace(loglik=loglik), smoothed
+            posterior = linear_posterior(*jax.lax.fori_loop(0, self.iterations, again, (filtered, smoothed)))
+            return posterior._replace(loglik=jnp.where(here, posterior.loglik, -jnp.inf))
 
-        return jax.vmap(follow)(jnp.arange(self.components))
+        return jax.vmap(follow)(paths, smoothed, here)
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        filtered, smoothed = self.paths(model, seq)
-        best = likeliest(filtered.loglik)
-        filtered, smoothed = jax.tree.map(lambda a: a[best], (filtered, smoothed))
-        return linear_posterior(filtered, smoothed)
+        paths = self.paths(model, seq)
+        return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths)

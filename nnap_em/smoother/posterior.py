@@ -71,8 +71,10 @@ class AbstractBranching(AbstractSmoother):
         """Places of the angles in which paths differ."""
 
     @abstractmethod
-    def branches(self, model: AbstractModel, seq: Prepared) -> tuple[Gaussian, Float[Array, " path"]]:
-        """Smoothed states along each path, with leading axes path and time, and its log-likelihood."""
+    def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
+        """The posterior about each of several paths, and about the path `first`, with a leading axis; the likelihood is
+        -inf where there is none.
+        """
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

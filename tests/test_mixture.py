@@ -13,7 +13,17 @@ from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.kalman import CUBATURE
-from nnap_em.smoother.mixture import WIDE, Components, MixtureSmoother, branch, merged, mixture_filter, split
+from nnap_em.smoother.mixture import (
+    DISTANCE,
+    NARROW,
+    WIDE,
+    Components,
+    MixtureSmoother,
+    branch,
+    merged,
+    mixture_filter,
+    split,
+)
 from nnap_em.smoother.start import StartBank
 
 ROWS = 60
@@ -149,9 +159,14 @@ def test_an_affine_model_has_one_posterior_whatever_is_split():
     free = jnp.where(jnp.arange(8) > 0, -jnp.inf, 0.0)
     tree = eqx.filter_jit(mixture_filter)(model, start, free, seq, CUBATURE, (0,))
     assert int(jnp.sum(jnp.isfinite(tree.log_weight))) > 1  # it was split
-    chain = branch(tree, jnp.argmax(tree.log_weight))
-    step = np.asarray(chain.affine.matrix[:-1, 0, 0] * chain.state.mean[:-1, 0] + chain.affine.offset[:-1, 0])
-    np.testing.assert_allclose(chain.predicted.mean[1:, 0], step, rtol=1e-12)  # each came from the one before it
+    chains = eqx.filter_jit(jax.vmap(lambda last: branch(tree, last)))(jnp.arange(8))
+    for chain in (jax.tree.map(lambda a, i=i: a[i], chains) for i in np.flatnonzero(np.isfinite(tree.log_weight))):
+        reach = DISTANCE * np.sqrt(np.asarray(chain.state.cov)[:, 0, 0]) / NARROW  # of a part from the whole
+        read = chain.gain[:, 0, 0] * chain.innovation[:, 0] * np.exp(0.5 * chain.log_variance[:, 0])
+        shift = np.abs(np.asarray(chain.state.mean[:, 0] - chain.predicted.mean[:, 0] - read))
+        assert np.all(shift < reach + 1e-12) and np.mean(shift < 1e-12) > 0.5  # splits and merges are rare
+        step = chain.affine.matrix[:-1, 0, 0] * chain.state.mean[:-1, 0] + chain.affine.offset[:-1, 0]
+        np.testing.assert_allclose(chain.predicted.mean[1:, 0], step, rtol=1e-12)  # each came from the one before it
     one = eqx.filter_jit(CubatureSmoother(StartBank((1,))))(model, seq)
     found = _mixture(model, data)
     np.testing.assert_allclose(found.state.mean[0], one.state.mean, rtol=1e-9, atol=1e-12)

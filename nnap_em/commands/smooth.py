@@ -33,7 +33,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
 
 
 def _line(other: Branch, fitted: Identified, logs: Logs) -> str:
-    """Where another branch lies, and its probability."""
+    """The place of another branch and its probability."""
     first, last = other.rows
     t, name = np.asarray(logs.data.t[other.sequence]), fitted.model.system.coordinates[other.angle]
     ends = " to ".join(f"{other.mean[row, other.angle]:.2f}" for row in dict.fromkeys(other.rows))

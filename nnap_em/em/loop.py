@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
@@ -99,7 +100,7 @@ def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray
 
     None where that is part of a larger program, which has no numbers to decide by.
     """
-    if second is None or first.width is None or isinstance(first.width, jax.core.Tracer):
+    if second is None or first.width is None or isinstance(first.width, Tracer):
         return np.zeros(0, int)
     return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
@@ -114,7 +115,8 @@ def _likeliest_path(common, one) -> Posterior:
 def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
     """`second` at the places `index` of `first`, but where it is no number."""
     pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
-    known, second = jnp.isfinite(second.loglik), second._replace(width=first.width[index])
+    known = jnp.isfinite(second.loglik)
+    second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
     return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 
 

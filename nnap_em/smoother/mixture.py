@@ -10,7 +10,7 @@ Syst. 43(3), for merging]
 
 import math
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,7 +57,7 @@ class Tree(NamedTuple):
     source: Int[Array, "time component"]
     """Place before the splits of a component after them."""
     log_weight: Float[Array, " component"]
-    """Of the last row."""
+    """Log weights of the last row."""
 
 
 def split(before: Components, angles: tuple[int, ...], wide: float) -> Components:
@@ -188,12 +188,16 @@ class MixtureSmoother(AbstractBranching):
     """
     components: int = eqx.field(static=True, default=8)
     """Places."""
-    wide: ClassVar[float] = WIDE
 
     @property
     def bytes_per_row(self) -> int:
         """Memory [B] that a row takes."""
         return 8192 * self.components
+
+    @property
+    def wide(self) -> float:
+        """Standard deviation of an angle beyond which one Gaussian is not enough [rad]."""
+        return WIDE
 
     @property
     def angles(self) -> tuple[int, ...]:

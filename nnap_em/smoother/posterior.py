@@ -62,8 +62,10 @@ class AbstractSmoother(eqx.Module):
 class AbstractBranching(AbstractSmoother):
     """A smoother that follows several paths of one sequence; it serves where another finds the posterior too wide."""
 
-    wide: eqx.AbstractClassVar[float]
-    """Largest `Posterior.width` that is left to the other one [rad]."""
+    @property
+    @abstractmethod
+    def wide(self) -> float:
+        """Largest `Posterior.width` that is left to the other one [rad]."""
 
     @property
     @abstractmethod

@@ -96,7 +96,7 @@ def _grid(model: _Fall, seq: Dataset) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _mixture(model: _Fall, data: Dataset):
     """Posterior of every sequence by the mixture alone."""
-    smoother = MixtureSmoother(StartBank((1,), (0,)), CUBATURE)
+    smoother = MixtureSmoother((0,), CUBATURE)
     return eqx.filter_jit(jax.vmap(lambda seq: smoother(model, prepare(model, seq))))(data)
 
 

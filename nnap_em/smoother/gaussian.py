@@ -40,7 +40,7 @@ class GaussianSmoother(AbstractSmoother):
 
     def second(self) -> MixtureSmoother | None:
         """The mixture, where an angle is not read."""
-        return MixtureSmoother(self.bank, self.linearise, self.window) if self.bank.angles else None
+        return MixtureSmoother(self.bank.angles, self.linearise) if self.bank.angles else None
 
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""

@@ -23,7 +23,6 @@ from ..numerics.gaussian import Gaussian, cholesky, lower
 from .kalman import Cubature, Filtered, Tangent, absorbed, linear_reading, moved, relinearised, rts
 from .linear import linear_posterior
 from .posterior import AbstractBranching, Posterior, likeliest
-from .start import StartBank
 
 WIDE = 0.2
 """Standard deviation of an unread angle beyond which one Gaussian does not describe it [rad].
@@ -176,18 +175,17 @@ def branch(tree: Tree, last: Int[Array, ""]) -> Filtered:
 class MixtureSmoother(AbstractBranching):
     """Gaussian-sum filter, smoothed along the ancestors of every final component: the likeliest path."""
 
-    bank: StartBank
+    places: tuple[int, ...] = eqx.field(static=True)
+    """Places of the angles in the state."""
     linearise: Tangent | Cubature
-    window: int = eqx.field(static=True, default=60)
-    """Samples over which the hypotheses of the start compete for a place."""
     iterations: int = eqx.field(static=True, default=4)
     """Relinearisations about a smoothed path, the last of which gives its likelihood.
 
     One is too few to compare paths: on a real double pendulum the likelihood of a diverged path was 27 nats above that
     of the right one after the first, and 60 nats below it after the second.
     """
-    components: int = eqx.field(static=True, default=8)
-    """Places."""
+    components: int = eqx.field(static=True, default=16)
+    """Gaussians of a mixture at most: with 12, one of twenty starts with both angles of an arm unknown was not found."""
 
     @property
     def bytes_per_row(self) -> int:
@@ -202,17 +200,13 @@ class MixtureSmoother(AbstractBranching):
     @property
     def angles(self) -> tuple[int, ...]:
         """Places of the angles in which paths differ."""
-        return self.bank.angles
+        return self.places
 
     def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
         """Posterior along the ancestors of every final component, and about the path `first`, with a leading axis."""
-        starts, score = self.bank.scored(model, seq, self.linearise, self.window)
-        most = min(self.components, len(score))
-        _, kept = jax.lax.top_k(jnp.where(jnp.isfinite(score), score, -jnp.inf), most)
-        free = self.components - most
-        start = jax.tree.map(lambda a: a[jnp.pad(kept, (0, free))], starts)
-        log_weight = jnp.where(jnp.arange(self.components) < most, 0.0, -jnp.inf)
-        tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.bank.angles, self.wide)
+        start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
+        log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
+        tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles, self.wide)
         paths = jax.vmap(lambda last: branch(tree, last))(jnp.arange(self.components))
         smoothed, here = jax.vmap(rts)(paths), jnp.isfinite(tree.log_weight)
         if first is not None:

@@ -185,7 +185,7 @@ class MixtureSmoother(AbstractBranching):
     of the right one after the first, and 60 nats below it after the second.
     """
     components: int = eqx.field(static=True, default=16)
-    """Gaussians of a mixture at most: with 12, one of twenty starts with both angles of an arm unknown was not found."""
+    """Gaussians of a mixture at most: with 12, one of twenty starts with both angles unknown was not found."""
 
     @property
     def bytes_per_row(self) -> int:

@@ -68,11 +68,12 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
 
     Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
     """
+    return _seconded(model, data, smoother.second(), _alone(model, data, smoother, key=key))
+
+
+def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+    """`e_step` without a second smoother."""
     keys = jax.random.split(key, data.t.shape[0])
-    return _seconded(model, data, smoother.second(), _first(model, data, smoother, keys))
-
-
-def _first(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
     outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
     return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
 
@@ -136,15 +137,22 @@ def _smooth(common, one) -> Posterior:
     return smoother(model, prepare(model, seq), key=key)
 
 
-@step(lambda model, *_: (model, MStepInfo(HERE, HERE), HERE, HERE))
+@step(lambda model, *_, **__: (model, MStepInfo(HERE, HERE), HERE, HERE))
 def em_step(
-    model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
+    model: AbstractModel,
+    data: Dataset,
+    smoother: AbstractSmoother,
+    m_step: AbstractMStep,
+    key: PRNGKeyArray,
+    *,
+    growing: bool = False,
 ) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:
     """One E-step and one M-step: the next model, the log-likelihoods of this one and the effective sample sizes.
 
-    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all.
+    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
+    horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
     """
-    posterior = e_step(model, data, smoother, key=key)
+    posterior = (_alone if growing else e_step)(model, data, smoother, key=key)
     model, info = m_step(model, posterior, data)
     return model, info, posterior.loglik, posterior.ess
 
@@ -184,7 +192,9 @@ def fit(
         seen = schedule.horizon(state.epoch, longest)
         key = jax.random.fold_in(state.key, state.epoch)
         rule = m_step.early() if seen < longest else m_step
-        proposal, info, loglik, ess = em_step(state.model, horizon(data, seen), smoother, rule, key)
+        proposal, info, loglik, ess = em_step(
+            state.model, horizon(data, seen), smoother, rule, key, growing=seen < longest
+        )
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
@@ -218,8 +228,7 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
     for trial in trials:  # the step that would follow does not count
-        keys = jax.random.split(key, data.t.shape[0])
-        posterior = _first(trial, data, smoother, keys)  # noise as large as the motion makes everything wide
+        posterior = _alone(trial, data, smoother, key=key)
         used = np.asarray(kept(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)
     return trials[int(np.argmax(logliks))]

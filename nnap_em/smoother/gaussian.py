@@ -74,7 +74,20 @@ class GaussianSmoother(AbstractSmoother):
             return filtered, rts(filtered)
 
         smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-        return *smoothed, _width(filtered, self.bank.angles)
+        return *smoothed, self.width(filtered, seq)
+
+    def width(self, filtered: Filtered, seq: Prepared) -> Float[Array, ""]:
+        """Largest standard deviation of the angles given the readings so far [rad]; 0 where they need no mixture.
+
+        Rows in which the bank still decides do not count, but for those before the first reading.
+        """
+        if not self.bank.angles:
+            return jnp.zeros_like(filtered.loglik)
+        variance = jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(self.bank.angles)], axis=1)
+        decided = 0 if self.bank.offsets.shape[0] == 1 else self.window
+        unread = jnp.cumsum(jnp.any(seq.observed, axis=1)) == 0
+        counts = unread | (jnp.arange(variance.shape[0]) >= decided)
+        return jnp.sqrt(jnp.max(jnp.where(counts, variance, 0.0)))
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""
@@ -102,13 +115,6 @@ class _Loosened(AbstractSmoother):
         """Smooth one sequence; it draws nothing."""
         start = self.smoother.likeliest(model, seq)
         return _posterior(*self.smoother.follow(model, seq, start, self.looser))
-
-
-def _width(filtered: Filtered, angles: tuple[int, ...]) -> Float[Array, ""]:
-    """Largest standard deviation of the angles given the readings so far [rad]; 0 where they need no mixture."""
-    if not angles:
-        return jnp.zeros_like(filtered.loglik)
-    return jnp.sqrt(jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]))
 
 
 def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) -> Posterior:

@@ -40,6 +40,7 @@ SECONDS = {
     "test_export.py": 23,
     "test_plant.py": 20,
     "test_tour.py": 60,
+    "test_mixture.py": 25,
     "test_check.py": 19,
     "test_findings.py": 18,
     "test_residual.py": 18,

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..data.logs import Logs, read_logs
 from ..data.recordings.mcap_writer import Channel, require_mcap, write_mcap
+from ..em.branches import Branch, branches
 from ..em.identify import Identified
 from ..em.predict import smoothed_states
 from ..em.store import load, model_file
@@ -24,9 +25,20 @@ def run(args: argparse.Namespace, say: Say) -> None:
     mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     say(f"wrote {len(logs.files)} files to {args.out}")
+    for other in branches(fitted.model, logs.data, fitted.smoother.tolerant(), key=fitted.state.key):
+        say(_line(other, fitted, logs))
     if args.mcap is not None:
         _write_channels(args.mcap, fitted, logs, states_of(fitted, mean, std))
         say(f"wrote {args.mcap}")
+
+
+def _line(other: Branch, fitted: Identified, logs: Logs) -> str:
+    """The place of another branch and its probability."""
+    first, last = other.rows
+    t, name = np.asarray(logs.data.t[other.sequence]), fitted.model.system.coordinates[other.angle]
+    ends = " to ".join(f"{other.mean[row, other.angle]:.2f}" for row in dict.fromkeys(other.rows))
+    span = f"from {t[first]:.2f} to {t[last]:.2f} s"
+    return f"{logs.files[other.sequence]}: with probability {other.weight:.2f} {name} is {ends} rad {span} instead"
 
 
 def _write_channels(path: Path, fitted: Identified, logs: Logs, smoothed: Channel) -> None:

@@ -228,4 +228,6 @@ def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system
     told = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
     if math.prod(counts[i] for i in told) > FEW or math.prod(counts) > MOST:
         counts = [1 if i in told else count for i, count in enumerate(counts)]
-    return StartBank(tuple(counts))
+    angles = tuple(j for j, is_angle in enumerate(system.angles) if is_angle)
+    unread = any(system.coordinates[j] not in rig.measured for j in angles)
+    return StartBank(tuple(counts), angles if unread else ())

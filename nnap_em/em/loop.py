@@ -12,12 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
-from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
+from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, kept
 
@@ -63,21 +64,70 @@ class Schedule(eqx.Module):
 
 
 def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
-    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`."""
-    sequences, rows = data.t.shape
-    keys = jax.random.split(key, sequences)
-    together = max(1, smoother.room // (rows * smoother.bytes_per_row))
-    outcomes = [each(_smooth, (model, one), (data, keys), together=together) for one in smoother.tries()]
+    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
+
+    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
+    """
+    return _seconded(model, data, smoother.second(), _alone(model, data, smoother, key=key))
+
+
+def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+    """`e_step` without a second smoother."""
+    keys = jax.random.split(key, data.t.shape[0])
+    outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
     return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+
+
+def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
+    """Each sequence by itself."""
+    together = max(1, smoother.room // (data.t.shape[1] * smoother.bytes_per_row))
+    return each(_smooth, (model, smoother), (data, keys), together=together)
+
+
+def _seconded(model: AbstractModel, data: Dataset, second: AbstractBranching | None, first: Posterior) -> Posterior:
+    """`first`, with the likeliest path of the second smoother where a sequence is wide."""
+    some = beyond(first, second)
+    if second is None or not some.size:
+        return first
+    size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
+    index = np.resize(some, size)
+    batch = jax.tree.map(lambda a: a[index], (data, first.state))
+    together = max(1, second.room // (data.t.shape[1] * second.bytes_per_row))
+    return _replaced(first, each(_likeliest_path, (model, second), batch, together=together), index)
+
+
+def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:
+    """Sequences that are wider than the first smoother can follow, so that the second one is used.
+
+    None where that is part of a larger program, which has no numbers to decide by.
+    """
+    if second is None or first.width is None or isinstance(first.width, Tracer):
+        return np.zeros(0, int)
+    return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
+
+
+def _likeliest_path(common, one) -> Posterior:
+    (model, second), (seq, first) = common, one
+    paths = second.paths(model, prepare(model, seq), first)
+    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths)
+
+
+@eqx.filter_jit
+def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
+    """`second` at the places `index` of `first`, but where it is no number."""
+    pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
+    known = jnp.isfinite(second.loglik)
+    second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
+    return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 
 
 @eqx.filter_jit
 def _likeliest(outcomes: list[Posterior]) -> Posterior:
-    """The likeliest for every sequence."""
+    """The likeliest for every sequence, with the width of the first."""
 
     def one(*tries):
         best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)._replace(width=tries[0].width)
 
     return jax.vmap(one)(*outcomes)
 
@@ -87,15 +137,22 @@ def _smooth(common, one) -> Posterior:
     return smoother(model, prepare(model, seq), key=key)
 
 
-@step(lambda model, *_: (model, MStepInfo(HERE, HERE), HERE, HERE))
+@step(lambda model, *_, **__: (model, MStepInfo(HERE, HERE), HERE, HERE))
 def em_step(
-    model: AbstractModel, data: Dataset, smoother: AbstractSmoother, m_step: AbstractMStep, key: PRNGKeyArray
+    model: AbstractModel,
+    data: Dataset,
+    smoother: AbstractSmoother,
+    m_step: AbstractMStep,
+    key: PRNGKeyArray,
+    *,
+    growing: bool = False,
 ) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:
     """One E-step and one M-step: the next model, the log-likelihoods of this one and the effective sample sizes.
 
-    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all.
+    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
+    horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
     """
-    posterior = e_step(model, data, smoother, key=key)
+    posterior = (_alone if growing else e_step)(model, data, smoother, key=key)
     model, info = m_step(model, posterior, data)
     return model, info, posterior.loglik, posterior.ess
 
@@ -135,7 +192,9 @@ def fit(
         seen = schedule.horizon(state.epoch, longest)
         key = jax.random.fold_in(state.key, state.epoch)
         rule = m_step.early() if seen < longest else m_step
-        proposal, info, loglik, ess = em_step(state.model, horizon(data, seen), smoother, rule, key)
+        proposal, info, loglik, ess = em_step(
+            state.model, horizon(data, seen), smoother, rule, key, growing=seen < longest
+        )
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
@@ -169,7 +228,7 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
     logliks = []
     for trial in trials:  # the step that would follow does not count
-        posterior = e_step(trial, data, smoother, key=key)
+        posterior = _alone(trial, data, smoother, key=key)
         used = np.asarray(kept(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)
     return trials[int(np.argmax(logliks))]

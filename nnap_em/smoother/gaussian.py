@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
-from ..numerics.gaussian import Gaussian, cholesky, cubature, lower, product
+from ..numerics.gaussian import Gaussian
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, relinearised, rts
+from .linear import linear_posterior
+from .mixture import MixtureSmoother
 from .posterior import AbstractSmoother, Posterior, likeliest
 from .start import StartBank
 
@@ -36,6 +38,10 @@ class GaussianSmoother(AbstractSmoother):
         """The smoother with looser first passes."""
         return dataclasses.replace(self, inflations=(1.0, 10.0, 100.0))
 
+    def second(self) -> MixtureSmoother | None:
+        """The mixture, where an angle is not read."""
+        return MixtureSmoother(self.bank.angles, self.linearise) if self.bank.angles else None
+
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""
         once = dataclasses.replace(self, inflations=(1.0,))
@@ -43,35 +49,55 @@ class GaussianSmoother(AbstractSmoother):
 
     def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
+        return self.tracked(model, seq)[:2]
+
+    def tracked(self, model, seq: Prepared) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
+        """Filtered and smoothed states of the last iteration, and the width of the first pass."""
         start = self.likeliest(model, seq)
         looser = jnp.log(jnp.asarray(self.inflations, seq.y.dtype))
         tracks = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
         best = likeliest(tracks[0].loglik)
-        return jax.tree.map(lambda a: a[best], tracks)
+        filtered, smoothed = jax.tree.map(lambda a: a[best], tracks[:2])
+        return filtered, smoothed, tracks[2][0]
 
-    def follow(self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]) -> tuple[Filtered, Smoothed]:
-        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model."""
+    def follow(
+        self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]
+    ) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
+        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model.
+
+        With the largest standard deviation of an angle in the first pass [rad].
+        """
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
         def again(_, now):
             filtered = relinearised(model, now[1].state, seq, self.linearise)
             return filtered, rts(filtered)
 
-        return jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+        smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
+        return *smoothed, self.width(filtered, seq)
+
+    def width(self, filtered: Filtered, seq: Prepared) -> Float[Array, ""]:
+        """Largest standard deviation of the angles given the readings so far [rad]; 0 where they need no mixture.
+
+        Rows in which the bank still decides do not count, but for those before the first reading.
+        """
+        if not self.bank.angles:
+            return jnp.zeros_like(filtered.loglik)
+        variance = jnp.max(jnp.diagonal(filtered.state.cov, axis1=1, axis2=2)[:, jnp.asarray(self.bank.angles)], axis=1)
+        decided = 0 if self.bank.offsets.shape[0] == 1 else self.window
+        unread = jnp.cumsum(jnp.any(seq.observed, axis=1)) == 0
+        counts = unread | (jnp.arange(variance.shape[0]) >= decided)
+        return jnp.sqrt(jnp.max(jnp.where(counts, variance, 0.0)))
 
     def likeliest(self, model, seq: Prepared) -> Gaussian:
         """The start of the bank that the first samples make likeliest."""
-        starts, log_weight = self.bank.hypotheses(model.start)
-        if log_weight.shape[0] == 1:
-            return jax.tree.map(lambda a: a[0], starts)
-        head = jax.tree.map(lambda a: a[: self.window], seq)
-        loglik = jax.vmap(lambda start: ekf(model, start, head, self.linearise).loglik)
-        best = likeliest(loglik(starts) + log_weight)
+        starts, score = self.bank.scored(model, seq, self.linearise, self.window)
+        best = likeliest(score)
         return jax.tree.map(lambda a: a[best], starts)
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        return linear_posterior(*self.path(model, seq))
+        return _posterior(*self.tracked(model, seq))
 
 
 class _Loosened(AbstractSmoother):
@@ -88,7 +114,11 @@ class _Loosened(AbstractSmoother):
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
         start = self.smoother.likeliest(model, seq)
-        return linear_posterior(*self.smoother.follow(model, seq, start, self.looser))
+        return _posterior(*self.smoother.follow(model, seq, start, self.looser))
+
+
+def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) -> Posterior:
+    return linear_posterior(filtered, smoothed)._replace(width=width)
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
@@ -99,29 +129,3 @@ def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
 def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:
     """The cubature (sigma-point) filter with RTS smoother."""
     return GaussianSmoother(bank, Cubature(), **options)
-
-
-def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
-    """The posterior of a model that was linearised about a path."""
-    prev, following = pair_nodes(smoothed)
-    endless = jnp.full_like(filtered.loglik, jnp.inf)
-    affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-    kick = following - (jnp.sum(affine.matrix * prev[..., None, :], axis=-1) + affine.offset)
-    return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
-
-
-def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:
-    """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) of every step."""
-
-    def one(mean, cov, gain, mean_next, cov_next):
-        n = mean.shape[0]
-        unit = cubature(2 * n, mean.dtype)
-        later = lower(cholesky(cov_next))
-        left = cov - product(product(gain, cov_next), gain.T)
-        rest = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
-        spread_next = product(unit[:, :n], later.T)
-        following = mean_next[None] + spread_next
-        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], rest.T), following
-
-    mean, cov = smoothed.state
-    return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -111,8 +111,11 @@ def linear_reading(model, x: Float[Array, " state"], u: Any) -> Reading:
     return Reading(rows, value - product(rows, x))
 
 
-def _condition(state: Gaussian, reading: Reading, r, y, observed):
-    """Absorb readings one at a time: y_i = rows_i x + offset_i + noise of variance r_i."""
+def absorbed(state: Gaussian, reading: Reading, r, y, observed):
+    """`state` after readings, one at a time: y_i = rows_i x + offset_i + noise of variance r_i.
+
+    With it the whitened innovations, their log variances and the gains, 0 where nothing is `observed`.
+    """
     mean, cov = state
     rows = reading.rows
     whitened, log_variance, gains = [], [], []
@@ -129,6 +132,20 @@ def _condition(state: Gaussian, reading: Reading, r, y, observed):
     return Gaussian(mean, symmetric(cov)), jnp.stack(whitened), jnp.stack(log_variance), jnp.stack(gains)
 
 
+def moved(state: Gaussian, affine: Affine, q: Float[Array, "state state"], active) -> tuple[Affine, Gaussian]:
+    """The step that is made, none where it is not `active`, and the prediction of the next row."""
+    stay = jnp.eye(state.mean.shape[0], dtype=state.mean.dtype)
+    rest = Affine(stay, jnp.zeros_like(state.mean), jnp.zeros_like(stay))
+    affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
+    following = Gaussian(
+        product(affine.matrix, state.mean) + affine.offset,
+        symmetric(product(product(affine.matrix, state.cov), affine.matrix.T))
+        + affine.noise
+        + jnp.where(active, q, 0.0),
+    )
+    return affine, following
+
+
 def _filter(log_q, log_r, start: Gaussian, seq: Prepared, given, affine_at, reading_at) -> Filtered:
     """Kalman recursion.
 
@@ -136,21 +153,12 @@ def _filter(log_q, log_r, start: Gaussian, seq: Prepared, given, affine_at, read
     emission at a predicted mean, of what is `given` in the row.
     """
     q, r = jnp.diag(jnp.exp(log_q)), jnp.exp(log_r)
-    stay = jnp.eye(start.mean.shape[0], dtype=start.mean.dtype)
-    rest = Affine(stay, jnp.zeros_like(start.mean), jnp.zeros_like(stay))
 
     def step(predicted, slices):
         y, observed, active, given = slices
         reading = reading_at(predicted.mean, given)
-        state, whitened, log_variance, gain = _condition(predicted, reading, r, y, observed)
-        affine = affine_at(state, given)
-        affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
-        following = Gaussian(
-            product(affine.matrix, state.mean) + affine.offset,
-            symmetric(product(product(affine.matrix, state.cov), affine.matrix.T))
-            + affine.noise
-            + jnp.where(active, q, 0.0),
-        )
+        state, whitened, log_variance, gain = absorbed(predicted, reading, r, y, observed)
+        affine, following = moved(state, affine_at(state, given), q, active)
         return following, (state, predicted, whitened, log_variance, gain, affine, reading)
 
     _, (state, predicted, whitened, log_variance, gain, affine, reading) = jax.lax.scan(

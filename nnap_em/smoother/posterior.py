@@ -25,6 +25,8 @@ class Posterior(NamedTuple):
     loglik: Float[Array, "*seq"]
     ess: Float[Array, "*seq"]
     """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
+    width: Float[Array, "*seq"] | None = None
+    """Largest standard deviation of an angle given the readings so far [rad]; None where it is not reported."""
 
 
 class AbstractSmoother(eqx.Module):
@@ -48,9 +50,33 @@ class AbstractSmoother(eqx.Module):
         """
         return self
 
+    def second(self) -> "AbstractBranching | None":
+        """The smoother of sequences whose `width` is beyond its `wide`; None where there is none."""
+        return None
+
     def tries(self) -> Sequence["AbstractSmoother"]:
         """Smoothers of one structure, one program for all, of which each sequence keeps the likeliest outcome."""
         return (self,)
+
+
+class AbstractBranching(AbstractSmoother):
+    """A smoother that follows several paths of one sequence; it serves where another finds the posterior too wide."""
+
+    @property
+    @abstractmethod
+    def wide(self) -> float:
+        """Largest `Posterior.width` that is left to the other one [rad]."""
+
+    @property
+    @abstractmethod
+    def angles(self) -> tuple[int, ...]:
+        """Places of the angles in which paths differ."""
+
+    @abstractmethod
+    def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
+        """The posterior about each of several paths, and about the path `first`, with a leading axis; the likelihood is
+        -inf where there is none.
+        """
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

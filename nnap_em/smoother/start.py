@@ -1,11 +1,16 @@
 """Hypotheses of the start: a hidden angle known to half a radian makes the first second curved or split."""
 
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..model.base import Prepared
 from ..numerics.gaussian import Gaussian
+from .kalman import ekf
 
 REACH = 2.5
 """Outermost hypotheses, in standard deviations of the prior."""
@@ -23,8 +28,12 @@ class StartBank(eqx.Module):
     shrink: Float[Array, " state"]
     """Standard deviation of a hypothesis over that of the prior."""
 
-    def __init__(self, counts: tuple[int, ...]):
+    angles: tuple[int, ...] = eqx.field(static=True, default=())
+    """Places of all angles where one of them is not read: what becomes wide there is cut later, too."""
+
+    def __init__(self, counts: tuple[int, ...], angles: tuple[int, ...] = ()):
         """`counts` hypotheses along each state (1: as it is)."""
+        self.angles = angles
         lines = [np.linspace(-REACH, REACH, n) if n > 1 else np.zeros(1) for n in counts]
         grid = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=-1)
         self.offsets = jnp.asarray(grid, float)
@@ -43,3 +52,13 @@ class StartBank(eqx.Module):
         means = start.mean[None] + bank.offsets * spread[None]
         cov = start.cov * jnp.outer(bank.shrink, bank.shrink)
         return Gaussian(means, jnp.tile(cov[None], (means.shape[0], 1, 1))), -0.5 * jnp.sum(self.offsets**2, axis=-1)
+
+    def scored(
+        self, model, seq: Prepared, linearise: Callable, window: int
+    ) -> tuple[Gaussian, Float[Array, " hypothesis"]]:
+        """The hypotheses, and the log of prior and likelihood of each over the first `window` samples."""
+        starts, log_weight = self.hypotheses(model.start)
+        if log_weight.shape[0] == 1:
+            return starts, log_weight
+        head = jax.tree.map(lambda a: a[:window], seq)
+        return starts, jax.vmap(lambda start: ekf(model, start, head, linearise).loglik)(starts) + log_weight

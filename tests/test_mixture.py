@@ -1,0 +1,224 @@
+"""The Gaussian-sum smoother: moments of its parts, an affine model, and a grid over a state that may have two signs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import Dataset
+from nnap_em.em.branches import APART, branches, modes
+from nnap_em.em.loop import e_step
+from nnap_em.model.base import AbstractModel, prepare
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import CubatureSmoother
+from nnap_em.smoother.kalman import CUBATURE
+from nnap_em.smoother.mixture import (
+    DISTANCE,
+    NARROW,
+    WIDE,
+    Components,
+    MixtureSmoother,
+    branch,
+    merged,
+    mixture_filter,
+    split,
+)
+from nnap_em.smoother.start import StartBank
+
+ROWS = 60
+KEY = jax.random.key(0)
+
+
+class _Fall(AbstractModel):
+    """An angle that falls from upright to either side, x' = x + dt (x - x^3 / 4), of which x^2 is read, or x itself.
+
+    The input u is 0 where the square is read and 1 where the angle is.
+    """
+
+    log_q: jax.Array
+    log_r: jax.Array
+    start: Gaussian
+    bend: float = eqx.field(static=True, default=1.0)
+    measured: tuple[int, ...] = eqx.field(static=True, default=())
+    dt: float = eqx.field(static=True, default=0.05)
+
+    def transition(self, x, u, force=None):
+        return x + self.dt * (x - self.bend * x**3 / 4)
+
+    def emission(self, x, u):
+        return jnp.where(u > 0, x, self.bend * x**2)
+
+
+def _model(bend: float = 1.0, mean: float = 0.05) -> _Fall:
+    start = Gaussian(jnp.asarray([mean]), jnp.asarray([[0.25**2]]))
+    return _Fall(jnp.log(jnp.asarray([4e-4])), jnp.log(jnp.asarray([0.01])), start, bend)
+
+
+def _logs(signs, last: int) -> Dataset:
+    """One sequence for each side, whose angle is read in the rows from `last` on."""
+    rng = np.random.default_rng(0)
+    x = np.zeros((len(signs), ROWS))
+    x[:, 0] = 0.1 * np.asarray(signs)
+    for k in range(1, ROWS):
+        x[:, k] = x[:, k - 1] + 0.05 * (x[:, k - 1] - x[:, k - 1] ** 3 / 4) + 0.02 * rng.normal(size=len(signs))
+    u = np.broadcast_to(np.arange(ROWS) >= last, x.shape).astype(float)
+    y = np.where(u > 0, x, x**2) + 0.1 * rng.normal(size=x.shape)
+    t = np.broadcast_to(0.05 * np.arange(ROWS), x.shape)
+    return Dataset(*map(jnp.asarray, (t, u[..., None], y[..., None], np.ones(x.shape, bool))))
+
+
+def _grid(model: _Fall, seq: Dataset) -> tuple[np.ndarray, np.ndarray, float]:
+    """Nodes, posterior over them in every row, and log p(y), by sums over a fine grid."""
+    x = np.linspace(-3.5, 3.5, 2001)
+    width, q, r = x[1] - x[0], np.exp(np.asarray(model.log_q))[0], np.exp(np.asarray(model.log_r))[0]
+    to = np.asarray(model.transition(jnp.asarray(x), None))
+    kernel = np.exp(-0.5 * (x[:, None] - to[None]) ** 2 / q) / np.sqrt(2 * np.pi * q) * width
+    y, u = np.asarray(seq.y)[:, 0], np.asarray(seq.u)[:, 0]
+    seen = np.where(u[:, None] > 0, x[None], model.bend * x[None] ** 2)
+    like = np.exp(-0.5 * (y[:, None] - seen) ** 2 / r) / np.sqrt(2 * np.pi * r)
+    mean, var = np.asarray(model.start.mean)[0], np.asarray(model.start.cov)[0, 0]
+    now = np.exp(-0.5 * (x - mean) ** 2 / var) / np.sqrt(2 * np.pi * var) * width
+    ahead, loglik = [], 0.0
+    for k in range(len(y)):
+        now = (kernel @ now if k else now) * like[k]
+        loglik += np.log(now.sum())
+        now = now / now.sum()
+        ahead.append(now)
+    back, out = np.ones_like(x), []
+    for k in reversed(range(len(y))):
+        both = ahead[k] * back
+        out.append(both / both.sum())
+        back = kernel.T @ (like[k] * back)
+        back = back / back.max()
+    return x, np.stack(out[::-1]), loglik
+
+
+def _mixture(model: _Fall, data: Dataset):
+    """Posterior of every sequence by the mixture alone."""
+    smoother = MixtureSmoother((0,), CUBATURE)
+    return eqx.filter_jit(jax.vmap(lambda seq: smoother(model, prepare(model, seq))))(data)
+
+
+_split = jax.jit(split, static_argnums=(1, 2))
+_merged = jax.jit(merged)
+
+
+def _moments(mixture: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    weight = np.exp(np.asarray(mixture.log_weight))
+    mean, cov = map(np.asarray, mixture.state)
+    whole = np.einsum("k,ki->i", weight, mean) / weight.sum()
+    off = mean - whole
+    return weight.sum(), whole, np.einsum("k,kij->ij", weight, cov + off[:, :, None] * off[:, None, :]) / weight.sum()
+
+
+def _components(seed: int, places: int = 4, used: int = 2) -> Components:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(places, 3, 3))
+    state = Gaussian(jnp.asarray(rng.normal(size=(places, 3))), jnp.asarray(root @ root.swapaxes(1, 2)))
+    log_weight = jnp.where(jnp.arange(places) < used, jnp.asarray(rng.normal(size=places)), -jnp.inf)
+    return Components(state, log_weight, jnp.arange(places))
+
+
+@pytest.mark.parametrize("wide", [1e-3, 1e3], ids=["split", "not split"])
+def test_split_and_merge_keep_weight_mean_and_covariance(wide):
+    for seed in range(3):
+        before = _components(seed)
+        parts = _split(before, (0, 2), wide)
+        assert int(jnp.sum(jnp.isfinite(parts.log_weight))) == (4 if wide < 1 else 2)
+        for after in (parts, _merged(_merged(parts)), _merged(_merged(_merged(parts)))):
+            for a, b in zip(_moments(after), _moments(before), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-10)
+
+
+def test_a_split_narrows_the_angle_and_only_components_that_are_wide():
+    before = _components(1, places=3, used=2)
+    std = np.sqrt(np.asarray(before.state.cov)[:2, 1, 1])
+    wide = float(std.mean())  # one of the two is
+    parts = _split(before, (1,), wide)
+    after = np.sqrt(np.asarray(parts.state.cov)[:, 1, 1])
+    assert np.argmax(std) == int(parts.source[-1]) == int(parts.source[-2])
+    np.testing.assert_allclose(after[[np.argmax(std), 3, 4]], 2 / 3 * std.max(), rtol=1e-12)
+    np.testing.assert_allclose(after[np.argmin(std)], std.min(), rtol=1e-15)
+
+
+def test_the_pair_with_the_smallest_bound_is_merged():
+    """Two that are nearly the same become one before a third that is far and as heavy."""
+    state = Gaussian(jnp.asarray([[0.0], [5.0], [0.1]]), jnp.ones((3, 1, 1)))
+    one = _merged(Components(state, jnp.log(jnp.asarray([0.3, 0.4, 0.3])), jnp.asarray([7, 8, 9])))
+    np.testing.assert_allclose(np.sort(np.asarray(one.state.mean)[:, 0]), [0.05, 5.0], rtol=1e-12)
+    assert set(np.asarray(one.source).tolist()) == {7, 8}
+
+
+def test_an_affine_model_has_one_posterior_whatever_is_split():
+    """All branches end in the Kalman smoother, since the relinearised model does not depend on the path."""
+    model = _model(bend=0.0)
+    data = _logs([1], 30)
+    seq = prepare(model, jax.tree.map(lambda a: a[0], data))
+    start = Gaussian(jnp.tile(model.start.mean, (8, 1)), jnp.tile(model.start.cov, (8, 1, 1)))
+    free = jnp.where(jnp.arange(8) > 0, -jnp.inf, 0.0)
+    tree = eqx.filter_jit(mixture_filter)(model, start, free, seq, CUBATURE, (0,))
+    assert int(jnp.sum(jnp.isfinite(tree.log_weight))) > 1  # it was split
+    chains = eqx.filter_jit(jax.vmap(lambda last: branch(tree, last)))(jnp.arange(8))
+    for chain in (jax.tree.map(lambda a, i=i: a[i], chains) for i in np.flatnonzero(np.isfinite(tree.log_weight))):
+        reach = DISTANCE * np.sqrt(np.asarray(chain.state.cov)[:, 0, 0]) / NARROW  # of a part from the whole
+        read = chain.gain[:, 0, 0] * chain.innovation[:, 0] * np.exp(0.5 * chain.log_variance[:, 0])
+        shift = np.abs(np.asarray(chain.state.mean[:, 0] - chain.predicted.mean[:, 0] - read))
+        assert np.all(shift < reach + 1e-12) and np.mean(shift < 1e-12) > 0.5  # splits and merges are rare
+        step = chain.affine.matrix[:-1, 0, 0] * chain.state.mean[:-1, 0] + chain.affine.offset[:-1, 0]
+        np.testing.assert_allclose(chain.predicted.mean[1:, 0], step, rtol=1e-12)  # each came from the one before it
+    one = eqx.filter_jit(CubatureSmoother(StartBank((1,))))(model, seq)
+    found = _mixture(model, data)
+    np.testing.assert_allclose(found.state.mean[0], one.state.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.state.cov[0], one.state.cov, rtol=1e-9)
+    np.testing.assert_allclose(found.loglik[0], one.loglik, rtol=1e-12)
+
+
+def test_the_likelier_side_is_the_one_of_the_grid():
+    """The side shows only at the end; before it a single Gaussian takes the one to which its mean leans."""
+    model, data = _model(), _logs([1, -1], ROWS - 4)
+    first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
+    found = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
+    assert np.all(np.asarray(found.width) > WIDE)
+    for i in range(2):
+        x, posterior, loglik = _grid(model, jax.tree.map(lambda a, i=i: a[i], data))
+        mean = posterior @ x
+        std = np.sqrt(posterior @ x**2 - mean**2)
+        off = (np.asarray(found.state.mean)[i, :, 0] - mean) / std
+        assert np.sqrt(np.mean(off**2)) < 0.3  # of a standard deviation: what linearisation costs
+        np.testing.assert_allclose(found.loglik[i], loglik, atol=0.7)
+        assert first.loglik[i] <= found.loglik[i]
+    assert first.loglik[1] < found.loglik[1] - 5  # it was on the other side
+
+
+def test_two_sides_that_nothing_decides_are_both_reported():
+    """With the square alone, and a start between them, the grid has half of its mass on each side."""
+    model, data = _model(mean=0.0), _logs([1], ROWS)
+    x, posterior, _ = _grid(model, jax.tree.map(lambda a: a[0], data))
+    right = posterior[-1] * (x > 0)
+    np.testing.assert_allclose(right.sum(), 0.5, atol=1e-6)
+    bank = StartBank((1,), (0,))
+    (other,) = branches(model, data, CubatureSmoother(bank), key=KEY)
+    assert other.sequence == 0 and other.angle == 0 and other.rows[1] == ROWS - 1
+    np.testing.assert_allclose(other.weight, 0.5, atol=0.1)
+    np.testing.assert_allclose(np.abs(other.mean[-1, 0]), right @ x / right.sum(), atol=0.05)
+
+
+def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
+    """The angle is read from the first row on."""
+    model, data = _model(), _logs([1, -1], 0)
+    first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
+    found = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
+    assert np.all(np.asarray(found.width) < WIDE)
+    for a, b in zip(
+        jax.tree.leaves(first._replace(width=None)), jax.tree.leaves(found._replace(width=None)), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_paths_that_differ_by_whole_turns_are_one_branch():
+    near, far = np.full((5, 1), 0.2), np.full((5, 1), 0.3 + APART)
+    paths = np.stack([near, near + 2 * np.pi, far, near + 0.5 * APART, far])
+    chosen, weight = modes(np.append(np.log([4.0, 3.0, 1.0, 2.0]), -np.inf), paths)
+    assert chosen.tolist() == [0, 2]
+    np.testing.assert_allclose(weight, [0.8, 0.2])

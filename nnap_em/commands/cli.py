@@ -306,16 +306,16 @@ def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
     """`notify`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
     noisily.
     """
-    asked = False
+    interrupted = False
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
+        nonlocal interrupted
+        interrupted = True
         signal.default_int_handler(number, frame)
 
     def line(text: str) -> None:
         say(text)
-        if asked:
+        if interrupted:
             raise KeyboardInterrupt
 
     def dropped(lost: Any) -> None:

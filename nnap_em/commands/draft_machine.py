@@ -99,9 +99,9 @@ def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
 
 def _kinds(fields: Sequence[tuple[Address, str]]) -> dict[str, Address]:
     """Meanings of names that are not in the file: `theta2`, and `input2` for a torque."""
-    told = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
+    columns = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
     out: dict[str, Address] = {}
-    for column, (at, _) in zip(told, fields, strict=True):
+    for column, (at, _) in zip(columns, fields, strict=True):
         number = "" if column.kind != "input" or column.number is None else str(column.number)
         out.setdefault(column.kind + number, at)
     return out

@@ -44,9 +44,9 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
         names = {joint: f"theta{i}" for i, joint in enumerate(joints, 1)}
         for column, at in (*joint_columns(topic, names).items(), *_called(topic)):
             out.setdefault(column, at)
-    told = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
+    torques = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
     efforts = {f"tau{i}": at for i, at in enumerate(_efforts(topics), 1)}
-    return out | ({} if any(meaning(name).kind == "input" for name in out) else told or efforts)
+    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques or efforts)
 
 
 def joints_of(topic: Topic) -> list[str]:
@@ -75,9 +75,9 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
     """Fields whose names mean a state or an input; rows of a wide data set count from 0."""
     for field in topic.fields:
         word = re.sub(r"\[(\d+)\]$", lambda m: str(int(m[1]) + 1), field.rpartition(".")[2])
-        told = meaning(word)
-        if told.kind and told.kind != "time" and "[" not in word and "stamp" not in field:
-            yield (word if told.kind == "input" else told.kind), Address(topic.name, field)
+        column = meaning(word)
+        if column.kind and column.kind != "time" and "[" not in word and "stamp" not in field:
+            yield (word if column.kind == "input" else column.kind), Address(topic.name, field)
 
 
 def others(topics: Sequence[Topic], found: Mapping[str, Address]) -> list[str]:

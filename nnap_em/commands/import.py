@@ -28,7 +28,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
         logs = []
         for path in args.logs:
             logs.append(bring(path, rig, build_system(rig).states, plan, shifts))
-            say(f"{path}: {_told(logs[-1])}")
+            say(f"{path}: {_summary(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
         text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
@@ -50,6 +50,6 @@ def _reaching(text: str, here: Path, out: Path) -> str:
     return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda found: found[1] + path, text, count=1)
 
 
-def _told(log: Brought) -> str:
+def _summary(log: Brought) -> str:
     used = [stretch for stretch in log.sequences if not stretch.why]
     return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

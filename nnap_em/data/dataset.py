@@ -28,8 +28,8 @@ class Dataset(NamedTuple):
         count, gone = valid[..., 0].size, np.isnan(y[valid]).mean() if y[valid].size else 0.0
         t = np.asarray(self.t)
         longest, inputs = float(np.max(t[..., -1] - t[..., 0])), np.shape(self.u)[-1]
-        said = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
-        return f"Dataset: {said}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
+        size = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
+        return f"Dataset: {size}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
 
 
 def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:

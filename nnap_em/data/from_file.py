@@ -8,7 +8,7 @@ import numpy as np
 
 from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sense, of_body, packed, states
 from .mjcf import Part, read_machine
-from .rig import Declared, RigWarning, SystemSpec, Told, flat, kinds_of, nearest
+from .rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
 from .servo import TORQUE, Drive, read_drives
 from .servo import keys as drive_keys
 from .servo import named as drive_numbers
@@ -18,7 +18,7 @@ _FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
 _UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
 
 
-def declare(root: Any) -> Told:
+def declare(root: Any) -> Declaration:
     """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
     model = root.table("model")
     model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
@@ -43,7 +43,7 @@ def declare(root: Any) -> Told:
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
-    return Told(spec, parameters, columns, joints, machine, kinds_of(drives))
+    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives))
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:

@@ -13,14 +13,14 @@ from jaxtyping import Float, Int
 from .dataset import DataError, Dataset, pad
 from .formats import log_files, place, read_table, refuse
 from .frozen import FULL
-from .lost import retell
+from .lost import interpolated
 from .plausible import Columns, doubts, repeats
 from .rig import Rig
 from .rough import Rough, rough
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
-TOLD = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
+INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 _REASONS = {
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
@@ -175,9 +175,9 @@ def _sequence(whole: _Table, found: Sequence[Rough], rig: Rig) -> _Sequence:
     for entry in found:
         k, count = int(entry.rows[0]), entry.rows.size
         masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
-        said = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
+        problem = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
         mend = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {said}; {mend}", DataWarning, 2)
+        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {mend}", DataWarning, 2)
     return _Sequence((t, u, y), (t, u, read), masked)
 
 
@@ -215,9 +215,9 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     full[rows] = table
     lost = np.isnan(full[:, 0])
     full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
-    told = [retell(u, lost) for u in full[:, inputs].T]
-    full[:, inputs] = np.stack([u for u, _ in told], axis=1) if told else full[:, inputs]
-    dark = np.any([doubt > TOLD for _, doubt in told], axis=0) if told else np.zeros(size, bool)
+    filled = [interpolated(u, lost) for u in full[:, inputs].T]
+    full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
+    dark = np.any([doubt > INTERPOLATION_ERROR for _, doubt in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
     here, masked = rows[rows < end], []
     for first, count, kind, mend in (
@@ -227,9 +227,9 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
-            said = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
-            said += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
-            warnings.warn(f"{path}: {place(path, 'time', k)}: {said}; {mend}", DataWarning, 2)
+            problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
+            problem += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
+            warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {mend}", DataWarning, 2)
     return _Table(path, full[:end], here, masked)
 
 

@@ -150,8 +150,8 @@ def packed(machine: Machine) -> str:
 @lru_cache(maxsize=64)
 def unpacked(text: str) -> Machine:
     """The machine in a text of `packed`."""
-    told = json.loads(text, parse_int=int)
-    fields = [_tuples(part) for part in told]
+    parts = json.loads(text, parse_int=int)
+    fields = [_tuples(part) for part in parts]
     kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "gauges": Gauge, "spots": Spot, "senses": Sense}
     named = dict(zip(Machine._fields, fields, strict=False))  # models that were saved before a field was there
     whole: dict[str, Any] = {

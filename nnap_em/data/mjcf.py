@@ -174,18 +174,18 @@ def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
             return _build(mujoco.MjSpec.from_string(_bare_urdf(root)), part)
         return _build(mujoco.MjSpec.from_file(str(path)), part)
     except ValueError as error:
-        said = " ".join(str(error).split())
-    if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", said, re.I):
+        message = " ".join(str(error).split())
+    if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", message, re.I):
         whole = _included(path, root)
         _strip(path, whole)
         try:
             return _build(mujoco.MjSpec.from_string(ET.tostring(whole, encoding="unicode")), part)
         except ValueError as error:
-            said = " ".join(str(error).split())
-    refuse(path, f"MuJoCo's compiler refuses it: {said}", _mend(said))
+            message = " ".join(str(error).split())
+    refuse(path, f"MuJoCo's compiler refuses it: {message}", _mend(message))
 
 
-def _mend(said: str) -> str:
+def _mend(message: str) -> str:
     """Remedies for the commonest errors of the compiler."""
     mends = {
         r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
@@ -195,7 +195,7 @@ def _mend(said: str) -> str:
         r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
         r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
     }
-    found = (mend for pattern, mend in mends.items() if re.search(pattern, said, re.I))
+    found = (mend for pattern, mend in mends.items() if re.search(pattern, message, re.I))
     return next(found, "correct the file; MuJoCo's viewer shows the same error")
 
 

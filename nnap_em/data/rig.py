@@ -79,11 +79,11 @@ class SystemSpec:
     """The joint of an input whose name does not determine it."""
     sensors: tuple[str, ...] = ()
     """Columns that are read beside states."""
-    declare: "Callable[[_Table], Told] | None" = None
+    declare: "Callable[[_Table], Declaration] | None" = None
     """Declaration by the file that rig.toml names and by the whole table, for a system with names from a file."""
 
 
-class Told(NamedTuple):
+class Declaration(NamedTuple):
     """Declaration of [model] and [input]."""
 
     spec: SystemSpec
@@ -178,8 +178,8 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
     system = model.choice("type", systems)
-    told = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
-    spec = told.spec
+    declaration = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
+    spec = declaration.spec
     sampling.check(("dt", "input_hold", "clock"))
     sampling.choice("input_hold", ("zero-order",))
     start.check((), spec.states)
@@ -187,29 +187,29 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     return Rig(
         name=root.text("name"),
         system=system,
-        parameters=told.parameters,
+        parameters=declaration.parameters,
         friction=_FRICTION[model.choice("friction", _FRICTION)],
-        input_columns=told.input_columns,
-        input_joints=told.input_joints,
+        input_columns=declaration.input_columns,
+        input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
         clock=sampling.choice("clock", _CLOCKS),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},
-        limits=read_bounds(root.table("limits", absent={}), told.input_columns, spec.states),
-        machine=told.machine,
-        input_kinds=told.input_kinds,
+        limits=read_bounds(root.table("limits", absent={}), declaration.input_columns, spec.states),
+        machine=declaration.machine,
+        input_kinds=declaration.input_kinds,
     )
 
 
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    told = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
+    bodies = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
-    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else told
+    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
     lines += [f'friction = "{"unknown" if rig.friction else "none"}"    # static map velocity -> torque in each joint']
-    lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
+    lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
     unit = "" if rig.input_kinds else "    # N m, or N on a slide"
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
     lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
@@ -366,14 +366,14 @@ def _parameter(model: _Table, key: str) -> Declared:
     return value
 
 
-def _declared(root: _Table, spec: SystemSpec) -> Told:
+def _declared(root: _Table, spec: SystemSpec) -> Declaration:
     """Declaration of a system of these parameters by [model] and [input]."""
     model = root.table("model")
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
     parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
     columns, joints, drives = _input(root, model, spec)
-    return Told(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
+    return Declaration(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
 
 
 def kinds_of(drives: Mapping[str, Drive]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The next experiment: which inputs, played on the machine, would answer the open questions best."""
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,9 +16,9 @@ from ..em.predict import drawn_paths, smooth
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .questions import AbstractQuestion, Apart, Friction, Parameters, Several, Told, share
+from .questions import AbstractQuestion, Apart, Friction, Information, Parameters, Several, share
 from .rivals import Rivals
-from .search import EFFORT, Bench, Effort, Plan, Say, search, tell, told
+from .search import EFFORT, Bench, Effort, Plan, Say, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
 DRAWN = 32
@@ -46,9 +47,9 @@ class Design(NamedTuple):
     middle: Float[np.ndarray, "sequence time readable"]
     high: Float[np.ndarray, "sequence time readable"]
     fit: Fit
-    told: Told
+    expected: Information
     """Information of all sequences."""
-    old: Told
+    old: Information
     """Information of as much time of the old inputs."""
     question: AbstractQuestion
     rivals: tuple[Rivals, ...]
@@ -59,9 +60,15 @@ class Design(NamedTuple):
     """Weight of velocities; 0 where the logs never were."""
 
     @property
-    def nothing(self) -> Told:
+    def nothing(self) -> Information:
         """Information without an experiment."""
-        return jax.tree.map(np.zeros_like, self.told)
+        return jax.tree.map(np.zeros_like, self.expected)
+
+    @property
+    def told(self) -> Information:
+        """The old name of `expected`, for one release."""
+        warnings.warn("Design.told is now Design.expected", DeprecationWarning, stacklevel=2)
+        return self.expected
 
 
 def design_experiment(
@@ -94,7 +101,7 @@ def design_experiment(
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
     slow = _slow(fit, visited)
     friction = _friction(fit, visited, slow)
-    asked = _question(question, fitted, fit, friction, apart)
+    criterion = _question(question, fitted, fit, friction, apart)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
@@ -104,8 +111,8 @@ def design_experiment(
     count = float(np.sum(np.asarray(data.valid)[used]))
     bench = bench._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
-    quick = bench._replace(informed=not isinstance(asked, Apart))
-    plan = search(quick, asked, sequences, rng=rng, effort=effort, say=say)
+    quick = bench._replace(informed=not isinstance(criterion, Apart))
+    plan = search(quick, criterion, sequences, rng=rng, effort=effort, say=say)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
     plan, found = _checked(bench, checked, plan, effort, say)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
@@ -120,9 +127,9 @@ def design_experiment(
         middle,
         high,
         fit,
-        plan.told.sum(),
+        plan.expected.sum(),
         row.times(bench.share * sequences * t.size),
-        asked,
+        criterion,
         tuple(rivals),
         apart,
         slow,
@@ -195,7 +202,7 @@ def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say)
         proposal.shape[~ok, :, -1] *= SHRINKS
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
-    _, each = tell(bench, _padded(proposal, effort.batch), effort.few)
+    _, each = evaluated(bench, _padded(proposal, effort.batch), effort.few)
     return Plan(proposal, each.of(np.arange(len(proposal.family)))), found
 
 
@@ -204,7 +211,7 @@ def _padded(proposal: Proposal, batch: int) -> Proposal:
     return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
 
 
-def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
+def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:
     """Information of a row of the logs, the mean along their smoothed motions, as far as a new sequence is long."""
     rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
@@ -213,5 +220,5 @@ def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time 
     t, u, y = (grow(a, mode="edge") for a in cut[:3])
     cut = Dataset(t, u, y, grow(cut.valid))
     x = grow(path[used, :rows], mode="edge")
-    each = told(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
+    each = expected_information(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
     return each.sum().times(1.0 / max(float(cut.valid.sum()), 1.0))

@@ -41,8 +41,8 @@ class Rivals(NamedTuple):
 
 def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
     """Pairs that a diagnosis left open: a law of its model, or None where nothing was added, and a rival."""
-    law = lambda told: Law(told["name"], told.get("joint"), told.get("channel"))  # noqa: E731
-    out: list[tuple[Law | None, Law]] = [(None, law(told)) for told in report.get("cannot_tell", [])]
+    law = lambda entry: Law(entry["name"], entry.get("joint"), entry.get("channel"))  # noqa: E731
+    out: list[tuple[Law | None, Law]] = [(None, law(entry)) for entry in report.get("cannot_tell", [])]
     for effect in report.get("effects", []):
         out += [(law(effect), law(other)) for other in effect.get("equivalent", [])]
     return out

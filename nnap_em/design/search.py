@@ -17,7 +17,7 @@ from ..storage.journal import HERE, step
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
-from .questions import AbstractQuestion, Told
+from .questions import AbstractQuestion, Information
 from .signals import Proposal, drawn, mutated, played, starts
 
 Say = Callable[[str], None]
@@ -66,23 +66,23 @@ class Plan(NamedTuple):
     """Sequences, and the information of each."""
 
     proposal: Proposal
-    told: Told
+    expected: Information
 
 
-@step(lambda bench, *_: (HERE, Told(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
-def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Told]:
+@step(lambda bench, *_: (HERE, Information(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
+def evaluated(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
     """Proposals that stay inside the limits, and the information of each."""
     u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
     found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
     seq = blank(bench.t, u, len(bench.fit.model.measured))
-    return allowed(found, bench.limits), told(bench, seq, found.x, start).times(bench.share)
+    return allowed(found, bench.limits), expected_information(bench, seq, found.x, start).times(bench.share)
 
 
-def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:
+def expected_information(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Information:
     """Information of sequences along the motions x, and from `start` on about the rivals."""
     pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
     none = np.zeros((len(start), *bench.fit.cov.shape))
-    return Told(information(bench.fit, seq, x) if bench.informed else none, pairs)
+    return Information(information(bench.fit, seq, x) if bench.informed else none, pairs)
 
 
 def search(
@@ -101,18 +101,18 @@ def search(
     pool = _pool(bench, count, rng, effort, say)
     chosen, total = [], None
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
-        costs = question.cost(pool.told if total is None else total + pool.told)
+        costs = question.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
-        one = pool.told.of(chosen[-1])
+        one = pool.expected.of(chosen[-1])
         total = one if total is None else total + one
     plan = _of(pool, np.asarray(chosen))
-    say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.told.sum())):.3f}")
+    say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
-        if float(question.cost(plan.told.sum())) <= question.least:
+        if float(question.cost(plan.expected.sum())) <= question.least:
             break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(bench, question, plan, rng, reach, effort)
-        cost = float(question.cost(plan.told.sum()))
+        cost = float(question.cost(plan.expected.sum()))
         say(
             f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
         )
@@ -124,8 +124,8 @@ def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, sa
     inputs, states = bench.limits.low.size, bench.limits.first.size
     found, waiting = [], drawn(rng, effort.batch, inputs, states)
     for _ in range(effort.tries):
-        ok, told = tell(bench, waiting, effort.few)
-        found.append(_of(Plan(waiting, told), ok))
+        ok, expected = evaluated(bench, waiting, effort.few)
+        found.append(_of(Plan(waiting, expected), ok))
         have = sum(len(plan.proposal.family) for plan in found)
         say(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
@@ -150,21 +150,21 @@ def _bettered(
     count = len(plan.proposal.family)
     place = np.arange(effort.batch) % count
     other = mutated(rng, Proposal(*(a[place] for a in plan.proposal)), reach)
-    ok, told = tell(bench, other, effort.few)
+    ok, expected = evaluated(bench, other, effort.few)
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
-        rest = _of(plan, np.arange(count) != slot).told.sum()
-        costs = question.cost(rest + told.of(np.append(mine, 0)))[: len(mine)]
-        now = float(question.cost(plan.told.sum()))
+        rest = _of(plan, np.arange(count) != slot).expected.sum()
+        costs = question.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
+        now = float(question.cost(plan.expected.sum()))
         if len(mine) and np.nanmin(costs, initial=np.inf) < now:
             best = int(mine[np.nanargmin(costs)])
-            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, told), np.asarray([best])),
+            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),
                             _of(plan, np.arange(count) > slot)])  # fmt: skip
     return plan
 
 
 def _of(plan: Plan, which) -> Plan:
-    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.told.of(which))
+    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.expected.of(which))
 
 
 def _joined(plans: list[Plan]) -> Plan:

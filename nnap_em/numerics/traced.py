@@ -78,21 +78,21 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
         return None
     found = _unpacked(shelf.get(key))
     if found is None:
-        told = []
+        structures = []
 
         def flat(*arrays):
             out, outside = jax.tree.flatten(run(*eqx.combine(jax.tree.unflatten(inside, arrays), static)))
-            told.append(outside)
+            structures.append(outside)
             return out
 
         flat.__name__ = flat.__qualname__ = run.__name__
         try:
             exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
-            shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
+            shelf.put(key, pickle.dumps((bytes(exported.serialize()), structures[-1])))
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
-        found = exported, told[-1]
+        found = exported, structures[-1]
     exported, outside = found
 
     def again(*arrays):
@@ -146,9 +146,9 @@ class _Telling(pickle.Pickler):
 @functools.cache
 def _surroundings() -> bytes:
     """The package's text, what it stands on and how JAX is set, as one number."""
-    package, told = Path(__file__).resolve().parents[1], hashlib.sha256()
+    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        told.update(str(path.relative_to(package)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
     versions = [f"{name} {importlib.metadata.version(name)}" for name in STANDS_ON]
-    told.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
-    return told.digest()
+    digest.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
+    return digest.digest()

@@ -85,8 +85,8 @@ def write_model(
     ]
     root = _model(sheet, motors_of(fitted, system))
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
-    said = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
-    root.insert(0, ET.Comment(said.replace("--", "- -")))
+    comment = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
+    root.insert(0, ET.Comment(comment.replace("--", "- -")))
     ET.indent(root)
     if acting and acting.plays:
         replace_text(beside(out), acting.text)

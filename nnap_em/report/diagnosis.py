@@ -51,7 +51,7 @@ def write_diagnosis(
         error.setdefault("after", error["before"])
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
     lacked = left["after"].without_effects() if found else left["before"]
-    told = {name: tests(each, names) for name, each in left.items()}
+    tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
     nodes = visited_nodes(velocities)
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if closed.before.rig.friction}
@@ -64,7 +64,7 @@ def write_diagnosis(
         *_search_pictures(closed.steps, closed.before.rig.named),
     ]
     disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
-    failed = sum(t.p_value < 0.01 and not t.slight for t in told["before"])
+    failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     document = shared(closed.before, train, test, seed=seed, began=began) | {
         "verdict": verdict(found, error, failed, rivals, suspects, closed.complete),
         "complete": closed.complete,
@@ -74,7 +74,7 @@ def write_diagnosis(
         "models": {name: f"{name}.npz" for name in both},
         "visited": visited(closed.before, velocities, train) if closed.before.rig.friction else None,
         "friction_change": friction_change(closed, nodes),
-        "tests": {name: [t._asdict() for t in each] for name, each in told.items()},
+        "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
@@ -185,19 +185,19 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
     return {
         "horizon_s": step.horizon * dt,
         "measure": step.measure,
-        "screened": [_told(*each) for each in step.screened[:10]],
-        "refitted": [_told(*each) for each in step.refitted],
+        "screened": [_screened(*each) for each in step.screened[:10]],
+        "refitted": [_screened(*each) for each in step.refitted],
         "accepted": words(step.accepted) if step.accepted else None,
         "untried": step.untried,
     }
 
 
 def _touch(touch: Intervention, files: Sequence[str]) -> dict[str, Any]:
-    told = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
-    return {"file": files[touch.sequence], **told, "size": touch.size, "std": touch.std, "unit": touch.unit}
+    interval = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
+    return {"file": files[touch.sequence], **interval, "size": touch.size, "std": touch.std, "unit": touch.unit}
 
 
-def _told(key: Key, gain: float) -> dict[str, Any]:
+def _screened(key: Key, gain: float) -> dict[str, Any]:
     return _place(key) | {"gain": gain}
 
 

@@ -28,8 +28,8 @@ def describe(
 ) -> dict[str, Any]:
     """All that import.json holds; times in seconds after the first message of a log."""
     rest = iter(files)
-    told = [_log(log, rest) for log in logs]
-    rows = sum(s["rows"] for log in told for s in log["sequences"] if s["file"])
+    entries = [_log(log, rest) for log in logs]
+    rows = sum(s["rows"] for log in entries for s in log["sequences"] if s["file"])
     return {
         "format": 1,
         "rig": rig.name,
@@ -37,8 +37,8 @@ def describe(
         "input": "mean" if plan.mean else "hold",
         "shifts": dict(shifts),
         "rows_used": rows,
-        "rows_dropped": sum(log["rows"] for log in told) - rows,
-        "logs": told,
+        "rows_dropped": sum(log["rows"] for log in entries) - rows,
+        "logs": entries,
         "look": list(_look(logs, rig)),
         "seconds": seconds,
         "versions": versions(),
@@ -73,8 +73,8 @@ def _log(log: Brought, files: Iterator[str]) -> dict[str, Any]:
 
 
 def _topic(topic: TopicFacts) -> dict[str, Any]:
-    told = topic._asdict()
-    return told | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
+    entry = topic._asdict()
+    return entry | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
 
 
 def _look(logs: Sequence[Brought], rig: Rig) -> Iterator[str]:

@@ -195,8 +195,8 @@ def _doubted(document: Mapping[str, Any]) -> bool:
 
 def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
     """Certainty of the finding in words; empty where it is unknown."""
-    told = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
-    decisive = next(((scale, value) for _, scale, value in told if finite(value)), None)
+    rows = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
+    decisive = next(((scale, value) for _, scale, value in rows if finite(value)), None)
     if decisive is None:
         return ""
     if doubted:

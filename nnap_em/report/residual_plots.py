@@ -170,9 +170,9 @@ def _draw(ax: Axes, panel: _Panel, sides: Sequence[_Side], *, bold: bool) -> Non
     ax.set(xlabel=panel.kind.label, xlim=(panel.edges[0], panel.edges[-1]))
     if panel.kind.turn or panel.wrapped:
         _turn_ticks(ax, panel.edges)
-    told = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO)
+    share = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO)
     if bold:
-        told.set(color="#222222", weight="bold")
+        share.set(color="#222222", weight="bold")
 
 
 def _reach(curves: Sequence[_Bins]) -> float:

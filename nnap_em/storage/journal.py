@@ -76,14 +76,14 @@ class Journal:
         blanks, structure = jax.tree.flatten(form)
         if len(entries) != len(blanks):
             refuse(path, f"{len(entries)} numbers and arrays, not {len(blanks)}", _AGAIN)
-        told = enumerate(zip(entries, blanks, strict=True))
-        return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in told])
+        leaves = enumerate(zip(entries, blanks, strict=True))
+        return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in leaves])
 
     def keep(self, name: str, outcome: Any) -> None:
         """Write an outcome."""
-        told = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
-        arrays = {str(i): array for i, (_, array) in enumerate(told) if array is not None}
-        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in told]}
+        leaves = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
+        arrays = {str(i): array for i, (_, array) in enumerate(leaves) if array is not None}
+        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in leaves]}
         write_arrays(self.folder / f"{name}.npz", KIND, header, arrays)
 
     def _read(self, path: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:

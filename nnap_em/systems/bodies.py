@@ -86,7 +86,7 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
         if not set(own) <= set(after):
             continue
         goal = numbers(body, after)
-        there = _told(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        there = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
         fine = physical(goal[0], goal[2])
         out |= {name: jnp.where(fine, after[name], one) for name, one in zip(own, there, strict=True)}
     return out
@@ -96,7 +96,7 @@ def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
     return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in own]))
 
 
-def _told(body: Numbers) -> list[Scalar]:
+def _in_order(body: Numbers) -> list[Scalar]:
     """Numbers in the order of `names`."""
     return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 

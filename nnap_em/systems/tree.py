@@ -40,12 +40,12 @@ class Tree(AbstractSystem):
 
     @classmethod
     def declared(cls, parameters, joints, machine):
-        told = unpacked(machine)
-        dof = len(told.joints)
-        angles = tuple(not joint.slide for joint in told.joints)
+        compiled = unpacked(machine)
+        dof = len(compiled.joints)
+        angles = tuple(not joint.slide for joint in compiled.joints)
         return cls(
-            coordinates=told.states[:dof],
-            rates=told.states[dof:],
+            coordinates=compiled.states[:dof],
+            rates=compiled.states[dof:],
             angles=angles,
             text=machine,
             values=dict(parameters),
@@ -109,9 +109,9 @@ class Tree(AbstractSystem):
 
     def __str__(self) -> str:
         numbers = {name: float(value) for name, value in self.values.items()}
-        told = quantities(numbers, lambda name: machine_unit(self.text, name)) or "all as in the file"
+        shown = quantities(numbers, lambda name: machine_unit(self.text, name)) or "all as in the file"
         driven = ", ".join(map(str, self.joints)) or "none"
-        return f"Tree of {self.machine.file}, joints {', '.join(self.coordinates)}: {told}; driven joints: {driven}"
+        return f"Tree of {self.machine.file}, joints {', '.join(self.coordinates)}: {shown}; driven joints: {driven}"
 
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         return jnp.stack([_stacked(row, q) for row in self._mass(self._poses(q))])

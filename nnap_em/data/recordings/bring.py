@@ -143,13 +143,13 @@ def _gridded(
         refuse(recording.path, "the log", silences, mend)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
-    told = pairs(joints, states, signals, tuple(plan.duplicates))
+    causes = pairs(joints, states, signals, tuple(plan.duplicates))
     return Brought(
         recording.path,
         origin,
         addresses,
         facts,
-        tuple(delay(pair, signals, around if pair.held else ()) for pair in told),
+        tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
         at.size,
         tuple(_sequence(piece, columns, rig, at) for piece in found),
         tuple({name: y[piece.first : piece.end] for name, y in columns.items()} for piece in used),
@@ -164,9 +164,9 @@ def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Sig
     if end <= start:
         late = max(found, key=lambda topic: found[topic][0])
         early = min(found, key=lambda topic: found[topic][1])
-        said = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in found.items())
+        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in found.items())
         mend = f"--shift {late}=SECONDS where their clocks differ, or record them together"
-        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({said})", mend)
+        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", mend)
     return start, end
 
 
@@ -251,13 +251,13 @@ def _facts(
 
 def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
     """Messages about readings lost or interpolated between topics and rows."""
-    told = set()
+    reported = set()
     for name in rig.measured:
         s = signals[name]
         rate = s.interval / rig.dt
-        if s.topic in told or (0.6 < rate <= SLOW):
+        if s.topic in reported or (0.6 < rate <= SLOW):
             continue
-        told.add(s.topic)
+        reported.add(s.topic)
         if rate > SLOW:
             yield f"readings of {s.topic or 'the table'} come every {rate:.3g} rows: the rows between are empty"
         else:

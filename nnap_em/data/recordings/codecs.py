@@ -110,8 +110,8 @@ class Ros2:
             return None
         data, first = np.frombuffer(message, np.uint8), np.zeros(1, int)
         found = np.array([form.read(data, first, path)[0] for path in paths])
-        told = self.slow.read(data, first, np.array([len(message)]), paths)[0]
-        return form if np.array_equal(found, told, equal_nan=True) else None
+        decoded = self.slow.read(data, first, np.array([len(message)]), paths)[0]
+        return form if np.array_equal(found, decoded, equal_nan=True) else None
 
 
 FORMS = 64

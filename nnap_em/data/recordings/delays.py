@@ -127,8 +127,8 @@ def _part(
     size = math.sqrt(target @ target)
 
     def likeness(shift: float) -> float:
-        told = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
-        return float(told @ target) / max(math.sqrt(told @ told) * size, 1e-300)
+        predicted = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
+        return float(predicted @ target) / max(math.sqrt(predicted @ predicted) * size, 1e-300)
 
     coarse = max(min(effect.interval, 0.005), REACH / 50)
     shifts = np.arange(-REACH, REACH + coarse / 2, coarse)

@@ -174,8 +174,8 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Jour
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
         journal.check()
-        found = f"resumed with {len(journal)} finished steps"
-        say(found if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
+        message = f"resumed with {len(journal)} finished steps"
+        say(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
     with _folder(args.out), _telling(lambda: go_on(args, journal)):
         if args.resume:
             sweep(journal.folder)
@@ -191,8 +191,8 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Jour
 
 def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
     """Those of these options that the command has; `none`: also where they were left out."""
-    found = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
-    return {name: value for name, value in found.items() if none or value is not None}
+    options = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
+    return {name: value for name, value in options.items() if none or value is not None}
 
 
 def go_on(args: argparse.Namespace, journal: Journal) -> str:

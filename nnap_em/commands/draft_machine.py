@@ -26,16 +26,16 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
     """
     machine = read_machine(model)
     topics = reader(path).topics(path)
-    found, inputs = _joints(machine, topics), _inputs(machine, topics)
-    if not found:
+    columns, inputs = _joints(machine, topics), _inputs(machine, topics)
+    if not columns:
         names = ", ".join(joint.name for joint in machine.joints)
         mend = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {mend}")
-    found |= (sensed := _sensors(machine, topics))
-    named, senses = tuple(found), tuple(sense for sense in machine.senses if sense.name in sensed)
+    columns |= (sensed := _sensors(machine, topics))
+    named, senses = tuple(columns), tuple(sense for sense in machine.senses if sense.name in sensed)
     machine = machine._replace(states=_called(machine, named), senses=senses)
     spec, text = SystemSpec(machine.states, (), {}, len(machine.joints)), packed(machine)
-    everything = found | {column: at for column, (at, _) in inputs.items()}
+    everything = columns | {column: at for column, (at, _) in inputs.items()}
     table = _table(path, everything)
     lines = [
         *_model(machine, os.path.relpath(model, home)),
@@ -128,13 +128,13 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
     return out
 
 
-def _table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """Some of the log on uniform rows; of a CSV file its own."""
     if path.suffix.lower() != ".csv":
-        return columns_table(path, found)
+        return columns_table(path, columns)
     given = numbers(path)
     time = next((given[name] for name in given if meaning(name).kind == "time"), None)
-    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in found.items()}
+    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in columns.items()}
 
 
 def _model(machine: Machine, file: str) -> Iterator[str]:
@@ -178,10 +178,10 @@ def _servos(machine: Machine) -> Iterator[str]:
         yield "# delay = { mean = 0.01, std = 0.01 }    # s"
 
 
-def _addresses(topics: Sequence[Topic], found: Mapping[str, Address]) -> Iterator[str]:
+def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
     """Addresses of columns that have another name in the log."""
-    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if str(at) != name]
+    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if str(at) != name]
     if lines:
         yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
-        yield from (f"# not used: {each}" for each in others(topics, found))
+        yield from (f"# not used: {each}" for each in others(topics, columns))
         yield from lines

@@ -24,14 +24,14 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
     Raises DataError where the log cannot be read, or nothing in it looks like a machine.
     """
     topics = reader(path).topics(path)
-    found = found_columns(topics)
-    if not found:
+    columns = found_columns(topics)
+    if not columns:
         names = ", ".join(topic.name for topic in topics) or "none"
         mend = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {mend}")
-    made = drafted(path, columns_table(path, found), system, specs)
-    lines = [f"# not used: {each}" for each in others(topics, found)]
-    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if f'"{name}"' in made.text]
+    made = drafted(path, columns_table(path, columns), system, specs)
+    lines = [f"# not used: {each}" for each in others(topics, columns)]
+    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in made.text]
     head = "\n[import.columns]    # where each column is in the log\n"
     return made._replace(text=made.text + head + "\n".join(lines) + "\n")
 
@@ -80,17 +80,17 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
             yield (word if column.kind == "input" else column.kind), Address(topic.name, field)
 
 
-def others(topics: Sequence[Topic], found: Mapping[str, Address]) -> list[str]:
+def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
     """Topics of numbers that no column is from."""
-    used = {at.topic for at in found.values()}
+    used = {at.topic for at in columns.values()}
     return [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in topics if t.fields and
             t.name not in used][:10]  # fmt: skip
 
 
-def columns_table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
     wanted: dict[str, list[str]] = {}
-    for at in found.values():
+    for at in columns.values():
         wanted.setdefault(at.topic, []).append(at.path)
     tracks = reader(path).read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in wanted.items()}).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
@@ -100,7 +100,7 @@ def columns_table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[n
     if at.size < 2:
         raise DataError(f"{path}: its topics have no time in common; name others in [import.columns] by hand")
     table = {"time": at}
-    for name, place in found.items():
+    for name, place in columns.items():
         track = tracks[place.topic]
         y = track.values[place.path]
         there = np.isfinite(y)

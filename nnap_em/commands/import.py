@@ -47,7 +47,7 @@ def _reaching(text: str, here: Path, out: Path) -> str:
     if file is None:
         return text
     path = toml_text(os.path.relpath(here / file, out))
-    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda found: found[1] + path, text, count=1)
+    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
 
 
 def _summary(log: Brought) -> str:

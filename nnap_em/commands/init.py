@@ -18,10 +18,10 @@ def run(args: argparse.Namespace, say: Say) -> None:
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
     if args.model is not None:
-        found = draft_machine(args.log, args.model, path.parent)
+        drafted = draft_machine(args.log, args.model, path.parent)
     else:
-        found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
-    replace_text(path, found.text)
-    for note in found.notes:
+        drafted = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
+    replace_text(path, drafted.text)
+    for note in drafted.notes:
         say(f"in the log: {note}")
-    say(f"wrote {path}" + (f"; fill in {', '.join(found.missing)}" if found.missing else ""))
+    say(f"wrote {path}" + (f"; fill in {', '.join(drafted.missing)}" if drafted.missing else ""))

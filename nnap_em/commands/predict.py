@@ -18,8 +18,8 @@ def run(args: argparse.Namespace, say: Say) -> None:
         require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
-    found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
-    mean, std = np.asarray(found.mean), np.asarray(found.std)
+    prediction = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
+    mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     say(f"wrote {len(logs.files)} files to {args.out}")
     if args.mcap is not None:

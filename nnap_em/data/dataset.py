@@ -42,8 +42,8 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     inputs, obs = (np.shape(x)[-1] for x in sequences[0][1:])
     for i, (t, u, y) in enumerate(sequences):
         wanted = (len(t),), (len(t), inputs), (len(t), obs)
-        if (found := (np.shape(t), np.shape(u), np.shape(y))) != wanted or not len(t):
-            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {found}; they must be {wanted}, time above 0")
+        if (shapes := (np.shape(t), np.shape(u), np.shape(y))) != wanted or not len(t):
+            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}; they must be {wanted}, time above 0")
     lengths = [len(t) for t, _, _ in sequences]
     time = max(lengths)
     return Dataset(

@@ -28,9 +28,9 @@ def log_files(folder: Path) -> list[Path]:
     files = _logs(folder)
     if not files:
         every = sorted(path for path in folder.glob("*") if not path.name.startswith("."))
-        found = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
+        problem = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
         others = f"; found there: {', '.join(path.name for path in every[:3])}" if every else ""
-        raise DataError(f"{folder}: {found}{others}; put one CSV file per sequence there")
+        raise DataError(f"{folder}: {problem}{others}; put one CSV file per sequence there")
     for one, two in pairwise(sorted(files, key=lambda path: (path.stem, path.name))):
         if one.stem == two.stem:
             raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
@@ -59,9 +59,9 @@ def place(path: Path, column: str, row: int | None = None) -> str:
     return f"{f'line {row + 2}' if path.suffix.lower() == '.csv' else f'row {row + 1}'}, column {column!r}"
 
 
-def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, where: str, problem: str, mend: str) -> NoReturn:
     """Raise the DataError."""
-    raise DataError(f"{path}: {where}: {found}; {mend}")
+    raise DataError(f"{path}: {where}: {problem}; {mend}")
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
@@ -116,9 +116,9 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
 
 def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
-    found = _mat_columns(path)
-    _check_names(path, list(found), (*required, *gaps))
-    return _stack(path, {name: np.asarray(found[name]) for name in (*required, *gaps)}, gaps)
+    columns = _mat_columns(path)
+    _check_names(path, list(columns), (*required, *gaps))
+    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps)
 
 
 _readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
@@ -131,10 +131,10 @@ def _mat_columns(path: Path) -> dict[str, Any]:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
-    found = {name: value for name, value in content.items() if not name.startswith("__")}
-    if len(found) == 1 and (only := next(iter(found.values()))).dtype.names:
-        found = {name: np.asarray(only[name].item()) for name in only.dtype.names}
-    return found
+    columns = {name: value for name, value in content.items() if not name.startswith("__")}
+    if len(columns) == 1 and (only := next(iter(columns.values()))).dtype.names:
+        columns = {name: np.asarray(only[name].item()) for name in only.dtype.names}
+    return columns
 
 
 def _parquet_file(path: Path) -> Any:
@@ -251,9 +251,9 @@ def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
     return value
 
 
-def _no_number(path: Path, name: str, row: int, found: str, missing: bool, gaps: bool) -> NoReturn:
+def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
     mend = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
-    refuse(path, place(path, name, row), f"found {found}", mend + ("; time and inputs are never empty" * missing))
+    refuse(path, place(path, name, row), f"found {text}", mend + ("; time and inputs are never empty" * missing))
 
 
 def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
@@ -273,7 +273,7 @@ def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float
         values = values.astype(np.float64)
         wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
         if wrong.size:
-            found = values[wrong[0]]
-            _no_number(path, name, int(wrong[0]), f"{found:g}", bool(np.isnan(found)), name in gaps)
+            value = values[wrong[0]]
+            _no_number(path, name, int(wrong[0]), f"{value:g}", bool(np.isnan(value)), name in gaps)
         out.append(values)
     return np.stack(out, -1)

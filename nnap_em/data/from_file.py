@@ -34,7 +34,7 @@ def declare(root: Any) -> Declaration:
         senses=tuple(_senses(machine, root)),
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
-    _say_left_out(root, machine)
+    _warn_of_left_out(root, machine)
     columns, joints, motored = _inputs(machine, root)
     motors = {motor.name: motor for motor in machine.motors} if motored else {}
     given = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
@@ -66,12 +66,12 @@ def _part(model: Any) -> Part:
     return Part(joints, {name: locked.number(name) for name in locked.items})
 
 
-def _say_left_out(root: Any, machine: Machine) -> None:
+def _warn_of_left_out(root: Any, machine: Machine) -> None:
     """Friction of the file has no part where it is learned."""
     names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
     if names and not machine.rubs:
-        found = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
-        warnings.warn(f'{root.path}: {machine.file}: {found}; friction = "none" takes the file\'s', RigWarning, 2)
+        problem = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {machine.file}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
 
 
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:
@@ -106,9 +106,9 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
     """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
     motors = {motor.name: motor for motor in machine.motors}
     if not motors and "input" not in root.items:
-        found = f"{machine.file} has no actuator"
+        problem = f"{machine.file} has no actuator"
         mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
-        root.refuse("input", found, mend)
+        root.refuse("input", problem, mend)
     table = root.table("input", absent={})
     table.check((), drive_keys(table))
     columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
@@ -130,9 +130,9 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
         motored = True
     for joint in joints:
         if joints.count(joint) > 1:
-            found = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
-            found += f", {machine.joints[joint - 1].name!r}"
-            table.refuse("columns", found, "name one of them in [input] columns, and log their sum")
+            problem = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
+            problem += f", {machine.joints[joint - 1].name!r}"
+            table.refuse("columns", problem, "name one of them in [input] columns, and log their sum")
     return columns, joints, motored
 
 
@@ -175,8 +175,8 @@ def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
         inertia[i, j] = inertia[j, i] = values[what]
     low, middle, high = np.linalg.eigvalsh(inertia)
     if low + middle < (1 - 1e-9) * high:
-        found = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
-        table.refuse(f"{body}.inertia", found, "write means of which the largest is at most the sum of the others")
+        problem = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
+        table.refuse(f"{body}.inertia", problem, "write means of which the largest is at most the sum of the others")
 
 
 def _declared(table: Any, name: str, value: object, mean: float) -> Declared:

@@ -93,8 +93,8 @@ def _part(
     for joint in machine.joints:
         body = machine.bodies[joint.body]
         if joint.name in values and (body.mass <= NOTHING or np.trace(body.inertia) <= 10 * NOTHING):
-            found = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
-            warnings.warn(f"{path}: {found}; it is joined to the body that carries it", RigWarning, 2)
+            problem = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
+            warnings.warn(f"{path}: {problem}; it is joined to the body that carries it", RigWarning, 2)
     machine = lock(machine, values, joined)
     group = groups(machine, {joint.body for joint in machine.joints}.__contains__)
     for i in sorted({joint.body for joint in machine.joints}):
@@ -123,9 +123,9 @@ def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
             refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
-def refuse(path: Path, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, problem: str, mend: str) -> NoReturn:
     """Raise MachineError."""
-    raise MachineError(f"{path}: {found}; {mend}")
+    raise MachineError(f"{path}: {problem}; {mend}")
 
 
 def _mujoco() -> Any:
@@ -195,8 +195,8 @@ def _mend(message: str) -> str:
         r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
         r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
     }
-    found = (mend for pattern, mend in mends.items() if re.search(pattern, message, re.I))
-    return next(found, "correct the file; MuJoCo's viewer shows the same error")
+    hints = (mend for pattern, mend in mends.items() if re.search(pattern, message, re.I))
+    return next(hints, "correct the file; MuJoCo's viewer shows the same error")
 
 
 # --- files whose meshes are elsewhere
@@ -276,8 +276,8 @@ def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
 
 def _link(joint: ET.Element, end: str) -> str:
     """The link at an end of a joint."""
-    found = joint.find(end)
-    return "" if found is None else str(found.get("link"))
+    element = joint.find(end)
+    return "" if element is None else str(element.get("link"))
 
 
 def _carries(link: str, root: ET.Element) -> bool:
@@ -338,8 +338,8 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
         elif child.tag == "frame":
             _strip_body(path, child, name, weighed)
         elif child.tag == "geom" and not weighed and child.get("mesh"):
-            found = f"body {name!r} has no <inertial>, and its mesh {child.get('mesh')!r} is missing"
-            refuse(path, found, "put the mesh beside the file, or give the body an <inertial>")
+            problem = f"body {name!r} has no <inertial>, and its mesh {child.get('mesh')!r} is missing"
+            refuse(path, problem, "put the mesh beside the file, or give the body an <inertial>")
         elif child.tag in ("geom", "camera", "light"):
             if weighed or child.tag != "geom":
                 body.remove(child)
@@ -351,8 +351,8 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
 
 
 def _refuse_all(path: Path, model: Any, part: Part) -> None:
-    for found, mend in _obstacles(model, part):
-        refuse(path, found, mend)
+    for problem, mend in _obstacles(model, part):
+        refuse(path, problem, mend)
 
 
 def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
@@ -461,10 +461,10 @@ def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
         yield f"actuator {name!r} has a bias that is not affine", mend
     elif gain not in (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)):
         yield f"actuator {name!r} has a gain that is neither fixed nor affine", mend
-    elif (found := _drive(model, i)) is None:
+    elif (drive := _drive(model, i)) is None:
         mend = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
         yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", mend
-    elif found[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
+    elif drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
         mend = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
         yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", mend
     elif acts not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):

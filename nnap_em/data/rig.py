@@ -268,10 +268,10 @@ class _Table:
     name: str
     items: Mapping[str, object]
 
-    def refuse(self, key: str, found: str | None = None, mend: str | None = None) -> NoReturn:
+    def refuse(self, key: str, problem: str | None = None, mend: str | None = None) -> NoReturn:
         place = f"[{self.name}] {key}" if self.name else key
-        found = found or f"found {self.items[key]!r}"
-        raise RigError(f"{self.path}: {place}: {found}; {mend or f'write {_MEND[key]}'}")
+        problem = problem or f"found {self.items[key]!r}"
+        raise RigError(f"{self.path}: {place}: {problem}; {mend or f'write {_MEND[key]}'}")
 
     def check(self, required: Collection[str], optional: Collection[str] = ()) -> None:
         """Refuse unknown keys first: a misspelt key is also a missing one, and its name is the better hint."""
@@ -361,8 +361,8 @@ def _parameter(model: _Table, key: str) -> Declared:
     if unit in ("m", "m/s^2") and value.mean < 0:
         model.refuse(key, mend=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
     if value.mean > {"m/s^2": 100.0, "m": 50.0}.get(unit, math.inf):
-        found = f"{model.path}: [model] {key}: found {value.mean:g}"
-        warnings.warn(f"{found}; is it in m{unit}? write it in {unit}", RigWarning, 2)
+        problem = f"{model.path}: [model] {key}: found {value.mean:g}"
+        warnings.warn(f"{problem}; is it in m{unit}? write it in {unit}", RigWarning, 2)
     return value
 
 

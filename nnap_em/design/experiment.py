@@ -114,9 +114,9 @@ def design_experiment(
     quick = bench._replace(informed=not isinstance(criterion, Apart))
     plan = search(quick, criterion, sequences, rng=rng, effort=effort, say=say)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
-    plan, found = _checked(bench, checked, plan, effort, say)
+    plan, trials = _checked(bench, checked, plan, effort, say)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
-    low, middle, high = np.quantile(np.asarray(found.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
+    low, middle, high = np.quantile(np.asarray(trials.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
     return Design(
         fitted,
         limits,
@@ -194,8 +194,8 @@ def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say)
     proposal = Proposal(*map(np.array, plan.proposal))
     for _ in range(LAST):
         u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-        found = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
-        ok = allowed(found, bench.limits)
+        trials = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
+        ok = allowed(trials, bench.limits)
         if ok.all():
             break
         say(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
@@ -203,7 +203,7 @@ def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say)
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
     _, each = evaluated(bench, _padded(proposal, effort.batch), effort.few)
-    return Plan(proposal, each.of(np.arange(len(proposal.family)))), found
+    return Plan(proposal, each.of(np.arange(len(proposal.family)))), trials
 
 
 def _padded(proposal: Proposal, batch: int) -> Proposal:

@@ -75,8 +75,8 @@ def _instead(fitted: Identified, data: Dataset, own: Law | None, other: Law) -> 
     if own is not None and place is None:
         held = ", ".join(words(key_of(effect)) for effect in effects)
         raise DesignError(f"the fit holds no {own}; it holds {held or 'no effect'}")
-    found = instead(fitted, data, place, other.means)
-    if found is None:
+    refit = instead(fitted, data, place, other.means)
+    if refit is None:
         known = sorted({words(key_of(effect)) for effect in possible(fitted, data)})
         raise DesignError(f"this machine cannot have {other}; possible here: {', '.join(known)}")
-    return found
+    return refit

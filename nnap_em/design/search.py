@@ -73,9 +73,9 @@ class Plan(NamedTuple):
 def evaluated(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
     """Proposals that stay inside the limits, and the information of each."""
     u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-    found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
+    trials = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
     seq = blank(bench.t, u, len(bench.fit.model.measured))
-    return allowed(found, bench.limits), expected_information(bench, seq, found.x, start).times(bench.share)
+    return allowed(trials, bench.limits), expected_information(bench, seq, trials.x, start).times(bench.share)
 
 
 def expected_information(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Information:
@@ -122,11 +122,11 @@ def search(
 def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, say: Say) -> Plan:
     """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
     inputs, states = bench.limits.low.size, bench.limits.first.size
-    found, waiting = [], drawn(rng, effort.batch, inputs, states)
+    plans, waiting = [], drawn(rng, effort.batch, inputs, states)
     for _ in range(effort.tries):
         ok, expected = evaluated(bench, waiting, effort.few)
-        found.append(_of(Plan(waiting, expected), ok))
-        have = sum(len(plan.proposal.family) for plan in found)
+        plans.append(_of(Plan(waiting, expected), ok))
+        have = sum(len(plan.proposal.family) for plan in plans)
         say(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
             break
@@ -134,7 +134,7 @@ def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, sa
         fresh = drawn(rng, effort.batch, inputs, states)
         again = ~ok & (waiting.shape[..., -1].max(axis=1) > SHRINKS**6)
         waiting = Proposal(*(_where(again, a, b) for a, b in zip(waiting, fresh, strict=True)))
-    plan = _joined(found)
+    plan = _joined(plans)
     if len(plan.proposal.family) < count:
         raise DesignError(
             f"only {len(plan.proposal.family)} of {effort.batch * effort.tries} proposals stay inside the limits; "

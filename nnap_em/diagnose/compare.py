@@ -316,9 +316,9 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
 
 def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) -> tuple[Number, ...]:
     """Stribeck numbers of one joint, their p-values corrected among each other."""
-    found = fit_law(velocity, torque, cov)
+    law_fit = fit_law(velocity, torque, cov)
     value, std = np.full((2, count, len(CALLED)), np.nan)
-    value[list(places)], std[list(places)] = found.value, found.std
+    value[list(places)], std[list(places)] = law_fit.value, law_fit.std
     rows = [
         number(name, unit, value[:, i], std[:, i])
         for i, (name, unit) in enumerate(zip(CALLED, UNITS[angle], strict=True))
@@ -347,13 +347,13 @@ def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
     for key in dict.fromkeys(itertools.chain(*each)):
         reported = [effects.get(key, {}) for effects in each]
         for name in dict.fromkeys(itertools.chain(*reported)):
-            found = [parameters.get(name) for parameters in reported]
-            value = np.asarray([np.nan if one is None else one.value for one in found])
-            std = np.asarray([np.nan if one is None else one.std for one in found])
+            entries = [parameters.get(name) for parameters in reported]
+            value = np.asarray([np.nan if one is None else one.value for one in entries])
+            std = np.asarray([np.nan if one is None else one.std for one in entries])
             if name in PERIODIC:
                 first = value[np.isfinite(value)][0]
                 value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-            unit = next(one.unit for one in found if one is not None)
+            unit = next(one.unit for one in entries if one is not None)
             yield number(f"{name} of {words(key)}", unit, value, std)
 
 

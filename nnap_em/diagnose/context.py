@@ -91,9 +91,9 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
     posterior = e_step(now.model, every, smoother, key=before.state.key)
     whole = np.asarray(kept(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    found = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
+    fit = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
     if whole.all():
-        return found, whole
+        return fit, whole
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
     loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.loud)
@@ -106,7 +106,7 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
-    return found._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
+    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
 def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:

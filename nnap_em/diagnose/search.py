@@ -42,11 +42,11 @@ def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[S
     added = sum(not effect.read_off for effect in now.model.effects)
     if not fit.used.any() or added >= context.effort.most:
         return now
-    found = screening_round(fit, context)
-    steps.append(found.step)
-    if found.step.untried:
+    outcome = screening_round(fit, context)
+    steps.append(outcome.step)
+    if outcome.step.untried:
         raise TimeUp
-    return now if found.accepted is None else _with(now, found.accepted, _found(found, context.loss), context)
+    return now if outcome.accepted is None else _with(now, outcome.accepted, _found(outcome, context.loss), context)
 
 
 def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
@@ -72,14 +72,14 @@ def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
     return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
 
 
-def _found(found: Round, loss: AbstractLoss) -> Found:
+def _found(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
-    case = cast(Refit, found.accepted)
+    case = cast(Refit, outcome.accepted)
     screened, directions = case.screened, max(case.screened.directions, 1)
-    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * found.step.tried)
+    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * outcome.step.tried)
     left_out = screened.share.left_out
     held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
-    return Found(case.gain, held_out, p_value, found.equivalent, share, case.removed)
+    return Found(case.gain, held_out, p_value, outcome.equivalent, share, case.removed)
 
 
 def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:

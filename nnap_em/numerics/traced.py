@@ -76,8 +76,8 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
-    found = _unpacked(shelf.get(key))
-    if found is None:
+    entry = _unpacked(shelf.get(key))
+    if entry is None:
         structures = []
 
         def flat(*arrays):
@@ -92,8 +92,8 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
-        found = exported, structures[-1]
-    exported, outside = found
+        entry = exported, structures[-1]
+    exported, outside = entry
 
     def again(*arrays):
         return exported.call(*arrays)

@@ -206,7 +206,7 @@ def _place(key: Key) -> dict[str, Any]:
     return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs)}
 
 
-def _velocities(found: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
+def _velocities(residuals: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
     """Velocities on the paths that took part."""
-    inside = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
-    return found.state[inside][:, dof : 2 * dof]
+    inside = residuals.valid & residuals.used[:, None] & np.isfinite(residuals.state).all(axis=-1)
+    return residuals.state[inside][:, dof : 2 * dof]

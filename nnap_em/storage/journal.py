@@ -141,10 +141,10 @@ def digest(*trees: Any) -> str:
 
     Raises TypeError for objects that cannot be distinguished.
     """
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
 
     def feed(text: str, content: bytes = b"") -> None:
-        found.update(f"{text}\0".encode() + content)
+        sha256.update(f"{text}\0".encode() + content)
 
     def walk(node: Any) -> None:
         kind = f"{type(node).__module__}.{type(node).__qualname__}"
@@ -174,4 +174,4 @@ def digest(*trees: Any) -> str:
             raise TypeError(f"{kind} cannot be told from another of its kind")
 
     walk(trees)
-    return found.hexdigest()
+    return sha256.hexdigest()

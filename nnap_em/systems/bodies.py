@@ -45,17 +45,17 @@ def carried_by(
 
     `loads`, by place of the body, are added to the bodies.
     """
-    found = [NOTHING] * len(layout.frames)
+    inertias = [NOTHING] * len(layout.frames)
     for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
             continue
         mass, centre, own = numbers(body, values)
         if any(name.startswith(f"{body.name}.") for name in values):
             mass = jnp.where(physical(mass, own), mass, jnp.nan)
-        found[mount.joint] = united(found[mount.joint], mounted(mass, centre, own, mount))
+        inertias[mount.joint] = united(inertias[mount.joint], mounted(mass, centre, own, mount))
         if place in loads:
-            found[mount.joint] = united(found[mount.joint], carried(loads[place], mount.place, mount.turn))
-    return found
+            inertias[mount.joint] = united(inertias[mount.joint], carried(loads[place], mount.place, mount.turn))
+    return inertias
 
 
 def mounted(mass: Scalar, centre: Three, own: Turn, mount: Mount) -> Inertia:

@@ -103,9 +103,11 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
     y = recording.tracks[at.topic].values[at.path]
     there = np.isfinite(y)
     if np.count_nonzero(there) < 2:
-        found = f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
+        problem = (
+            f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
+        )
         mend = "name a field that holds numbers in [import.columns], or take the log out"
-        refuse(recording.path, f"column {name!r}", found, mend)
+        refuse(recording.path, f"column {name!r}", problem, mend)
     if there.all():
         return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
     return Signal(at.topic, t[there], y[there] * at.scale)
@@ -131,16 +133,15 @@ def _gridded(
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
     columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
-    found = [
+    segments = [
         _checked(piece, columns, rig.measured) for piece in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
     ]
-    used = [piece for piece in found if not piece.why]
+    used = [piece for piece in segments if not piece.why]
     if not used:
-        silences = (
-            f"the longest stretch in which all topics speak has {max((p.end - p.first for p in found), default=0)} rows"
-        )
+        most = max((piece.end - piece.first for piece in segments), default=0)
+        problem = f"the longest stretch in which all topics have messages has {most} rows"
         mend = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
-        refuse(recording.path, "the log", silences, mend)
+        refuse(recording.path, "the log", problem, mend)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
     causes = pairs(joints, states, signals, tuple(plan.duplicates))
@@ -151,7 +152,7 @@ def _gridded(
         facts,
         tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
         at.size,
-        tuple(_sequence(piece, columns, rig, at) for piece in found),
+        tuple(_sequence(piece, columns, rig, at) for piece in segments),
         tuple({name: y[piece.first : piece.end] for name, y in columns.items()} for piece in used),
         (*recording.notes, *_notes(rig, signals)),
     )
@@ -159,12 +160,12 @@ def _gridded(
 
 def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> tuple[float, float]:
     """Interval in which all topics are present [s]; DataError where there is none."""
-    found = spans(inputs, readings, dt)
-    start, end = max(first for first, _ in found.values()), min(last for _, last in found.values())
+    intervals = spans(inputs, readings, dt)
+    start, end = max(first for first, _ in intervals.values()), min(last for _, last in intervals.values())
     if end <= start:
-        late = max(found, key=lambda topic: found[topic][0])
-        early = min(found, key=lambda topic: found[topic][1])
-        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in found.items())
+        late = max(intervals, key=lambda topic: intervals[topic][0])
+        early = min(intervals, key=lambda topic: intervals[topic][1])
+        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in intervals.items())
         mend = f"--shift {late}=SECONDS where their clocks differ, or record them together"
         refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", mend)
     return start, end
@@ -174,8 +175,10 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
     if best.interval > COARSE * dt:
-        found = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart in {best.topic!r} ({name})"
-        refuse(path, "[sampling] dt", found, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
+        problem = (
+            f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart in {best.topic!r} ({name})"
+        )
+        refuse(path, "[sampling] dt", problem, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
 
 
 def _there(

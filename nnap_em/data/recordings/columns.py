@@ -37,18 +37,18 @@ def declared_at(path: Path, topics: Sequence[Topic], given: Address, column: str
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
     wanted = set(_names(column, is_input))
-    found = [Address(topic.name, field) for topic in topics for field in topic.fields if field in wanted]
-    found = found or [
+    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in wanted]
+    addresses = addresses or [
         Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in wanted
     ]
     mend = f'write [import.columns] {column} = "topic:field" in rig.toml'
-    if not found:
+    if not addresses:
         every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
         raise DataError(f"{path}: column {column!r}: nothing is called so; {mend}; {_nearest(column, every)}")
-    if len(found) > 1:
-        places = " and ".join(repr(str(each)) for each in found[:4])
+    if len(addresses) > 1:
+        places = " and ".join(repr(str(each)) for each in addresses[:4])
         raise DataError(f"{path}: column {column!r}: may be {places}; {mend}")
-    return found[0]
+    return addresses[0]
 
 
 def _names(column: str, is_input: bool) -> list[str]:

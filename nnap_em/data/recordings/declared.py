@@ -88,5 +88,5 @@ def _seconds(path: Path, table: Mapping[str, Any], key: str, absent: float | Non
     return float(value)
 
 
-def _refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
-    raise RigError(f"{path}: {where}: {found}; {mend}")
+def _refuse(path: Path, where: str, problem: str, mend: str) -> NoReturn:
+    raise RigError(f"{path}: {where}: {problem}; {mend}")

@@ -25,8 +25,8 @@ _BLOCK = 2**18
 def topics(path: Path) -> tuple[Topic, ...]:
     """Every group that holds numbers, with a time axis of its own or of a group above."""
     with _opened(path) as file:
-        found = [_topic(group) for group in _groups(file)]
-        return tuple(topic for topic in found if topic.fields)
+        every = [_topic(group) for group in _groups(file)]
+        return tuple(topic for topic in every if topic.fields)
 
 
 def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:

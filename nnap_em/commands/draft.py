@@ -231,9 +231,9 @@ def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
             continue
         if state and column.kind != column.name and column.kind in names:
             continue
-        mends = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
-        mends += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
-        if mends:
-            yield f"column {column.name!r}: {' and '.join(mends)}"
+        hints = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
+        hints += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
+        if hints:
+            yield f"column {column.name!r}: {' and '.join(hints)}"
     if "time" not in {column.kind for column in columns}:
         yield "no column 'time': add one [s]"

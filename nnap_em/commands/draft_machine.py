@@ -29,8 +29,8 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
     columns, inputs = _joints(machine, topics), _inputs(machine, topics)
     if not columns:
         names = ", ".join(joint.name for joint in machine.joints)
-        mend = "write rig.toml by hand, with [import.columns]"
-        raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {mend}")
+        hint = "write rig.toml by hand, with [import.columns]"
+        raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
     columns |= (sensed := _sensors(machine, topics))
     named, senses = tuple(columns), tuple(sense for sense in machine.senses if sense.name in sensed)
     machine = machine._replace(states=_called(machine, named), senses=senses)

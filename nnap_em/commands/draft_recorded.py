@@ -27,8 +27,8 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
     columns = found_columns(topics)
     if not columns:
         names = ", ".join(topic.name for topic in topics) or "none"
-        mend = "write rig.toml by hand, with [import.columns]"
-        raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {mend}")
+        hint = "write rig.toml by hand, with [import.columns]"
+        raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
     made = drafted(path, columns_table(path, columns), system, specs)
     lines = [f"# not used: {each}" for each in others(topics, columns)]
     lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in made.text]

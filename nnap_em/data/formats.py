@@ -59,9 +59,9 @@ def place(path: Path, column: str, row: int | None = None) -> str:
     return f"{f'line {row + 2}' if path.suffix.lower() == '.csv' else f'row {row + 1}'}, column {column!r}"
 
 
-def refuse(path: Path, where: str, problem: str, mend: str) -> NoReturn:
+def refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
     """Raise the DataError."""
-    raise DataError(f"{path}: {where}: {problem}; {mend}")
+    raise DataError(f"{path}: {where}: {problem}; {hint}")
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
@@ -97,8 +97,8 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
     text = _text(path)
     names = _header(text)
     other = next((mark for mark in (";", "\t") if mark in text.split("\n", 1)[0]), None)
-    mend = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
-    _check_names(path, names, (*required, *gaps), "line 1, ", mend)
+    hint = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
+    _check_names(path, names, (*required, *gaps), "line 1, ", hint)
     columns = list(zip(*_rows(path, text), strict=True))
     return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
 
@@ -141,8 +141,8 @@ def _parquet_file(path: Path) -> Any:
     try:
         from pyarrow import parquet
     except ImportError:
-        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
-        raise DataError(f"{path}: cannot be read without pyarrow; {mend}") from None
+        hint = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without pyarrow; {hint}") from None
     with _damaged(path, "Parquet"):
         return parquet.ParquetFile(path)
 
@@ -168,8 +168,8 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise _unreadable(path, error) from None
-        mend = "use another copy, or write it as CSV"
-        raise DataError(f"{path}: no {form} file, or damaged or cut short; {mend}") from None
+        hint = "use another copy, or write it as CSV"
+        raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
 
 def _check_size(path: Path) -> None:
@@ -178,8 +178,8 @@ def _check_size(path: Path) -> None:
     except OSError as error:
         raise _unreadable(path, error) from None
     if size > LARGEST:
-        mend = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
-        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {mend}")
+        hint = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
+        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {hint}")
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
@@ -212,19 +212,19 @@ def _rows(path: Path, text: str) -> list[list[str]]:
     names = lines[0].count(",") + 1
     for number, row in enumerate(rows, 2):
         if len(row) != names:
-            mend = "separate columns by ',', write decimals with '.', and give every column a field"
-            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", mend)
+            hint = "separate columns by ',', write decimals with '.', and give every column a field"
+            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", hint)
     return rows
 
 
 def _check_names(
-    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", mend: str | None = None
+    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", hint: str | None = None
 ) -> None:
     spare = [name for name in names if name not in wanted]
     for name in wanted:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            refuse(path, f"{line}column {name!r}", "missing", mend or (nearest(name, spare) if spare else alone))
+            refuse(path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) if spare else alone))
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
@@ -252,8 +252,8 @@ def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
 
 
 def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
-    mend = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
-    refuse(path, place(path, name, row), f"found {text}", mend + ("; time and inputs are never empty" * missing))
+    hint = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
+    refuse(path, place(path, name, row), f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
 def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:

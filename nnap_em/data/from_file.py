@@ -56,7 +56,7 @@ def _part(model: Any) -> Part:
     joints = model.items.get("joints")
     if joints is not None:
         if not (isinstance(joints, list) and joints and all(type(name) is str for name in joints)):
-            model.refuse("joints", mend='write the names of the joints that move, joints = ["joint1", "joint2"]')
+            model.refuse("joints", hint='write the names of the joints that move, joints = ["joint1", "joint2"]')
         joints = tuple(dict.fromkeys(joints))
     locked = model.table("locked", absent={})
     for name in locked.items:
@@ -96,8 +96,8 @@ def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
             if sense.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
                 continue
             if sense.kind not in SENSE_UNITS:
-                mend = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
-                table.refuse("columns", f"{column!r} is of a sensor of type {sense.kind}", mend)
+                hint = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
+                table.refuse("columns", f"{column!r} is of a sensor of type {sense.kind}", hint)
             if sense.name == column:
                 yield sense
 
@@ -107,15 +107,15 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
     motors = {motor.name: motor for motor in machine.motors}
     if not motors and "input" not in root.items:
         problem = f"{machine.file} has no actuator"
-        mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
-        root.refuse("input", problem, mend)
+        hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", problem, hint)
     table = root.table("input", absent={})
     table.check((), drive_keys(table))
     columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
     for column in columns:
         if column in ("time", *machine.states):
-            mend = "give the motor another name than the joint's, or name torque columns and joints in [input]"
-            table.refuse("columns", f"{column!r} is a state, and no torque or command", mend)
+            hint = "give the motor another name than the joint's, or name torque columns and joints in [input]"
+            table.refuse("columns", f"{column!r} is a state, and no torque or command", hint)
     if "joints" in table.items:
         joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
         if len(joints) != len(columns):
@@ -124,8 +124,8 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
     else:
         for column in columns:
             if column not in motors:
-                mend = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
-                table.refuse("columns", f"{column!r} is no motor of {machine.file}", mend)
+                hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+                table.refuse("columns", f"{column!r} is no motor of {machine.file}", hint)
         joints = tuple(motors[column].joint + 1 for column in columns)
         motored = True
     for joint in joints:

@@ -170,14 +170,14 @@ def _sequence(whole: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     for doubt in doubts(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, doubt.column, None if doubt.row is None else int(line[doubt.row]))
         if doubt.ruins:
-            refuse(path, where, doubt.problem, doubt.mend)
-        warnings.warn(f"{path}: {where}: {doubt.problem}; {doubt.mend}", DataWarning, 2)
+            refuse(path, where, doubt.problem, doubt.hint)
+        warnings.warn(f"{path}: {where}: {doubt.problem}; {doubt.hint}", DataWarning, 2)
     for entry in entries:
         k, count = int(entry.rows[0]), entry.rows.size
         masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
         problem = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
-        mend = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {mend}", DataWarning, 2)
+        hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
+        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {hint}", DataWarning, 2)
     return _Sequence((t, u, y), (t, u, read), masked)
 
 
@@ -187,8 +187,8 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
         thousand = 0.99 < typical / 1000 < 1.01 or 0.99 < typical * 1000 < 1.01
-        mend = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
-        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", mend)
+        hint = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
+        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
     whole = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - whole) > TOLERANCE
     lost = int(np.sum(whole[~wrong] - 1))
@@ -198,11 +198,11 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
         problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
-        mend = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
-        refuse(path, place(path, "time", int(k) + 1), problem, f"{mend} (dt = {rig.dt:g} s)")
+        hint = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
+        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} s)")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
-        mend = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
-        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", mend)
+        hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
+        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", hint)
     return np.append(0, np.cumsum(whole)).astype(int)
 
 
@@ -220,7 +220,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     dark = np.any([doubt > INTERPOLATION_ERROR for _, doubt in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
     here, masked = rows[rows < end], []
-    for first, count, kind, mend in (
+    for first, count, kind, hint in (
         (int(lost.argmax()), int(lost[:end].sum()), "gap", "inputs there are told from the rows around"),
         (end, len(rows) - len(here), "cut", "inputs before these rows were lost and cannot be told: not used"),
     ):
@@ -229,7 +229,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
             problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
             problem += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
-            warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {mend}", DataWarning, 2)
+            warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], here, masked)
 
 

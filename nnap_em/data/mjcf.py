@@ -101,8 +101,8 @@ def _part(
         whole = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
         if sum(body.mass for body in whole) <= NOTHING:
             joint = next(joint.name for joint in machine.joints if joint.body == i)
-            mend = f"give it an <inertial>, or hold its joint: {_line(joint)}"
-            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", mend)
+            hint = f"give it an <inertial>, or hold its joint: {_line(joint)}"
+            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", hint)
     return machine
 
 
@@ -123,9 +123,9 @@ def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
             refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
-def refuse(path: Path, problem: str, mend: str) -> NoReturn:
+def refuse(path: Path, problem: str, hint: str) -> NoReturn:
     """Raise MachineError."""
-    raise MachineError(f"{path}: {problem}; {mend}")
+    raise MachineError(f"{path}: {problem}; {hint}")
 
 
 def _mujoco() -> Any:
@@ -182,12 +182,12 @@ def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
             return _build(mujoco.MjSpec.from_string(ET.tostring(whole, encoding="unicode")), part)
         except ValueError as error:
             message = " ".join(str(error).split())
-    refuse(path, f"MuJoCo's compiler refuses it: {message}", _mend(message))
+    refuse(path, f"MuJoCo's compiler refuses it: {message}", _hint(message))
 
 
-def _mend(message: str) -> str:
+def _hint(message: str) -> str:
     """Remedies for the commonest errors of the compiler."""
-    mends = {
+    hints = {
         r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
         r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
         r"inertia.*(positive|negative)|(positive|negative).*inertia": "masses and inertias are above 0: correct it",
@@ -195,8 +195,8 @@ def _mend(message: str) -> str:
         r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
         r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
     }
-    hints = (mend for pattern, mend in mends.items() if re.search(pattern, message, re.I))
-    return next(hints, "correct the file; MuJoCo's viewer shows the same error")
+    matching = (hint for pattern, hint in hints.items() if re.search(pattern, message, re.I))
+    return next(matching, "correct the file; MuJoCo's viewer shows the same error")
 
 
 # --- files whose meshes are elsewhere
@@ -257,12 +257,12 @@ def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
         if (mimic := joint.find("mimic")) is not None:
             leader = str(mimic.get("joint"))
             if not (held and part.holds(leader)):
-                mend = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
-                refuse(path, f"joint {name!r} mimics another", mend)
+                hint = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
+                refuse(path, f"joint {name!r} mimics another", hint)
             joint.remove(mimic)
         if kind != "fixed" and not held and links[child].find("inertial") is None and not _carries(child, root):
-            mend = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
-            refuse(path, f"link {child!r} moves and has no <inertial>", mend)
+            hint = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
+            refuse(path, f"link {child!r} moves and has no <inertial>", hint)
     if parents and not set(links) - set(parents):
         refuse(path, "its links form a ring", "a machine here is a tree: one link has no parent")
     for name in parents:
@@ -351,8 +351,8 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
 
 
 def _refuse_all(path: Path, model: Any, part: Part) -> None:
-    for problem, mend in _obstacles(model, part):
-        refuse(path, problem, mend)
+    for problem, hint in _obstacles(model, part):
+        refuse(path, problem, hint)
 
 
 def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
@@ -374,9 +374,9 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
         yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
     if closed := list(_closed(model, held)):
         lines = list(dict.fromkeys(name for names in closed for name in names))
-        mend = "a loop or coupling is no tree: take <equality> out"
-        mend += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
-        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), mend
+        hint = "a loop or coupling is no tree: take <equality> out"
+        hint += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
+        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
     loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
     if loose:
         yield f"it has {len(loose)} tendons", "put their springs and motors on joints, and take <tendon> out"
@@ -451,22 +451,22 @@ def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
     gain, bias, state, acts = (
         int(getattr(model, f"actuator_{kind}type")[i]) for kind in ("gain", "bias", "dyn", "trn")
     )
-    mend = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
+    hint = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
     if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or state == int(mujoco.mjtDyn.mjDYN_MUSCLE):
-        yield f"actuator {name!r} is a muscle", mend
+        yield f"actuator {name!r} is a muscle", hint
     elif state != int(mujoco.mjtDyn.mjDYN_NONE):
         lag = "log the goal that it has integrated and make it <position>" if _integrates(model, i) else _LAG
         yield f"actuator {name!r} has a state of its own", lag
     elif bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
-        yield f"actuator {name!r} has a bias that is not affine", mend
+        yield f"actuator {name!r} has a bias that is not affine", hint
     elif gain not in (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)):
-        yield f"actuator {name!r} has a gain that is neither fixed nor affine", mend
+        yield f"actuator {name!r} has a gain that is neither fixed nor affine", hint
     elif (drive := _drive(model, i)) is None:
-        mend = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
-        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", mend
+        hint = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
+        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", hint
     elif drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
-        mend = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
-        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", mend
+        hint = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
+        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", hint
     elif acts not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
         yield f"actuator {name!r} drives no joint", "let every motor drive a joint"
 

@@ -36,7 +36,7 @@ class Doubt(NamedTuple):
     column: str
     row: int | None
     problem: str
-    mend: str
+    hint: str
 
 
 class Repeat(NamedTuple):
@@ -64,8 +64,8 @@ def doubts(
     for name, values in readings.items():
         observed = values[np.isfinite(values)]
         if not observed.size:
-            mend = "take the file out, or the column out of [measurement]"
-            yield Doubt(True, name, None, "no sample at all", mend)
+            hint = "take the file out, or the column out of [measurement]"
+            yield Doubt(True, name, None, "no sample at all", hint)
             return
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Doubt(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
@@ -128,10 +128,10 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
     """A coordinate against the integral of its rate: units, sign, and what is swapped."""
     fit, ratio = _follows(columns[name], columns[rate], dt)
     problem = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
-    for factor, wrong, mend in (*(_ANGLE if angle else ()), *_ANY):
-        close = (0.7, 0.7 < ratio / factor < 1.4) if mend == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
+    for factor, wrong, hint in (*(_ANGLE if angle else ()), *_ANY):
+        close = (0.7, 0.7 < ratio / factor < 1.4) if hint == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
         if fit > close[0] and close[1]:
-            yield Doubt(True, rate if wrong else name, None, problem, mend)
+            yield Doubt(True, rate if wrong else name, None, problem, hint)
             return
     ways = "units, signs and names of the two"
     if fit > 0.9 and not 0.8 < ratio < 1.25:
@@ -186,8 +186,8 @@ def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
         jumps = (np.abs(np.abs(step) - turn) < 0.15 * turn) & (np.diff(rows) <= 2)
         if jumps.any() and np.median(np.abs(step)) < 0.1 * turn:
             k, row = step[jumps][0], int(rows[1:][jumps][0])
-            mend = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
-            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", mend)
+            hint = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
+            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", hint)
             return
 
 

@@ -23,7 +23,7 @@ from .units import parameter_unit, quantities, with_names
 
 _FRICTION = {"unknown": True, "none": False}
 _CLOCKS = ("sequence", "session")
-_MEND = {  # how the line of a key or table should look
+_HINTS = {  # how the line of a key or table should look
     "format": "format = 1",
     "name": 'name = "my_rig"',
     "model": 'a table [model] with type = "acrobot" and its parameters',
@@ -268,10 +268,10 @@ class _Table:
     name: str
     items: Mapping[str, object]
 
-    def refuse(self, key: str, problem: str | None = None, mend: str | None = None) -> NoReturn:
+    def refuse(self, key: str, problem: str | None = None, hint: str | None = None) -> NoReturn:
         place = f"[{self.name}] {key}" if self.name else key
         problem = problem or f"found {self.items[key]!r}"
-        raise RigError(f"{self.path}: {place}: {problem}; {mend or f'write {_MEND[key]}'}")
+        raise RigError(f"{self.path}: {place}: {problem}; {hint or f'write {_HINTS[key]}'}")
 
     def check(self, required: Collection[str], optional: Collection[str] = ()) -> None:
         """Refuse unknown keys first: a misspelt key is also a missing one, and its name is the better hint."""
@@ -286,14 +286,14 @@ class _Table:
 
     def value(self, key: str) -> object:
         if key not in self.items:
-            mend = _MEND.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
-            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {mend}")
+            hint = _HINTS.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
+            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {hint}")
         return self.items[key]
 
     def table(self, key: str, absent: Mapping[str, object] | None = None) -> "_Table":
         value = self.value(key) if absent is None else self.items.get(key, absent)
         if not isinstance(value, dict):
-            self.refuse(key, mend=None if key in _MEND else f"write {key} = {{ mean = 0.2, std = 0.02 }}")
+            self.refuse(key, hint=None if key in _HINTS else f"write {key} = {{ mean = 0.2, std = 0.02 }}")
         return _Table(self.path, f"{self.name}.{key}" if self.name else key, value)
 
     def text(self, key: str) -> str:
@@ -305,13 +305,13 @@ class _Table:
     def choice(self, key: str, known: Collection[str]) -> str:
         value = self.text(key)
         if value not in known:
-            self.refuse(key, mend=nearest(value, known))
+            self.refuse(key, hint=nearest(value, known))
         return value
 
     def number(self, key: str) -> float:
         value = self.value(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            self.refuse(key, mend=f"write a finite number, {key} = 0.2")
+            self.refuse(key, hint=f"write a finite number, {key} = 0.2")
         return float(value)
 
     def quantity(self, key: str) -> Declared:
@@ -321,14 +321,14 @@ class _Table:
     def positive(self, key: str) -> float:
         value = self.number(key)
         if value <= 0:
-            self.refuse(key, mend=f"write a number above 0, {key} = 0.01")
+            self.refuse(key, hint=f"write a number above 0, {key} = 0.01")
         return value
 
     def declared(self, key: str) -> Declared:
         pair = self.table(key)
         pair.check(("mean", "std"))
         if pair.number("std") < 0:
-            pair.refuse("std", mend="write a standard deviation of 0 (trusted) or more")
+            pair.refuse("std", hint="write a standard deviation of 0 (trusted) or more")
         return Declared(pair.number("mean"), pair.number("std"))
 
     def distinct(self, key: str, kind: type) -> tuple:
@@ -357,9 +357,9 @@ def _parameter(model: _Table, key: str) -> Declared:
     value = model.quantity(key)
     unit = parameter_unit(key)
     if unit == "kg" and value.mean <= 0:
-        model.refuse(key, mend="write a mass above 0 [kg]")
+        model.refuse(key, hint="write a mass above 0 [kg]")
     if unit in ("m", "m/s^2") and value.mean < 0:
-        model.refuse(key, mend=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
+        model.refuse(key, hint=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
     if value.mean > {"m/s^2": 100.0, "m": 50.0}.get(unit, math.inf):
         problem = f"{model.path}: [model] {key}: found {value.mean:g}"
         warnings.warn(f"{problem}; is it in m{unit}? write it in {unit}", RigWarning, 2)
@@ -400,7 +400,7 @@ def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ..
         joint = model.value(key)
         joints = (joint,) if type(joint) is int else model.refuse(key)
     if not all(1 <= joint <= spec.joints for joint in joints):
-        table.refuse(key, mend=f"joints count from 1 to {spec.joints}")
+        table.refuse(key, hint=f"joints count from 1 to {spec.joints}")
     return columns, joints, drives
 
 

@@ -77,8 +77,8 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
     for key, about in KINDS[kind].items():
         if about.needed and key not in numbers:
             problem = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
-            mend = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
-            (own if own.items else table).refuse(key, problem, mend)
+            hint = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
+            (own if own.items else table).refuse(key, problem, hint)
     return Drive(kind, numbers)
 
 
@@ -92,8 +92,8 @@ def _refuse_unknown(table: Any, columns: Collection[str]) -> None:
     for key, value in table.items.items():
         if isinstance(value, dict) and key not in (*columns, *RESERVED):
             problem = f"no input column is called {key!r}"
-            mend = "name it in columns and its joint in joints, or take the table out"
-            table.refuse(key, problem, f"{mend}; columns are {', '.join(columns) or 'none'}")
+            hint = "name it in columns and its joint in joints, or take the table out"
+            table.refuse(key, problem, f"{hint}; columns are {', '.join(columns) or 'none'}")
 
 
 def _kind(table: Any) -> str | None:

@@ -97,8 +97,8 @@ class Journal:
                 option = isinstance(value, int) or name.startswith("--")
                 made = f"with {name} {other}, not {value}" if option else f"from another {name}"
                 again = f"resume with {name} {other}" if other is not None else f"resume without {name}"
-                mend = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
-                refuse(path, f"made {made}", f"{mend}, or give another --out")
+                hint = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
+                refuse(path, f"made {made}", f"{hint}, or give another --out")
         return header["leaves"], arrays
 
 

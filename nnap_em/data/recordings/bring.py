@@ -106,8 +106,8 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
         problem = (
             f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
         )
-        mend = "name a field that holds numbers in [import.columns], or take the log out"
-        refuse(recording.path, f"column {name!r}", problem, mend)
+        hint = "name a field that holds numbers in [import.columns], or take the log out"
+        refuse(recording.path, f"column {name!r}", problem, hint)
     if there.all():
         return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
     return Signal(at.topic, t[there], y[there] * at.scale)
@@ -140,8 +140,8 @@ def _gridded(
     if not used:
         most = max((piece.end - piece.first for piece in segments), default=0)
         problem = f"the longest stretch in which all topics have messages has {most} rows"
-        mend = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
-        refuse(recording.path, "the log", problem, mend)
+        hint = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
+        refuse(recording.path, "the log", problem, hint)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
     causes = pairs(joints, states, signals, tuple(plan.duplicates))
@@ -166,8 +166,8 @@ def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Sig
         late = max(intervals, key=lambda topic: intervals[topic][0])
         early = min(intervals, key=lambda topic: intervals[topic][1])
         ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in intervals.items())
-        mend = f"--shift {late}=SECONDS where their clocks differ, or record them together"
-        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", mend)
+        hint = f"--shift {late}=SECONDS where their clocks differ, or record them together"
+        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", hint)
     return start, end
 
 

@@ -23,8 +23,8 @@ def places(logs: Sequence[Brought], test: float) -> list[str]:
     count = sum(len(log.values) for log in logs)
     wanted = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
     if wanted >= count:
-        mend = "give fewer, or set [import] longest lower in rig.toml"
-        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {mend}")
+        hint = "give fewer, or set [import] longest lower in rig.toml"
+        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {hint}")
     digits = max(len(str(count - 1)), 3)
     return [f"train/{i:0{digits}d}.csv" for i in range(count - wanted)] + [
         f"test/{i:0{digits}d}.csv" for i in range(wanted)

@@ -93,8 +93,8 @@ def _decoded(
         values = reader.read(batch.data, batch.start, batch.size, (*paths, *fields))
     except Exception as error:  # what the decoders raise on damaged bytes is open-ended
         problem = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
-        mend = "the recorder wrote another type than it said: record again, or name another topic"
-        refuse(log.path, f"topic {log.frames.channels[batch.channel].topic!r}", problem, mend)
+        hint = "the recorder wrote another type than it said: record again, or name another topic"
+        refuse(log.path, f"topic {log.frames.channels[batch.channel].topic!r}", problem, hint)
     stamp = _nanoseconds(values[:, len(paths) :]) if fields else None
     return np.ascontiguousarray(values[:, : len(paths)].T), stamp
 
@@ -159,9 +159,9 @@ def _opened(path: Path) -> Iterator[_Open]:
             yield _Open(path, frames, counts, firsts)
         except Broken as broken:
             text = str(broken)
-            mend = "" if ";" in text else "; use another copy, or `mcap recover` it"
-            mend = text.endswith("pip install") * f" {EXTRA.removeprefix('pip install ')}" or mend
-            raise DataError(f"{path}: {text}{mend}") from None
+            hint = "" if ";" in text else "; use another copy, or `mcap recover` it"
+            hint = text.endswith("pip install") * f" {EXTRA.removeprefix('pip install ')}" or hint
+            raise DataError(f"{path}: {text}{hint}") from None
 
 
 def _samples(log: _Open) -> dict[int, list[bytes]]:

@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from .. import __version__
+from ..storage.log import Log, silent
 
 _MAIN = """\
 examples:
@@ -282,28 +283,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from . import common  # loads JAX
 
-        with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:
+        with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
             warnings.showwarning = _warn
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()
             run = importlib.import_module(f".{args.command}", __package__).run
             with common.profiled(getattr(args, "profile", False)):
-                return run(args, say) or 0
+                return run(args, log) or 0
     except KeyboardInterrupt as stopped:
-        _say(str(stopped) or "stopped; the files that were written are whole")
+        _log(str(stopped) or "stopped; the files that were written are whole")
         return 130
     except Exception as error:
         line = _line(error)
         if line is None:
             raise
-        _say(f"error: {line}")
+        _log(f"error: {line}")
         return 2
 
 
 @contextmanager
-def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """`notify`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
+def _stoppable(log: Log) -> Iterator[Log]:
+    """`log`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
     noisily.
     """
     interrupted = False
@@ -314,7 +315,7 @@ def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
         signal.default_int_handler(number, frame)
 
     def line(text: str) -> None:
-        say(text)
+        log(text)
         if interrupted:
             raise KeyboardInterrupt
 
@@ -347,15 +348,11 @@ def _line(error: Exception) -> str | None:
 
 def _warn(message: Warning | str, category: type[Warning], *_) -> None:
     if "persistent compilation cache" not in str(message):
-        _say(f"warning: {message}")
+        _log(f"warning: {message}")
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"nnap-em: {text}", file=sys.stderr, flush=True)
-
-
-def _silent(text: str) -> None:
-    """Discard a message."""
 
 
 def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):

@@ -34,6 +34,7 @@ from ..portable.export import ExportError
 from ..residual.residual import names_of
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
+from ..storage.log import Log
 from ..storage.shelf import Shelf
 from ..systems import specs
 
@@ -52,7 +53,6 @@ MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
-Say = Callable[[str], None]
 """Receiver of lines of progress."""
 
 
@@ -162,7 +162,7 @@ def log_of(fitted: Identified, logs: Logs) -> Channel:
 
 
 @contextmanager
-def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Journal]:
+def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Journal]:
     """Keep every finished step of what is done inside until all of it is; with --resume go on from what is kept.
 
     A journal that is left `open` is kept after the end, too.
@@ -175,14 +175,14 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Jour
     if args.resume:
         journal.check()
         message = f"resumed with {len(journal)} finished steps"
-        say(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
-    with _folder(args.out), _telling(lambda: go_on(args, journal)):
+        log(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
+    with _folder(args.out), _reporting(lambda: go_on(args, journal)):
         if args.resume:
             sweep(journal.folder)
         else:
             journal.clear()
         count, rows = bench.train.data.valid.shape
-        say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
+        log(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
             yield journal
         if not journal.open:
@@ -208,7 +208,7 @@ def go_on(args: argparse.Namespace, journal: Journal) -> str:
 
 
 @contextmanager
-def _telling(kept: Callable[[], str]) -> Iterator[None]:
+def _reporting(kept: Callable[[], str]) -> Iterator[None]:
     """Report the finished steps where a run is stopped or a file cannot be written."""
     try:
         yield

@@ -15,24 +15,25 @@ from ..design.rivals import Law, open_pairs, rivals
 from ..em.identify import Identified
 from ..em.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
+from ..storage.log import Log
 from ..systems import specs
-from .common import Bench, Say, read_training, resumable
+from .common import Bench, read_training, resumable
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Design, and report."""
     began = time.perf_counter()
     stored = read(model_file(args.folder))
     fitted, bench = _logs(args, stored)
     key, question = jax.random.key(args.seed), vars(args)["for"]
-    with resumable(args, bench, say):
+    with resumable(args, bench, log):
         data = bench.train.data
-        pairs = rivals(fitted, data, _wanted(args, fitted), say) if question in ("all", "apart") else []
+        pairs = rivals(fitted, data, _wanted(args, fitted), log) if question in ("all", "apart") else []
         design = design_experiment(
             fitted, data, key=key, question=question, rivals=pairs,
-            seconds=args.seconds, sequences=args.sequences, say=say,
+            seconds=args.seconds, sequences=args.sequences, log=log,
         )  # fmt: skip
-        write_design(args.out, design, question=question, seed=args.seed, began=began, say=say)
+        write_design(args.out, design, question=question, seed=args.seed, began=began, log=log)
 
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:

@@ -4,14 +4,14 @@ import argparse
 
 from ..data.dataset import DataError
 from ..storage.files import replace_text
+from ..storage.log import Log
 from ..systems import specs
-from .common import Say
 from .draft import draft
 from .draft_machine import draft_machine
 from .draft_recorded import draft_recorded
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write it, to be filled in; one that is there stays as it is."""
     home = args.log.parent.parent if args.log.parent.name in ("train", "test") else args.log.parent
     path = (args.out or home) / "rig.toml"
@@ -23,5 +23,5 @@ def run(args: argparse.Namespace, say: Say) -> None:
         drafted = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
     replace_text(path, drafted.text)
     for note in drafted.notes:
-        say(f"in the log: {note}")
-    say(f"wrote {path}" + (f"; fill in {', '.join(drafted.missing)}" if drafted.missing else ""))
+        log(f"in the log: {note}")
+    log(f"wrote {path}" + (f"; fill in {', '.join(drafted.missing)}" if drafted.missing else ""))

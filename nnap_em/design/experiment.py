@@ -13,12 +13,13 @@ from ..data.dataset import Dataset
 from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import drawn_paths, smooth
+from ..storage.log import Log, renamed, silent
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
 from .questions import AbstractQuestion, Apart, Friction, Information, Parameters, Several, share
 from .rivals import Rivals
-from .search import EFFORT, Bench, Effort, Plan, Say, evaluated, expected_information, search
+from .search import EFFORT, Bench, Effort, Plan, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
 DRAWN = 32
@@ -71,6 +72,7 @@ class Design(NamedTuple):
         return self.expected
 
 
+@renamed(say="log")
 def design_experiment(
     fitted: Identified,
     data: Dataset,
@@ -81,7 +83,7 @@ def design_experiment(
     seconds: float = 30.0,
     sequences: int = 6,
     effort: Effort = EFFORT,
-    say: Say = lambda text: None,
+    log: Log = silent,
 ) -> Design:
     """The `sequences` inputs of `seconds` [s] together that serve a criterion best, found by a seeded search.
 
@@ -112,9 +114,9 @@ def design_experiment(
     bench = bench._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
     quick = bench._replace(informed=not isinstance(criterion, Apart))
-    plan = search(quick, criterion, sequences, rng=rng, effort=effort, say=say)
+    plan = search(quick, criterion, sequences, rng=rng, effort=effort, log=log)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
-    plan, trials = _checked(bench, checked, plan, effort, say)
+    plan, trials = _checked(bench, checked, plan, effort, log)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
     low, middle, high = np.quantile(np.asarray(trials.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
     return Design(
@@ -189,7 +191,7 @@ SHRINKS, LAST = 0.85, 12
 """Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
 
 
-def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say):
+def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, log: Log):
     """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
     proposal = Proposal(*map(np.array, plan.proposal))
     for _ in range(LAST):
@@ -198,7 +200,7 @@ def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say)
         ok = allowed(trials, bench.limits)
         if ok.all():
             break
-        say(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
+        log(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
         proposal.shape[~ok, :, -1] *= SHRINKS
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..data.dataset import Dataset
-from ..diagnose.context import Say
 from ..diagnose.keys import key_of, words
 from ..diagnose.rivals import instead, possible
 from ..effects import AbstractEffect
 from ..em.identify import Identified
+from ..storage.log import Log, silent
 from .limits import DesignError
 
 
@@ -49,7 +49,7 @@ def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
 
 
 def rivals(
-    fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], say: Say = lambda text: None
+    fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], log: Log = silent
 ) -> list[Rivals]:
     """Models to be discriminated: `fitted` beside itself with another law in the place of one of its own, and, where
     there is none (None), all that may come on top beside each other and beside `fitted` as it is, if there is but one.
@@ -58,7 +58,7 @@ def rivals(
     """
     out, beside = [], []
     for own, other in wanted:
-        say(f"fitting {other} in place of {own or 'nothing'}")
+        log(f"fitting {other} in place of {own or 'nothing'}")
         model = _instead(fitted, data, own, other)
         if own is None:
             beside.append((str(other), model))

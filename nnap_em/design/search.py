@@ -4,7 +4,6 @@ Friction has kinks, limits are walls and a free arm is chaotic, so that a slope 
 search is a seeded one.  Motions and information of a batch of proposals are a step that a resumed run finds again.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,13 +13,12 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..em.predict import Paths
 from ..storage.journal import HERE, step
+from ..storage.log import Log, silent
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
 from .questions import AbstractQuestion, Information
 from .signals import Proposal, drawn, mutated, played, starts
-
-Say = Callable[[str], None]
 
 
 class Effort(NamedTuple):
@@ -92,13 +90,13 @@ def search(
     *,
     rng: np.random.Generator,
     effort: Effort = EFFORT,
-    say: Say = lambda text: None,
+    log: Log = silent,
 ) -> Plan:
     """The `count` sequences that answer best together.
 
     Raises DesignError where hardly any proposal stays inside the limits.
     """
-    pool = _pool(bench, count, rng, effort, say)
+    pool = _pool(bench, count, rng, effort, log)
     chosen, total = [], None
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
         costs = question.cost(pool.expected if total is None else total + pool.expected)
@@ -106,20 +104,20 @@ def search(
         one = pool.expected.of(chosen[-1])
         total = one if total is None else total + one
     plan = _of(pool, np.asarray(chosen))
-    say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
+    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
         if float(question.cost(plan.expected.sum())) <= question.least:
             break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(bench, question, plan, rng, reach, effort)
         cost = float(question.cost(plan.expected.sum()))
-        say(
+        log(
             f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
         )
     return plan
 
 
-def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, say: Say) -> Plan:
+def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, log: Log) -> Plan:
     """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
     inputs, states = bench.limits.low.size, bench.limits.first.size
     plans, waiting = [], drawn(rng, effort.batch, inputs, states)
@@ -127,7 +125,7 @@ def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, sa
         ok, expected = evaluated(bench, waiting, effort.few)
         plans.append(_of(Plan(waiting, expected), ok))
         have = sum(len(plan.proposal.family) for plan in plans)
-        say(f"{have} of {effort.pool} proposals inside the limits")
+        log(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
             break
         waiting.shape[~ok, :, -1] *= SHRINKS

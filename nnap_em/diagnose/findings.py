@@ -212,7 +212,7 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
             f"{words(dispute.key)} would remove {dispute.share:.0%} of the prediction error, but {listed(against)} "
-            f"{'says' if len(against) == 1 else 'say'} the opposite (up to {dispute.harm:.0%} more error)"
+            f"{'says' if len(against) == 1 else 'log'} the opposite (up to {dispute.harm:.0%} more error)"
         )
         key = catalogue[name].key()
         out.append(Dispute(key, joint, channel, list(inputs), dispute.share, against, dispute.harm, text))

@@ -31,7 +31,7 @@ def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMSt
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
         if share < 0.1 or gain < ONE_STEP.nats:
             continue
-        context.say(f"  {channel} comes in steps of {step:.4g}")
+        context.log(f"  {channel} comes in steps of {step:.4g}")
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)

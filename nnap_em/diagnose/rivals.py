@@ -10,6 +10,7 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
 from ..em.identify import Identified, finished
+from ..storage.log import silent
 from .context import EFFORT, SearchContext, extend, smooth
 from .hypothesis import Hypothesis
 from .keys import Key, key_of
@@ -98,7 +99,7 @@ def _settled(fitted: Identified, data: Dataset) -> Identified:
 
 
 def _context(fitted: Identified, data: Dataset) -> SearchContext:
-    return SearchContext(fitted, {}, data, OneStep(), EFFORT, lambda text: None)
+    return SearchContext(fitted, {}, data, OneStep(), EFFORT, silent)
 
 
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:

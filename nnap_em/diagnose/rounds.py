@@ -86,7 +86,7 @@ def _accepted(sound: list[Refit], outcome: Round, fit: SmoothedFit, context: Sea
     rivals = [case for case in even if other_cause(case.effect, law, fit.model.system)]
     if rivals and context.loss.predicts:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
-        context.say(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
+        context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = zip(candidates, overlaps(outcome.screen, best.screened), strict=True)
@@ -174,12 +174,12 @@ def _log(case: Refit, context: SearchContext) -> None:
     """One line on a refit."""
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
     share, reason = case.screened.share.least, case.rejection
-    context.say(
+    context.log(
         f"  refitted {words(key_of(case.effect))} {values}: {share:.1%} of the squared error before the refit, "
         f"{case.removed:.1%} after it ({case.gain:.0f} nat); bar {case.screened.bar:.1%}"
     )
     if reason is not None:
-        context.say(f"  {words(key_of(case.effect))} {reason.sentence}")
+        context.log(f"  {words(key_of(case.effect))} {reason.sentence}")
 
 
 def _removals(tried: Sequence[Refit]) -> tuple[tuple[Key, float], ...]:

@@ -1,7 +1,6 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,12 @@ from ..diagnose.keys import key_of, listed, words
 from ..numerics.digits import number
 from ..residual.residual import names_of
 from ..storage.files import replace_text
+from ..storage.log import Log
 from .design_plots import bands_figure, motion_figure
 from .document import versions
 from .page import Picture, picture, rendered
 from .tables import write_json
 
-Say = Callable[[str], None]
 INPUTS, MOTIONS = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
 NOTED = 1.1
@@ -29,7 +28,7 @@ ACROSS = 3
 """Sequences in one figure."""
 
 
-def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, say: Say) -> None:
+def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, log: Log) -> None:
     """Write a designed experiment into the folder `out`; `began` is `time.perf_counter()` at the start."""
     files = _write_sequences(out, design)
     document = describe(design) | {
@@ -44,8 +43,8 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     write_json(out / "design.json", document, named)
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
     replace_text(out / "design.html", named(text))
-    say(document["verdict"])
-    say(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
+    log(document["verdict"])
+    log(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
 
 
 def _write_sequences(out: Path, design: Design) -> list[str]:

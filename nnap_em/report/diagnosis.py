@@ -20,6 +20,7 @@ from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.files import replace_text
+from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
@@ -27,8 +28,6 @@ from .friction_plots import friction_figure
 from .page import MOST, ROOM, Picture, page, picture
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
-
-Say = Callable[[str], None]
 
 
 def write_diagnosis(
@@ -40,7 +39,7 @@ def write_diagnosis(
     *,
     seed: int,
     began: float,
-    say: Say,
+    log: Log,
 ) -> None:
     """Write the report of a closed loop into the folder `out`; `began` is `time.perf_counter()` at the start."""
     names, both = names_of(closed.before), {"before": closed.before, "after": closed.after}
@@ -86,8 +85,8 @@ def write_diagnosis(
     named = closed.before.rig.named
     write_json(out / "report.json", document, named)
     replace_text(out / "report.html", named(page(document, figures)))
-    say(document["verdict"])
-    say(f"wrote {out / 'report.html'} and report.json")
+    log(document["verdict"])
+    log(f"wrote {out / 'report.html'} and report.json")
 
 
 def _error_pictures(

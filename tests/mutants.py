@@ -820,7 +820,7 @@ MUTANTS = (
     Mutant(
         "a sensor in the axes of its joint",
         "systems/sensing.py",
-        "transposed(product(mount.turn, sense.turn))",
+        "transposed(product(mount.turn, sensor.turn))",
         "transposed(mount.turn)",
         f"{SENSORS}readings_are_those_of_mujoco_under_torque_and_friction[branch]",
     ),

@@ -32,8 +32,8 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         hint = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
     columns |= (sensed := _sensors(machine, topics))
-    named, senses = tuple(columns), tuple(sense for sense in machine.senses if sense.name in sensed)
-    machine = machine._replace(states=_called(machine, named), senses=senses)
+    named, sensors = tuple(columns), tuple(sensor for sensor in machine.sensors if sensor.name in sensed)
+    machine = machine._replace(states=_called(machine, named), sensors=sensors)
     spec, text = SystemSpec(machine.states, (), {}, len(machine.joints)), packed(machine)
     everything = columns | {column: at for column, (at, _) in inputs.items()}
     table = _table(path, everything)
@@ -50,9 +50,9 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
 def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
     """The states, by the sensors whose columns are there."""
     names, dof = list(states(machine.joints)), len(machine.joints)
-    for gauge in machine.gauges:
-        if gauge.name in columns:
-            names[gauge.joint + dof * gauge.rate] = gauge.name
+    for sensor in machine.joint_sensors:
+        if sensor.name in columns:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
     return tuple(names)
 
 
@@ -72,7 +72,7 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     kinds = _kinds(fields)
     for rate, (d, array, kind) in enumerate((("", "position", "theta"), ("d", "velocity", "dtheta"))):
         for i, joint in enumerate(machine.joints):
-            own = [gauge.name for gauge in machine.gauges if (gauge.joint, gauge.rate) == (i, bool(rate))]
+            own = [sensor.name for sensor in machine.joint_sensors if (sensor.joint, sensor.rate) == (i, bool(rate))]
             at = _first(fields, [d + joint.name, f"{array}[{joint.name}]"])
             if at is None and (sensor := next((name for name in own if _first(fields, [name])), None)):
                 out[sensor] = _first(fields, [sensor])
@@ -88,12 +88,12 @@ _IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
 def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
     every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
-    for sense in machine.senses:
-        alone = sum(other.kind == sense.kind for other in machine.senses) == 3
-        usual = f"{_IMU[sense.kind]}.{'xyz'[sense.axis]}" if alone and sense.kind in _IMU else sense.name
-        at = [at for at in every if at.path == sense.name] or [at for at in every if at.path == usual]
-        if sense.kind in SENSE_UNITS and len(at) == 1:
-            out[sense.name] = at[0]
+    for sensor in machine.sensors:
+        alone = sum(other.kind == sensor.kind for other in machine.sensors) == 3
+        usual = f"{_IMU[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in _IMU else sensor.name
+        at = [at for at in every if at.path == sensor.name] or [at for at in every if at.path == usual]
+        if sensor.kind in SENSE_UNITS and len(at) == 1:
+            out[sensor.name] = at[0]
     return out
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sense, of_body, packed, states
+from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
 from .mjcf import Part, read_machine
 from .rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
 from .servo import TORQUE, Drive, read_drives
@@ -26,12 +26,12 @@ def declare(root: Any) -> Declaration:
         model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
     part = _part(model)
     machine = read_machine(root.path.parent / str(model.items["file"]), part)
-    possible = tuple(sense.name for sense in machine.senses if sense.kind in SENSE_UNITS)
+    possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
     machine = machine._replace(
         file=str(model.items["file"]),
         states=_states(machine, root),
         rubs=model.items.get("friction") == "none",
-        senses=tuple(_senses(machine, root)),
+        sensors=tuple(_sensors(machine, root)),
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
     _warn_of_left_out(root, machine)
@@ -78,28 +78,28 @@ def _states(machine: Machine, root: Any) -> tuple[str, ...]:
     """Every joint by its name, or by that of the sensor whose column is measured."""
     names, dof = list(states(machine.joints)), len(machine.joints)
     wanted = root.table("measurement").items.get("columns")
-    for gauge in machine.gauges:
-        if isinstance(wanted, list) and gauge.name in wanted:
-            names[gauge.joint + dof * gauge.rate] = gauge.name
+    for sensor in machine.joint_sensors:
+        if isinstance(wanted, list) and sensor.name in wanted:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
     return tuple(names)
 
 
-def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
+def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
     """The components of sensors that are measured."""
     table = root.table("measurement")
     wanted = table.items.get("columns")
     for column in wanted if isinstance(wanted, list) else ():
-        for sense in machine.senses:
-            if sense.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
+        for sensor in machine.sensors:
+            if sensor.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
                 continue
-            if sense.kind not in SENSE_UNITS:
+            if sensor.kind not in SENSE_UNITS:
                 hint = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
-                table.refuse("columns", f"{column!r} is of a sensor of type {sense.kind}", hint)
-            if sense.name == column:
-                yield sense
+                table.refuse("columns", f"{column!r} is of a sensor of type {sensor.kind}", hint)
+            if sensor.name == column:
+                yield sensor
 
 
 def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from .locked import NOTHING, groups, lock
-from .machine import SENSE_UNITS, Body, Gauge, Joint, Machine, Motor, Rotation, Sense, Spot, Vector
+from .machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site, Vector
 from .rig import RigError, RigWarning, nearest
 from .servo import TORQUE
 
@@ -64,15 +64,17 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
         bodies=bodies,
         joints=joints,
         motors=tuple(motor._replace(joint=numbers.index(motor.joint)) for motor in driven),
-        gauges=tuple(
-            gauge._replace(joint=numbers.index(gauge.joint)) for gauge in _gauges(model) if gauge.joint in numbers
+        joint_sensors=tuple(
+            sensor._replace(joint=numbers.index(sensor.joint))
+            for sensor in _joint_sensors(model)
+            if sensor.joint in numbers
         ),
-        spots=tuple(
-            Spot(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
+        sites=tuple(
+            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
             for i in range(model.nsite)
             if model.site_bodyid[i] > 0
         ),
-        senses=tuple(_senses(model)),
+        sensors=tuple(_sensors(model)),
     )
     if not part.whole:
         joined = range(len(bodies)) if root.tag == "robot" else {int(i) - 1 for i in model.jnt_bodyid}
@@ -593,15 +595,15 @@ def _limits(model: Any, i: int) -> tuple[float, float] | None:
     return (max(float(x[0]) for x in own), min(float(x[1]) for x in own)) if own else None
 
 
-def _gauges(model: Any) -> Iterator[Gauge]:
+def _joint_sensors(model: Any) -> Iterator[JointSensor]:
     kinds = _mujoco().mjtSensor
     for i in range(model.nsensor):
         kind, rate = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTVEL)
         if kind in (int(kinds.mjSENS_JOINTPOS), rate):
-            yield Gauge(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
+            yield JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
 
 
-def _senses(model: Any) -> Iterator[Sense]:
+def _sensors(model: Any) -> Iterator[Sensor]:
     """The components of every sensor that reads no joint."""
     mujoco = _mujoco()
     sites, joints = int(mujoco.mjtObj.mjOBJ_SITE), (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
@@ -616,7 +618,7 @@ def _senses(model: Any) -> Iterator[Sense]:
         place, turn = (model.site_pos[at], model.site_quat[at]) if at >= 0 else (np.zeros(3), np.array([1.0, 0, 0, 0]))
         body = int(model.site_bodyid[at]) - 1 if at >= 0 else -1
         for axis, letter in enumerate("xyz"):
-            yield Sense(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
+            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:

@@ -281,7 +281,7 @@ def _check(one: Fit, two: Fit) -> None:
 
 def _body(fitted: Identified):
     """The machine of a file without its path and its sensors."""
-    return unpacked(fitted.rig.machine)._replace(file="", gauges=(), spots=(), senses=())
+    return unpacked(fitted.rig.machine)._replace(file="", joint_sensors=(), sites=(), sensors=())
 
 
 def _identity(fitted: Identified) -> tuple:

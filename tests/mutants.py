@@ -394,7 +394,7 @@ MUTANTS = (
         "numerics/programs.py",
         "if maps() <= most:",
         "if maps() > most:",
-        "test_programs.py::test_programs_are_let_go_beyond_the_bound",
+        "test_programs.py::test_programs_are_released_beyond_the_bound",
     ),
     Mutant(
         "prior of friction on its size",

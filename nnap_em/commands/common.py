@@ -29,13 +29,13 @@ from ..em.predict import GIVEN
 from ..em.store import fingerprint
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
-from ..numerics.traced import keep_on
+from ..numerics.traced import use_cache
 from ..portable.export import ExportError
 from ..residual.residual import names_of
+from ..storage.cache import Cache
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
 from ..storage.log import Log
-from ..storage.shelf import Shelf
 from ..systems import specs
 
 
@@ -53,7 +53,6 @@ MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
-"""Receiver of lines of progress."""
 
 
 def set_up() -> None:
@@ -66,7 +65,7 @@ def set_up() -> None:
         use_every_device()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
-        keep_on(Shelf(Path(chosen) / TRACED))
+        use_cache(Cache(Path(chosen) / TRACED))
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -78,7 +77,7 @@ def set_up() -> None:
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
-        keep_on(Shelf(folder / TRACED))
+        use_cache(Cache(folder / TRACED))
 
 
 @contextmanager

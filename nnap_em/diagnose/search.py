@@ -17,7 +17,7 @@ from ..em.identify import Identified, finished, identify
 from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
-from ..numerics.programs import let_go
+from ..numerics.programs import release_programs
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
 from ..storage.deadline import TimeUp, until
@@ -36,7 +36,7 @@ from .verdict import Rejection, explains, needed
 
 def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
     """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
-    let_go()
+    release_programs()
     fit, whole = smooth(context, now, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
     context.log(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")

@@ -713,7 +713,7 @@ MUTANTS = (
     ),
     Mutant(
         "a gap does not end a sequence",
-        "data/recordings/pieces.py",
+        "data/recordings/segments.py",
         "np.diff(signal.t) > longest)",
         "np.diff(signal.t) > 9 * longest)",
         "test_import.py::test_sequences_are_cut_at_gaps[readings]",

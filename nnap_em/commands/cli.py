@@ -187,16 +187,16 @@ def parser() -> argparse.ArgumentParser:
         "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
     )
 
-    bring = command("import", "write a data set from logs as machines write them", _IMPORT)
-    bring.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
-    bring.add_argument(
+    importing = command("import", "write a data set from logs as machines write them", _IMPORT)
+    importing.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
+    importing.add_argument(
         "--rig", metavar="RIG", type=Path, required=True, help="rig.toml; its [import] says what is where"
     )
-    bring.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
-    bring.add_argument(
+    importing.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
+    importing.add_argument(
         "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (.2)"
     )
-    bring.add_argument(
+    importing.add_argument(
         "--shift",
         type=_shift,
         action="append",

@@ -7,9 +7,9 @@ import time
 import tomllib
 from pathlib import Path
 
-from ..data.recordings.bring import Brought, bring
 from ..data.recordings.declared import read_plan
 from ..data.recordings.folder import completed, places, write_sequences
+from ..data.recordings.resample import Resampled, resample
 from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
 from ..report.imported import describe, write_page
@@ -27,7 +27,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:
-            logs.append(bring(path, rig, build_system(rig).states, plan, shifts))
+            logs.append(resample(path, rig, build_system(rig).states, plan, shifts))
             log(f"{path}: {_summary(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
@@ -50,6 +50,6 @@ def _reaching(text: str, here: Path, out: Path) -> str:
     return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
 
 
-def _summary(log: Brought) -> str:
+def _summary(log: Resampled) -> str:
     used = [stretch for stretch in log.sequences if not stretch.why]
     return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..data.recordings.bring import Brought, TopicFacts
 from ..data.recordings.declared import Plan
 from ..data.recordings.delays import Delay
+from ..data.recordings.resample import Resampled, TopicFacts
 from ..data.rig import Rig
 from ..numerics.digits import number
 from ..storage.files import replace_text
@@ -24,7 +24,13 @@ SURE = 4.0
 
 
 def describe(
-    logs: Sequence[Brought], files: Sequence[str], rig: Rig, plan: Plan, shifts: Mapping[str, float], *, seconds: float
+    logs: Sequence[Resampled],
+    files: Sequence[str],
+    rig: Rig,
+    plan: Plan,
+    shifts: Mapping[str, float],
+    *,
+    seconds: float,
 ) -> dict[str, Any]:
     """All that import.json holds; times in seconds after the first message of a log."""
     rest = iter(files)
@@ -57,7 +63,7 @@ def write_page(folder: Path, document: Mapping[str, Any]) -> None:
     replace_text(folder / "import.html", rendered("import.html.j2", document=document, pictures=[figure]))
 
 
-def _log(log: Brought, files: Iterator[str]) -> dict[str, Any]:
+def _log(log: Resampled, files: Iterator[str]) -> dict[str, Any]:
     return {
         "file": log.path.name,
         "origin_ns": log.origin,
@@ -77,7 +83,7 @@ def _topic(topic: TopicFacts) -> dict[str, Any]:
     return entry | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
 
 
-def _look(logs: Sequence[Brought], rig: Rig) -> Iterator[str]:
+def _look(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
     """Warnings for the owner before a fit."""
     for log in logs:
         for entry in log.delays:

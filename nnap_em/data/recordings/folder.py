@@ -11,11 +11,11 @@ import numpy as np
 from ..dataset import DataError
 from ..formats import write_csv
 from ..rig import Rig, toml_text
-from .bring import Brought
 from .recording import Address
+from .resample import Resampled
 
 
-def places(logs: Sequence[Brought], test: float) -> list[str]:
+def places(logs: Sequence[Resampled], test: float) -> list[str]:
     """The files of all sequences that are used, in the order of the logs: the last ones are for the test.
 
     `test` from 1 on is how many, below 1 their share; one sequence is left to train on.
@@ -31,7 +31,7 @@ def places(logs: Sequence[Brought], test: float) -> list[str]:
     ]
 
 
-def write_sequences(folder: Path, logs: Sequence[Brought], files: Sequence[str], rig: Rig) -> None:
+def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str], rig: Rig) -> None:
     """One CSV file a sequence; the clock begins at 0 in each, or runs on from the first log's, as the rig declares."""
     rest = iter(files)
     for log in logs:

@@ -14,8 +14,8 @@ from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
 from .files import reader
-from .pieces import LEAST, Gap, Piece, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .recording import Address, Recording, Topic, Track, refuse
+from .segments import LEAST, Gap, Segment, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .signals import SLOW, Signal, averaged, held, interpolated
 
 COARSE = 4.0
@@ -56,7 +56,7 @@ class Stretch(NamedTuple):
     """Reason why it is dropped."""
 
 
-class Brought(NamedTuple):
+class Resampled(NamedTuple):
     """One log on the grid."""
 
     path: Path
@@ -73,7 +73,7 @@ class Brought(NamedTuple):
     notes: tuple[str, ...]
 
 
-def bring(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Brought:
+def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 
     Raises DataError where a column cannot be had.
@@ -122,7 +122,7 @@ def _gridded(
     addresses: Mapping[str, Address],
     signals: Mapping[str, Signal],
     facts: tuple[TopicFacts, ...],
-) -> Brought:
+) -> Resampled:
     inputs = {name: signals[name] for name in rig.input_columns}
     readings = {name: signals[name] for name in rig.measured}
     start, end = _common(recording.path, inputs, readings, rig.dt)
@@ -134,26 +134,27 @@ def _gridded(
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
     columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
     segments = [
-        _checked(piece, columns, rig.measured) for piece in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
+        _checked(segment, columns, rig.measured)
+        for segment in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
     ]
-    used = [piece for piece in segments if not piece.why]
+    used = [segment for segment in segments if not segment.why]
     if not used:
-        most = max((piece.end - piece.first for piece in segments), default=0)
+        most = max((segment.end - segment.first for segment in segments), default=0)
         problem = f"the longest stretch in which all topics have messages has {most} rows"
         hint = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
         refuse(recording.path, "the log", problem, hint)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
     causes = pairs(joints, states, signals, tuple(plan.duplicates))
-    return Brought(
+    return Resampled(
         recording.path,
         origin,
         addresses,
         facts,
         tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
         at.size,
-        tuple(_sequence(piece, columns, rig, at) for piece in segments),
-        tuple({name: y[piece.first : piece.end] for name, y in columns.items()} for piece in used),
+        tuple(_sequence(segment, columns, rig, at) for segment in segments),
+        tuple({name: y[segment.first : segment.end] for name, y in columns.items()} for segment in used),
         (*recording.notes, *_notes(rig, signals)),
     )
 
@@ -208,18 +209,18 @@ def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
             yield name, s
 
 
-def _checked(piece: Piece, columns: Mapping[str, Float[np.ndarray, " row"]], measured: Sequence[str]) -> Piece:
-    """A piece in which a column of readings is empty is dropped: no other command takes it."""
+def _checked(segment: Segment, columns: Mapping[str, Float[np.ndarray, " row"]], measured: Sequence[str]) -> Segment:
+    """A segment in which a column of readings is empty is dropped: no other command takes it."""
     for name in measured:
-        if not piece.why and np.count_nonzero(np.isfinite(columns[name][piece.first : piece.end])) < 2:
-            return piece._replace(why=f"{name} has no reading there")
-    return piece
+        if not segment.why and np.count_nonzero(np.isfinite(columns[name][segment.first : segment.end])) < 2:
+            return segment._replace(why=f"{name} has no reading there")
+    return segment
 
 
-def _sequence(piece: Piece, columns: Mapping[str, np.ndarray], rig: Rig, at: Float[np.ndarray, " row"]) -> Stretch:
-    rows = slice(piece.first, piece.end)
+def _sequence(segment: Segment, columns: Mapping[str, np.ndarray], rig: Rig, at: Float[np.ndarray, " row"]) -> Stretch:
+    rows = slice(segment.first, segment.end)
     missing = {name: int(np.isnan(columns[name][rows]).sum()) for name in rig.measured}
-    return Stretch(float(at[piece.first]), piece.end - piece.first, missing, piece.why)
+    return Stretch(float(at[segment.first]), segment.end - segment.first, missing, segment.why)
 
 
 def _facts(

@@ -25,7 +25,7 @@ class Gap(NamedTuple):
     end: float
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """Rows of the grid that follow each other."""
 
     first: int
@@ -86,7 +86,7 @@ def watched(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: f
     return there
 
 
-def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Piece]:
+def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Segment]:
     """The stretches of rows that are there, the long ones in equal parts, the short ones marked as dropped."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
     segments = []
@@ -94,5 +94,5 @@ def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Pi
         parts = -(-(end - first) // longest)
         places = np.round(np.linspace(first, end, parts + 1)).astype(int).tolist()
         why = "" if end - first >= shortest else f"shorter than {shortest} rows"
-        segments += [Piece(a, b, why) for a, b in pairwise(places)]
+        segments += [Segment(a, b, why) for a, b in pairwise(places)]
     return segments

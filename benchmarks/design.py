@@ -80,10 +80,10 @@ def near_rest(case: plant.Case, fitted: Identified, grid: np.ndarray) -> dict[st
     return {"stated": rms(table.std), "true": rms(np.asarray(table.torque) - truth)}
 
 
-def expected(design: Design, told, grid: np.ndarray) -> list[float]:
+def expected(design: Design, information, grid: np.ndarray) -> list[float]:
     """The band that a design promises, rms over `grid`."""
     nodes = np.asarray(design.fit.nodes)
-    cov = after(np.asarray(design.fit.cov), told.information)[: nodes.size, : nodes.size]
+    cov = after(np.asarray(design.fit.cov), information.information)[: nodes.size, : nodes.size]
     out = []
     for j, v in enumerate(grid):
         weights = np.stack([np.interp(v, nodes[j], row) for row in np.eye(nodes.shape[1])], axis=1)
@@ -128,7 +128,7 @@ def friction(seed: int, out: Path, quick: bool = False, rate: float | None = Non
         "seed": seed,
         "design_s": seconds,
         **{name: near_rest(case, fitted, grid) for name, fitted in fits.items()},
-        "expected": {"designed": expected(design, design.told, grid), "more": expected(design, design.old, grid)},
+        "expected": {"designed": expected(design, design.expected, grid), "more": expected(design, design.old, grid)},
         "broken": int(np.sum(plays)),
         "plays": len(plays),
     }
@@ -178,14 +178,14 @@ def apart(seed: int, out: Path, quick: bool = False, rate: float | None = None) 
         for turn in (both, both[::-1]):
             file = out / f"{seed}_{name}_{turn[0].name}.json".replace(" ", "_")
             if not file.exists():
-                row = _told_apart(seed, name, turn, out, quick, rate)
+                row = _discriminated(seed, name, turn, out, quick, rate)
                 print(row, flush=True)
                 replace_text(file, json.dumps(row) + "\n")
             rows.append(json.loads(file.read_text()))
     return {"seed": seed, "rows": rows}
 
 
-def _told_apart(
+def _discriminated(
     seed: int, name: str, laws: tuple[Law, Law], out: Path, quick: bool, rate: float | None
 ) -> dict[str, Any]:
     """A rig with the first law: what the first logs say, more of them, and a design."""
@@ -215,10 +215,10 @@ def _told_apart(
     )
     assert design.apart is not None
     seconds, (_, new) = time.perf_counter() - began, play(case, design, seed)
-    told = ahead(rig, joined(first, new), laws, key)[0]
+    leads = ahead(rig, joined(first, new), laws, key)[0]
     more = math.nan if quick else ahead(rig, data, laws, key)[0]
-    far = {side: design.apart.distance(t).tolist() for side, t in (("designed", design.told), ("old", design.old))}
-    return row | {"more": more, "designed": told, "distance": far, "design_s": seconds}
+    far = {side: design.apart.distance(t).tolist() for side, t in (("designed", design.expected), ("old", design.old))}
+    return row | {"more": more, "designed": leads, "distance": far, "design_s": seconds}
 
 
 JOBS = {"friction": friction, "apart": apart}
@@ -263,14 +263,17 @@ def table(out: Path) -> str:
         "| seed | pair | true | lead of the true law [nat]: 30 s, 30 s more, designed |",
         "| --- | --- | --- | --- |",
     ]
-    told: dict[str, list[bool]] = {}
+    counts: dict[str, list[bool]] = {}
     for path in sorted(out.glob("apart*/*.json")):
         row, kind = json.loads(path.read_text()), path.parent.name
         if not math.isnan(row["designed"]):
-            told.setdefault(kind, []).append(row["designed"] >= EVEN)
+            counts.setdefault(kind, []).append(row["designed"] >= EVEN)
         leads = ", ".join("-" if math.isnan(row[s]) else f"{row[s]:.1f}" for s in ("first", "more", "designed"))
         lines.append(f"| {kind} {path.name.split('_')[0]} | {row['pair']} | {row['true']} | {leads} |")
-    right = (f"{kind}: told and named right {sum(each)} of the {len(each)} left open." for kind, each in told.items())
+    right = (
+        f"{kind}: discriminated and named right {sum(each)} of the {len(each)} left open."
+        for kind, each in counts.items()
+    )
     return "\n".join([*lines, "", *right])
 
 

@@ -113,7 +113,7 @@ def run(name: str, out: Path) -> None:
         rig = read_rig(folder / "rig.toml", specs)
         train, test = (read_logs(folder / part, rig).data for part in ("train", "test"))
         began = time.perf_counter()
-        closed = close_the_loop(rig, train, key=jax.random.key(0), say=record["log"].append)
+        closed = close_the_loop(rig, train, key=jax.random.key(0), log=record["log"].append)
         found = findings(closed)
         error = {}
         for side, fitted in (("before", closed.before), ("after", closed.after)):

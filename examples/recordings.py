@@ -91,8 +91,8 @@ def downloaded(address: str = ADDRESS, cache: Path | None = None, retries: int =
             found = f"{host} answers {error.response.status_code} for {urls[name]}"
             raise RecordingError(f"{name}: {found}; get the file elsewhere, then --from FOLDER") from None
         except requests.RequestException:
-            mend = f"download {urls[name]} and the seven others where there is one, then --from FOLDER"
-            raise RecordingError(f"{name}: no connection to {host}; {mend}") from None
+            hint = f"download {urls[name]} and the seven others where there is one, then --from FOLDER"
+            raise RecordingError(f"{name}: no connection to {host}; {hint}") from None
     return out
 
 

@@ -33,9 +33,9 @@ def pytest_configure(config: pytest.Config) -> None:
 def _programs():
     """After each file, programs are let go where they hold many memory maps: a worker runs hundreds of tests."""
     yield
-    from nnap_em.numerics.programs import let_go
+    from nnap_em.numerics.programs import release_programs
 
-    let_go(35_000)
+    release_programs(35_000)
 
 
 @pytest.fixture(scope="session")

@@ -415,7 +415,7 @@ MUTANTS = (
         "numerics/programs.py",
         "if maps() <= most:",
         "if maps() > most:",
-        "test_programs.py::test_programs_are_let_go_beyond_the_bound",
+        "test_programs.py::test_programs_are_released_beyond_the_bound",
     ),
     Mutant(
         "prior of friction on its size",
@@ -734,7 +734,7 @@ MUTANTS = (
     ),
     Mutant(
         "a gap does not end a sequence",
-        "data/recordings/pieces.py",
+        "data/recordings/segments.py",
         "np.diff(signal.t) > longest)",
         "np.diff(signal.t) > 9 * longest)",
         "test_import.py::test_sequences_are_cut_at_gaps[readings]",
@@ -841,7 +841,7 @@ MUTANTS = (
     Mutant(
         "a sensor in the axes of its joint",
         "systems/sensing.py",
-        "transposed(product(mount.turn, sense.turn))",
+        "transposed(product(mount.turn, sensor.turn))",
         "transposed(mount.turn)",
         f"{SENSORS}readings_are_those_of_mujoco_under_torque_and_friction[branch]",
     ),

@@ -1,4 +1,4 @@
-"""Bad input, from end to end: each ends in one line that names file, row, column and the mend, and writes nothing."""
+"""Bad input, from end to end: each ends in one line that names file, row, column and the hint, and writes nothing."""
 
 import re
 import shutil
@@ -139,7 +139,7 @@ def _jitter(t):
     return t + 0.0002 * (np.arange(t.size) == 7)
 
 
-LOGS = {  # name: (the change of train/01.csv, then the words of the message: place, finding, mend)
+LOGS = {  # name: (the change of train/01.csv, then the words of the message: place, finding, hint)
     "empty file": (lambda _: "", "line 1", "empty", "write a header"),
     "blank file": (lambda _: "\n \n", "line 1", "empty", "write a header"),
     "header only": (lambda s: s.splitlines()[0], "line 1", "found 0 rows", "2 rows or more"),

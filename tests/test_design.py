@@ -22,7 +22,7 @@ from nnap_em.design.experiment import design_experiment
 from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
 from nnap_em.design.limits import DesignError, Limits, limits_of
 from nnap_em.design.play import motions
-from nnap_em.design.questions import Apart, Friction, Several, Told, after, share
+from nnap_em.design.questions import Apart, Friction, Information, Several, after, share
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
@@ -72,18 +72,20 @@ def test_mutations_stay_numbers_between_0_and_1_and_begin_at_the_parent():
 def test_covariance_after_more_information_is_that_of_the_sum_of_precisions():
     rng = np.random.default_rng(1)
     half, jac = rng.standard_normal((5, 5)), rng.standard_normal((3, 7, 5))
-    cov, told = half @ half.T, np.einsum("nri,nrj->nij", jac, jac)
-    np.testing.assert_allclose(after(cov, told), np.linalg.inv(np.linalg.inv(cov) + told), rtol=1e-8, atol=1e-10)
+    cov, expected = half @ half.T, np.einsum("nri,nrj->nij", jac, jac)
+    np.testing.assert_allclose(
+        after(cov, expected), np.linalg.inv(np.linalg.inv(cov) + expected), rtol=1e-8, atol=1e-10
+    )
 
 
 def test_new_logs_tell_the_share_that_the_old_ones_told():
     """A posterior that is wider than the information of its logs says explains a share of it, by construction .3."""
     rng = np.random.default_rng(4)
     jac = rng.standard_normal((30, 4))
-    prior, told = 9 * np.eye(4), jac.T @ jac
+    prior, expected = 9 * np.eye(4), jac.T @ jac
     fit = lambda cov: Fit(None, None, None, jnp.asarray(cov), jnp.asarray(prior))  # type: ignore[arg-type]  # noqa: E731
-    np.testing.assert_allclose(share(fit(after(prior, 0.3 * told)), told), 0.3, rtol=1e-4)
-    assert share(fit(after(prior, 2.0 * told)), told) == 1.0
+    np.testing.assert_allclose(share(fit(after(prior, 0.3 * expected)), expected), 0.3, rtol=1e-4)
+    assert share(fit(after(prior, 2.0 * expected)), expected) == 1.0
 
 
 def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_adapted():
@@ -91,9 +93,9 @@ def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_a
     rng = np.random.default_rng(2)
     half, jac, r = rng.standard_normal((4, 4)), rng.standard_normal((9, 4)), rng.standard_normal(9)
     cov = half @ half.T
-    told = Told(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
+    expected = Information(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
     direct = np.sqrt(r @ np.linalg.solve(np.eye(9) + jac @ cov @ jac.T, r))
-    np.testing.assert_allclose(Apart((cov,)).distance(told), [direct], rtol=1e-10)
+    np.testing.assert_allclose(Apart((cov,)).distance(expected), [direct], rtol=1e-10)
 
 
 def test_friction_near_rest_counts_as_much_as_all_the_rest():
@@ -101,7 +103,7 @@ def test_friction_near_rest_counts_as_much_as_all_the_rest():
     std, weight = np.asarray([0.4, 0.1]), np.asarray([[[0.0, 1.0]], [[1.0, 0.0]]])
     fit = Fit(None, None, np.asarray([[0.0, 9.0]]), np.diag(std**2), np.eye(2))  # type: ignore[arg-type]
     cost = Friction(fit, np.asarray([2.0]), weight).cost
-    nothing, slow = (Told(np.diag([told, 0.0]) / std**2) for told in (0.0, 8.0))
+    nothing, slow = (Information(np.diag([expected, 0.0]) / std**2) for expected in (0.0, 8.0))
     np.testing.assert_allclose(np.exp(cost(nothing)), np.sqrt(0.2 * 0.05), rtol=1e-9)
     np.testing.assert_allclose(cost(nothing) - cost(slow), 0.5 * np.log(3.0), rtol=1e-9)  # eightfold more information
 
@@ -139,9 +141,9 @@ def test_information_is_the_mean_square_of_the_score(fit):
         return jax.jacfwd(innovations)(jnp.zeros(()))
 
     slope = slope_of(known_fit, seq, x)
-    told = information(known_fit, jax.tree.map(lambda a: jnp.asarray(a)[:1], data), x[None, None])
-    np.testing.assert_allclose(told[0, place, place], float(jnp.sum(slope**2)), rtol=1e-8)
-    assert told[0, place, place] > 0
+    expected = information(known_fit, jax.tree.map(lambda a: jnp.asarray(a)[:1], data), x[None, None])
+    np.testing.assert_allclose(expected[0, place, place], float(jnp.sum(slope**2)), rtol=1e-8)
+    assert expected[0, place, place] > 0
 
 
 def test_a_model_is_no_distance_from_itself_and_some_from_another(fit):
@@ -173,9 +175,9 @@ def slide(tmp_path_factory):
 def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
     """The fit linearises over the whole posterior, a design along one motion: they agree to a few percent."""
     *_, data, fitted = slide
-    told, data = known(fitted), Dataset(*map(jnp.asarray, data))
+    expected, data = known(fitted), Dataset(*map(jnp.asarray, data))
     path = nnap_em.smooth(fitted, data).state.mean
-    total = information(told, data, path[:, None]).sum(axis=0)
+    total = information(expected, data, path[:, None]).sum(axis=0)
     weights = fitted.m_step.weights(fitted.model)
     w = weights.read(fitted.model)
     hessian, _ = weights.hessian(fitted.model.unknown, w, jnp.asarray(total) + weights.symmetry())
@@ -193,15 +195,17 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     made = nnap_em.simulate(truth, jnp.asarray(design.start), jnp.asarray(design.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
     value, stated = parameter_table(identify(rig, both, key=jax.random.key(0)))["m"]
-    std = lambda told: 0.2 * np.sqrt(after(np.asarray(design.fit.cov), told.information)[-1, -1])  # noqa: E731
-    assert 1 / 1.5 < std(design.told) / stated < 1.5
+    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(design.fit.cov), expected.information)[-1, -1])  # noqa: E731
+    assert 1 / 1.5 < std(design.expected) / stated < 1.5
     assert abs(value - 1.0) < 4 * stated
-    assert max(std(design.told), std(design.old)) < std(design.nothing)
+    assert max(std(design.expected), std(design.old)) < std(design.nothing)
 
 
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     *_, data, fitted = slide
     design = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    with pytest.warns(DeprecationWarning, match=r"Design\.expected"):
+        assert design.told is design.expected
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
     found = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(found.lowest) >= design.limits.lowest[None, None])
@@ -224,9 +228,9 @@ def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says
     plan = {"seconds": 4.0, "sequences": 2, "effort": SMALL}
     design = design_experiment(fitted, data, key=jax.random.key(2), question="apart", rivals=pairs, **plan)
     assert design.apart is not None
-    assert np.all(design.apart.distance(design.told) > 0)
-    std = lambda told: np.sqrt(after(np.asarray(design.fit.cov), told.information)[-1, -1])  # noqa: E731
-    assert std(design.told) < 0.99 * std(design.nothing)  # of the mass
+    assert np.all(design.apart.distance(design.expected) > 0)
+    std = lambda expected: np.sqrt(after(np.asarray(design.fit.cov), expected.information)[-1, -1])  # noqa: E731
+    assert std(design.expected) < 0.99 * std(design.nothing)  # of the mass
 
 
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
@@ -237,9 +241,9 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     plain = limits_of(rig, system, data, path, used)
     assert plain.low[0] == np.asarray(data.u).min() and plain.high[0] == np.asarray(data.u).max()
     own = bounded(values={"u": (-1.0, 2.0), "x": (-0.5, 0.5)}, rate={"u": (-3.0, 3.0)}, start={"x": (-0.2, 0.3)})
-    told = limits_of(own, system, data, path, used)
-    assert (told.low[0], told.high[0], told.rate[0]) == (-1.0, 2.0, 3.0)
-    assert (told.lowest[0], told.highest[0], told.first[0], told.last[0]) == (-0.5, 0.5, -0.2, 0.3)
+    expected = limits_of(own, system, data, path, used)
+    assert (expected.low[0], expected.high[0], expected.rate[0]) == (-1.0, 2.0, 3.0)
+    assert (expected.lowest[0], expected.highest[0], expected.first[0], expected.last[0]) == (-0.5, 0.5, -0.2, 0.3)
     with pytest.raises(DesignError, match=r"begin at x = 0.7, out of the limits .*\[limits.start\]"):
         limits_of(bounded(start={"x": (0.7, 0.7)}), system, data, path, used)
     with pytest.raises(DesignError, match=r"has no input.*\[input\]"):
@@ -295,16 +299,16 @@ def designed(slide) -> Path:
 
 
 def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
-    told = json.loads((designed / "design.json").read_text())
-    assert told["inputs"] == [f"inputs/{i}.csv" for i in range(1, 5)] and told["seconds_each"] == 1.5
-    table = np.genfromtxt(designed / told["inputs"][0], delimiter=",", names=True)
+    expected = json.loads((designed / "design.json").read_text())
+    assert expected["inputs"] == [f"inputs/{i}.csv" for i in range(1, 5)] and expected["seconds_each"] == 1.5
+    table = np.genfromtxt(designed / expected["inputs"][0], delimiter=",", names=True)
     assert table.dtype.names == ("time", "u") and len(table) == 151
-    low, high = told["limits"]["values"]["u"]
+    low, high = expected["limits"]["values"]["u"]
     assert low <= table["u"].min() and table["u"].max() <= high
-    assert told["friction"][0]["near_rest"]["expected"] < told["friction"][0]["near_rest"]["now"]
-    assert told["parameters"]["m"]["expected"] < told["parameters"]["m"]["now"]
+    assert expected["friction"][0]["near_rest"]["expected"] < expected["friction"][0]["near_rest"]["now"]
+    assert expected["parameters"]["m"]["expected"] < expected["parameters"]["m"]["now"]
     page = (designed / "design.html").read_text()
-    assert page.count("<img") == 3 and "None is declared" in page and told["verdict"].split(" should")[0] in page
+    assert page.count("<img") == 3 and "None is declared" in page and expected["verdict"].split(" should")[0] in page
     assert not (designed / "unfinished").exists()
 
 

@@ -368,10 +368,10 @@ def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_pa
         def __del__(self):
             os.kill(os.getpid(), signal.SIGINT)
 
-    def lost(args, say):
+    def lost(args, log):
         litter = Litter()
         del litter
-        say("one line")
+        log("one line")
         raise AssertionError
 
     monkeypatch.setattr(check_command, "run", lost)

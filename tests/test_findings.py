@@ -137,7 +137,7 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
     doubtful = _doubtful()
     suspects = (Suspect(key_of(_law("motor_gain")), 0.18, 0.03),)
     doubtful = doubtful._replace(steps=(*doubtful.steps[:-1], doubtful.steps[-1]._replace(suspects=suspects)))
-    write_diagnosis(tmp_path, doubtful, [], logs, None, seed=0, began=0.0, say=lambda text: None)
+    write_diagnosis(tmp_path, doubtful, [], logs, None, seed=0, began=0.0, log=lambda text: None)
     report, html = json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
     joints = report["visited"]
     assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
@@ -156,6 +156,6 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
 def test_the_page_draws_what_is_left_beside_a_law(tmp_path):
     closed = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
     logs = Logs(("a.csv", "b.csv"), _data(SLIDE), ("time", "u", "x"))
-    write_diagnosis(tmp_path, closed, findings(closed), logs, None, seed=0, began=0.0, say=lambda text: None)
+    write_diagnosis(tmp_path, closed, findings(closed), logs, None, seed=0, began=0.0, log=lambda text: None)
     html = (tmp_path / "report.html").read_text()
     assert html.count("<figcaption><b>What is left of torsional spring at joint 1, a function of x.</b>") == 1

@@ -12,7 +12,7 @@ from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.recordings.delays import Pair, delay
-from nnap_em.data.recordings.pieces import cut
+from nnap_em.data.recordings.segments import cut
 from nnap_em.data.recordings.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.data.rig import read_rig
 from nnap_em.systems import specs

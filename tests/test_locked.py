@@ -160,7 +160,7 @@ def test_motors_and_sites_of_a_part_are_those_of_the_file(tmp_path):
     assert [(motor.name, motor.joint, motor.gear) for motor in machine.motors] == [("t1", 0, 2.0), ("t2", 1, 3.0)]
     assert [body.name for body in machine.bodies] == ["base", "hand"]
     assert sum(body.mass for body in machine.bodies) == pytest.approx(3.9, rel=1e-12)
-    (tip,) = machine.spots
+    (tip,) = machine.sites
     model = _whole(GRIPPER)
     data = mujoco.MjData(model)
     data.qpos[[model.joint("finger1").id, model.joint("finger2").id]] = 0.02, 0.021

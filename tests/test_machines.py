@@ -20,14 +20,14 @@ from nnap_em.data.mjcf import read_machine
 from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig, write_rig
 from nnap_em.design.experiment import Design
 from nnap_em.design.information import Fit
-from nnap_em.design.questions import Told
+from nnap_em.design.questions import Information
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build, build_system
 from nnap_em.em.felt import felt, sentences
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
-from nnap_em.report.design import parameters_told
+from nnap_em.report.design import parameter_entries
 from nnap_em.systems import specs
 from nnap_em.systems.bodies import physical
 from nnap_em.systems.pseudo_inertia import Numbers, of_pseudo, pseudo, stepped
@@ -289,11 +289,11 @@ def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_pa
     prior = ParameterPrior(("link2.mass", "0.delay"), jnp.asarray([2.0, 0.0]), jnp.asarray([0.1, 0.01]))
     system = build_system(rig)
     model = SimpleNamespace(system=system, effects=(late,), parameter=system.parameter)
-    told = Told(np.zeros((4, 4)))
+    told = Information(np.zeros((4, 4)))
     fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
     design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
     design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), told=told, old=told)
-    found = parameters_told(design)
+    found = parameter_entries(design)
     assert {name: entry["unit"] for name, entry in found.items()} == {
         "link2.mass": "kg",
         "input delay at joint 2, delay": "s",

@@ -5,9 +5,9 @@ import jax
 from nnap_em.numerics import programs
 
 
-def test_programs_are_let_go_beyond_the_bound(monkeypatch):
+def test_programs_are_released_beyond_the_bound(monkeypatch):
     cleared = []
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))
     monkeypatch.setattr(programs, "maps", lambda: 50)
-    assert not programs.let_go(50) and not cleared
-    assert programs.let_go(49) and cleared == [True]
+    assert not programs.release_programs(50) and not cleared
+    assert programs.release_programs(49) and cleared == [True]

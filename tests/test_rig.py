@@ -1,4 +1,4 @@
-"""rig.toml: what is declared comes back, what is wrong is refused by name and with a mend."""
+"""rig.toml: what is declared comes back, what is wrong is refused by name and with a hint."""
 
 import re
 import shutil
@@ -122,7 +122,7 @@ def test_byte_order_mark_and_windows_lines_are_accepted(tmp_path):
     assert _read(tmp_path, "\ufeff" + GOOD.replace("\n", "\r\n")) == _read(tmp_path, GOOD)
 
 
-MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what was found and the mend)
+MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what was found and the hint)
     "syntax": ("dt = 0.01", "dt = ", "line 22", "not TOML", "key = value"),
     "key twice": ("m2 = 0.25", "m2 = 0.25\nm2 = 0.3", "line 8", "not TOML", "no key twice"),
     "format missing": ("format = 1", "", "format:", "missing", "write format = 1"),
@@ -197,13 +197,13 @@ MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what 
 }
 
 
-@pytest.mark.parametrize(("good", "bad", "place", "found", "mend"), MISTAKES.values(), ids=MISTAKES.keys())
-def test_a_mistake_is_refused_with_file_place_finding_and_mend(tmp_path, good, bad, place, found, mend):
+@pytest.mark.parametrize(("good", "bad", "place", "found", "hint"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_refused_with_file_place_finding_and_hint(tmp_path, good, bad, place, found, hint):
     assert good in GOOD
     with pytest.raises(RigError) as refused:
         _read(tmp_path, GOOD.replace(good, bad, 1))
     message = str(refused.value)
-    for part in (str(tmp_path / "rig.toml"), place, found, mend):
+    for part in (str(tmp_path / "rig.toml"), place, found, hint):
         assert part in message
 
 

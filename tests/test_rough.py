@@ -14,7 +14,7 @@ from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, spec
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, Logs
-from nnap_em.data.lost import retell
+from nnap_em.data.lost import interpolated
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
 from nnap_em.data.spikes import noise, spikes
@@ -236,7 +236,7 @@ def test_an_input_of_sines_is_told_over_a_gap(length):
     t = DT * np.arange(ROWS)
     u = 0.2 * np.sin(7 * t) + 0.1 * np.sin(23 * t + 1)
     lost = (np.arange(ROWS) >= 200) & (np.arange(ROWS) < 200 + length)
-    told = retell(np.where(lost, np.nan, u), lost)
+    told = interpolated(np.where(lost, np.nan, u), lost)
     np.testing.assert_allclose(told.u, u, atol=1e-3)
     assert (told.doubt[lost] < 0.01).all()
     assert (told.doubt[~lost] == 0).all()
@@ -244,8 +244,8 @@ def test_an_input_of_sines_is_told_over_a_gap(length):
 
 def test_an_input_of_noise_is_not_trusted_over_a_gap():
     u, lost = np.random.default_rng(0).standard_normal(ROWS), np.arange(ROWS) // 8 == 25
-    assert (retell(np.where(lost, np.nan, u), lost).doubt[lost] > 1).all()
-    assert retell(np.where(lost, np.nan, 0.0), lost).u.tolist() == [0.0] * ROWS
+    assert (interpolated(np.where(lost, np.nan, u), lost).doubt[lost] > 1).all()
+    assert interpolated(np.where(lost, np.nan, 0.0), lost).u.tolist() == [0.0] * ROWS
 
 
 # --- through the reader

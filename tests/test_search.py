@@ -251,7 +251,7 @@ def _rounds(monkeypatch, *laws):
 
     smooth = search.smooth
     monkeypatch.setattr(search, "smooth", lambda *a: (lengths.append(a[2]), smooth(*a))[1])
-    monkeypatch.setattr(search, "let_go", lambda: None)
+    monkeypatch.setattr(search, "release_programs", lambda: None)
     monkeypatch.setattr(search, "screening_round", screening_round)
     return lengths
 

@@ -237,7 +237,7 @@ def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
 
 def test_texts_of_machines_from_before_sensors_are_read():
     before = json.dumps(json.loads(packed(read_machine(ROOT / "tests" / "machines" / "branch.xml")))[:-1])
-    assert unpacked(before).senses == ()
+    assert unpacked(before).sensors == ()
 
 
 BAD = {
@@ -357,12 +357,12 @@ def test_sensors_are_written_back(swung, tmp_path):
     for passive in written.findall("./actuator/*[@name='pivot_offset']"):  # of the learned friction; it is no input
         written.find("./actuator").remove(passive)
     written.write(tmp_path / "again.xml")
-    again = read_machine(tmp_path / "again.xml").senses
-    for sense in unpacked(fitted.rig.machine).senses:
-        own = next(one for one in again if one.name == sense.name)
-        assert own[:4] == sense[:4]
-        np.testing.assert_allclose(own.turn, sense.turn, atol=1e-11)
-        np.testing.assert_allclose(own.place, sense.place, atol=1e-11)
+    again = read_machine(tmp_path / "again.xml").sensors
+    for sensor in unpacked(fitted.rig.machine).sensors:
+        own = next(one for one in again if one.name == sensor.name)
+        assert own[:4] == sensor[:4]
+        np.testing.assert_allclose(own.turn, sensor.turn, atol=1e-11)
+        np.testing.assert_allclose(own.place, sensor.place, atol=1e-11)
 
 
 def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp_path):

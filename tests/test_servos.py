@@ -1,4 +1,4 @@
-"""Servos as inputs: their torque is that of MuJoCo's actuators, what is declared comes back, mistakes have a mend."""
+"""Servos as inputs: their torque is that of MuJoCo's actuators, what is declared comes back, mistakes have a hint."""
 
 import dataclasses
 import re

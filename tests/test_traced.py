@@ -16,20 +16,20 @@ from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics import parallel, traced
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
 from nnap_em.smoother.start import StartBank
-from nnap_em.storage.shelf import Shelf
+from nnap_em.storage.cache import Cache
 
 
 @pytest.fixture
-def shelf(tmp_path, monkeypatch):
-    """A shelf in use, in a process that has no program yet."""
-    found = Shelf(tmp_path / "shelf")
-    monkeypatch.setattr(traced._Kept, "shelf", found)
-    monkeypatch.setattr(traced._Kept, "ready", {})
+def cache(tmp_path, monkeypatch):
+    """A cache in use, in a process that has no program yet."""
+    found = Cache(tmp_path / "cache")
+    monkeypatch.setattr(traced._Programs, "cache", found)
+    monkeypatch.setattr(traced._Programs, "ready", {})
     return found
 
 
-def _kept(shelf: Shelf) -> set[str]:
-    return {path.name for path in shelf.folder.glob("*")}
+def _kept(cache: Cache) -> set[str]:
+    return {path.name for path in cache.folder.glob("*")}
 
 
 @pytest.fixture(scope="module")
@@ -41,20 +41,20 @@ def work():
 
 def _smoothed(work, smoother, monkeypatch):
     """`e_step` as the next process would do it."""
-    monkeypatch.setattr(traced._Kept, "ready", {})
+    monkeypatch.setattr(traced._Programs, "ready", {})
     parallel._program.cache_clear()
     return e_step(work[0], work[1], smoother, key=jax.random.key(0))
 
 
-def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(shelf, work, monkeypatch):
+def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(cache, work, monkeypatch):
     smoother, calls = CubatureSmoother(StartBank((1, 3))), []
     plain = e_step(work[0], work[1], smoother, key=jax.random.key(0))
     first = _smoothed(work, smoother, monkeypatch)
-    assert len(_kept(shelf)) == 1
+    assert len(_kept(cache)) == 1
     transition = type(work[0]).transition
     monkeypatch.setattr(type(work[0]), "transition", lambda *args: calls.append(1) or transition(*args))
     again = _smoothed(work, smoother, monkeypatch)
-    assert not calls and len(_kept(shelf)) == 1
+    assert not calls and len(_kept(cache)) == 1
     for a, b, c in zip(*map(jax.tree.leaves, (plain, first, again)), strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(b, c)
@@ -62,7 +62,7 @@ def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
 
 
 @pytest.mark.parametrize("other", ["smoother", "constant", "shape", "type"])
-def test_what_decides_a_program_makes_another(shelf, work, monkeypatch, other):
+def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
     smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
     _smoothed(work, smoother, monkeypatch)
     if other == "smoother":
@@ -75,36 +75,36 @@ def test_what_decides_a_program_makes_another(shelf, work, monkeypatch, other):
         data = data._replace(u=data.u.astype(jnp.float32))
     with jax.numpy_dtype_promotion("standard"):
         found = _smoothed((model, data), smoother, monkeypatch)
-        assert len(_kept(shelf)) == 2
-        monkeypatch.setattr(traced._Kept, "shelf", None)
+        assert len(_kept(cache)) == 2
+        monkeypatch.setattr(traced._Programs, "cache", None)
         np.testing.assert_array_equal(found.state.mean, _smoothed((model, data), smoother, monkeypatch).state.mean)
 
 
-def test_other_numbers_are_no_other_program(shelf, work, monkeypatch):
+def test_other_numbers_are_no_other_program(cache, work, monkeypatch):
     smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
     first = _smoothed(work, smoother, monkeypatch)
     heavier = dataclasses.replace(model, log_q=model.log_q + 1.0)
     second = _smoothed((heavier, data), smoother, monkeypatch)
-    assert len(_kept(shelf)) == 1
+    assert len(_kept(cache)) == 1
     assert np.abs(np.asarray(first.state.cov - second.state.cov)).max() > 0
 
 
-def test_another_text_of_the_package_makes_another(shelf, work, monkeypatch):
+def test_another_text_of_the_package_makes_another(cache, work, monkeypatch):
     smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     _smoothed(work, smoother, monkeypatch)
     monkeypatch.setattr(traced, "_surroundings", lambda: b"after an edit")
     _smoothed(work, smoother, monkeypatch)
-    assert len(_kept(shelf)) == 2
+    assert len(_kept(cache)) == 2
 
 
 def _own(common, one):
     return common * one
 
 
-def test_what_a_key_cannot_tell_is_not_kept(shelf):
+def test_what_a_key_cannot_tell_is_not_kept(cache):
     """A function of another package may say something else tomorrow under the same name."""
     np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(2.0), jnp.arange(3.0)), [0.0, 2.0, 4.0])
-    assert not _kept(shelf)
+    assert not _kept(cache)
 
 
 def _called_back(common, one):
@@ -115,11 +115,11 @@ def _wrong(common, one):
     raise ZeroDivisionError("told by the function")
 
 
-def test_what_cannot_be_written_down_runs_all_the_same(shelf, monkeypatch):
+def test_what_cannot_be_written_down_runs_all_the_same(cache, monkeypatch):
     for function in (_called_back, _wrong):
         monkeypatch.setattr(function, "__module__", "nnap_em.somewhere")
     np.testing.assert_array_equal(parallel.each(_called_back, None, jnp.arange(3.0)), [0.0, 2.0, 4.0])
-    assert not _kept(shelf)
+    assert not _kept(cache)
     with pytest.raises(ZeroDivisionError, match="told by the function"):
         parallel.each(_wrong, None, jnp.arange(3.0))
 
@@ -135,21 +135,21 @@ def test_a_closure_is_told_by_nothing():
         traced._key(len, [], inside)
 
 
-def test_what_is_damaged_is_made_anew(shelf, work, monkeypatch):
+def test_what_is_damaged_is_made_anew(cache, work, monkeypatch):
     smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     first = _smoothed(work, smoother, monkeypatch)
-    (name,) = _kept(shelf)
-    whole = (shelf.folder / name).read_bytes()
-    (shelf.folder / name).write_bytes(whole[: len(whole) // 2])
+    (name,) = _kept(cache)
+    whole = (cache.folder / name).read_bytes()
+    (cache.folder / name).write_bytes(whole[: len(whole) // 2])
     again = _smoothed(work, smoother, monkeypatch)
     np.testing.assert_array_equal(first.state.mean, again.state.mean)
-    assert len((shelf.folder / name).read_bytes()) == len(whole)
+    assert len((cache.folder / name).read_bytes()) == len(whole)
 
 
 def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(traced._Kept, "shelf", Shelf(tmp_path / "file"))
-    monkeypatch.setattr(traced._Kept, "ready", {})
+    monkeypatch.setattr(traced._Programs, "cache", Cache(tmp_path / "file"))
+    monkeypatch.setattr(traced._Programs, "ready", {})
     smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     assert np.isfinite(np.asarray(_smoothed(work, smoother, monkeypatch).state.mean)).all()
 
@@ -159,7 +159,7 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path):
     dead.wait()
     (tmp_path / f".key.{dead.pid}.part").write_text("half")
     (tmp_path / "key").write_text("whole")
-    assert _kept(Shelf(tmp_path)) == {"key"}
+    assert _kept(Cache(tmp_path)) == {"key"}
 
 
 TWO = """
@@ -171,9 +171,9 @@ from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics import parallel, profile, traced
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.start import StartBank
-from nnap_em.storage.shelf import Shelf
+from nnap_em.storage.cache import Cache
 from pathlib import Path
-traced.keep_on(Shelf(Path(sys.argv[1])))
+traced.use_cache(Cache(Path(sys.argv[1])))
 parallel.use_every_device()
 model, sweep = examples["slide"]()
 data = sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data

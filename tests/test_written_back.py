@@ -128,7 +128,7 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     again = read_machine(tmp_path / "out.xml")
     there = [motor[:2] for motor in machine.motors]
     assert [motor[:2] for motor in again.motors] == [*there, ("u", 0)]  # the rig drives a joint without a motor
-    assert again.gauges == machine.gauges
+    assert again.joint_sensors == machine.joint_sensors
 
 
 def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_told(tmp_path):

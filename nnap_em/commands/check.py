@@ -5,15 +5,16 @@ import argparse
 import jax
 
 from ..em.check import BAD, check
-from .common import Say, read_bench
+from ..storage.log import Log
+from .common import read_bench
 
 
-def run(args: argparse.Namespace, say: Say) -> int:
+def run(args: argparse.Namespace, log: Log) -> int:
     """A line per question; 1 where they cannot."""
     bench = read_bench(args.folder, args.trust_readings)
-    found = check(*bench, key=jax.random.key(0))
-    for finding in found:
+    results = check(*bench, key=jax.random.key(0))
+    for finding in results:
         print(f"{finding.mark:4}  {finding.subject:8}  {bench.rig.named(finding.text)}")
-    bad = sum(finding.mark == BAD for finding in found)
-    say(f"{bad} of {len(found)} answers are bad" if bad else "nothing speaks against a fit")
+    bad = sum(finding.mark == BAD for finding in results)
+    log(f"{bad} of {len(results)} answers are bad" if bad else "nothing speaks against a fit")
     return int(bad > 0)

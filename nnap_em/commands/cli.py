@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from .. import __version__
+from ..storage.log import Log, silent
 
 _MAIN = """\
 examples:
@@ -186,16 +187,16 @@ def parser() -> argparse.ArgumentParser:
         "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
     )
 
-    bring = command("import", "write a data set from logs as machines write them", _IMPORT)
-    bring.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
-    bring.add_argument(
+    importing = command("import", "write a data set from logs as machines write them", _IMPORT)
+    importing.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
+    importing.add_argument(
         "--rig", metavar="RIG", type=Path, required=True, help="rig.toml; its [import] says what is where"
     )
-    bring.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
-    bring.add_argument(
+    importing.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
+    importing.add_argument(
         "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (.2)"
     )
-    bring.add_argument(
+    importing.add_argument(
         "--shift",
         type=_shift,
         action="append",
@@ -282,40 +283,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from . import common  # loads JAX
 
-        with warnings.catch_warnings(), _stoppable(_silent if getattr(args, "quiet", False) else _say) as say:
+        with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
             warnings.showwarning = _warn
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()
             run = importlib.import_module(f".{args.command}", __package__).run
             with common.profiled(getattr(args, "profile", False)):
-                return run(args, say) or 0
+                return run(args, log) or 0
     except KeyboardInterrupt as stopped:
-        _say(str(stopped) or "stopped; the files that were written are whole")
+        _log(str(stopped) or "stopped; the files that were written are whole")
         return 130
     except Exception as error:
         line = _line(error)
         if line is None:
             raise
-        _say(f"error: {line}")
+        _log(f"error: {line}")
         return 2
 
 
 @contextmanager
-def _stoppable(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """`notify`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
+def _stoppable(log: Log) -> Iterator[Log]:
+    """`log`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
     noisily.
     """
-    asked = False
+    interrupted = False
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
+        nonlocal interrupted
+        interrupted = True
         signal.default_int_handler(number, frame)
 
     def line(text: str) -> None:
-        say(text)
-        if asked:
+        log(text)
+        if interrupted:
             raise KeyboardInterrupt
 
     def dropped(lost: Any) -> None:
@@ -347,15 +348,11 @@ def _line(error: Exception) -> str | None:
 
 def _warn(message: Warning | str, category: type[Warning], *_) -> None:
     if "persistent compilation cache" not in str(message):
-        _say(f"warning: {message}")
+        _log(f"warning: {message}")
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"nnap-em: {text}", file=sys.stderr, flush=True)
-
-
-def _silent(text: str) -> None:
-    """Discard a message."""
 
 
 def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):

@@ -29,12 +29,13 @@ from ..em.predict import GIVEN
 from ..em.store import fingerprint
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
-from ..numerics.traced import keep_on
+from ..numerics.traced import use_cache
 from ..portable.export import ExportError
 from ..residual.residual import names_of
+from ..storage.cache import Cache
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping
-from ..storage.shelf import Shelf
+from ..storage.log import Log
 from ..systems import specs
 
 
@@ -52,8 +53,6 @@ MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
-Say = Callable[[str], None]
-"""Receiver of lines of progress."""
 
 
 def set_up() -> None:
@@ -66,7 +65,7 @@ def set_up() -> None:
         use_every_device()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:
-        keep_on(Shelf(Path(chosen) / TRACED))
+        use_cache(Cache(Path(chosen) / TRACED))
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -78,7 +77,7 @@ def set_up() -> None:
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
-        keep_on(Shelf(folder / TRACED))
+        use_cache(Cache(folder / TRACED))
 
 
 @contextmanager
@@ -162,7 +161,7 @@ def log_of(fitted: Identified, logs: Logs) -> Channel:
 
 
 @contextmanager
-def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Journal]:
+def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Journal]:
     """Keep every finished step of what is done inside until all of it is; with --resume go on from what is kept.
 
     A journal that is left `open` is kept after the end, too.
@@ -174,15 +173,15 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Jour
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
         journal.check()
-        found = f"resumed with {len(journal)} finished steps"
-        say(found if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
-    with _folder(args.out), _telling(lambda: go_on(args, journal)):
+        message = f"resumed with {len(journal)} finished steps"
+        log(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
+    with _folder(args.out), _reporting(lambda: go_on(args, journal)):
         if args.resume:
             sweep(journal.folder)
         else:
             journal.clear()
         count, rows = bench.train.data.valid.shape
-        say(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
+        log(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
             yield journal
         if not journal.open:
@@ -191,8 +190,8 @@ def resumable(args: argparse.Namespace, bench: Bench, say: Say) -> Iterator[Jour
 
 def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
     """Those of these options that the command has; `none`: also where they were left out."""
-    found = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
-    return {name: value for name, value in found.items() if none or value is not None}
+    options = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
+    return {name: value for name, value in options.items() if none or value is not None}
 
 
 def go_on(args: argparse.Namespace, journal: Journal) -> str:
@@ -208,7 +207,7 @@ def go_on(args: argparse.Namespace, journal: Journal) -> str:
 
 
 @contextmanager
-def _telling(kept: Callable[[], str]) -> Iterator[None]:
+def _reporting(kept: Callable[[], str]) -> Iterator[None]:
     """Report the finished steps where a run is stopped or a file cannot be written."""
     try:
         yield

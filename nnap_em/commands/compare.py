@@ -4,13 +4,13 @@ import argparse
 
 from ..diagnose.compare import compare
 from ..report.comparison import table, write_comparison
-from .common import Say
+from ..storage.log import Log
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Print the table; write the page if requested."""
     comparison = compare(*args.fits)
     print(table(comparison))
     if args.out is not None:
         write_comparison(args.out, comparison)
-        say(f"wrote {args.out / 'compare.html'} and compare.json")
+        log(f"wrote {args.out / 'compare.html'} and compare.json")

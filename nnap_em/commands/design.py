@@ -15,24 +15,25 @@ from ..design.rivals import Law, open_pairs, rivals
 from ..em.identify import Identified
 from ..em.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
+from ..storage.log import Log
 from ..systems import specs
-from .common import Bench, Say, read_training, resumable
+from .common import Bench, read_training, resumable
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Design, and report."""
     began = time.perf_counter()
     stored = read(model_file(args.folder))
     fitted, bench = _logs(args, stored)
     key, question = jax.random.key(args.seed), vars(args)["for"]
-    with resumable(args, bench, say):
+    with resumable(args, bench, log):
         data = bench.train.data
-        pairs = rivals(fitted, data, _wanted(args, fitted), say) if question in ("all", "apart") else []
+        pairs = rivals(fitted, data, _wanted(args, fitted), log) if question in ("all", "apart") else []
         design = design_experiment(
             fitted, data, key=key, question=question, rivals=pairs,
-            seconds=args.seconds, sequences=args.sequences, say=say,
+            seconds=args.seconds, sequences=args.sequences, log=log,
         )  # fmt: skip
-        write_design(args.out, design, question=question, seed=args.seed, began=began, say=say)
+        write_design(args.out, design, question=question, seed=args.seed, began=began, log=log)
 
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
@@ -40,8 +41,8 @@ def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
     file, folders = model_file(args.folder), args.logs or list(map(Path, stored.notes.get("logs", [])))
     gone = next((folder for folder in folders if not folder.is_dir()), None)
     if not folders or gone:
-        found = f"its logs are not at {gone}" if gone else "it does not say where its logs are"
-        raise DesignError(f"{file}: {found}; give their folder with --logs FOLDER")
+        problem = f"its logs are not at {gone}" if gone else "it does not say where its logs are"
+        raise DesignError(f"{file}: {problem}; give their folder with --logs FOLDER")
     rig = read_rig(folders[0] / "rig.toml", specs)
     train = read_training(rig, folders, args.trust_readings)
     if stored.fingerprint and fingerprint(train.data) != stored.fingerprint:
@@ -54,9 +55,9 @@ def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
 def _wanted(args: argparse.Namespace, fitted: Identified) -> list[tuple[Law | None, Law]]:
     """Laws to be discriminated: those that the report beside the model leaves open, and those that --rival names."""
     report = model_file(args.folder).with_name("report.json")
-    found = open_pairs(json.loads(report.read_text())) if report.exists() else []
+    pairs = open_pairs(json.loads(report.read_text())) if report.exists() else []
     own = [Law(effect.name, effect.joint, effect.channel) for effect in fitted.model.effects] or [None]
-    return found + [(law, _law(text)) for text in args.rival for law in own]
+    return pairs + [(law, _law(text)) for text in args.rival for law in own]
 
 
 def _law(text: str) -> Law:

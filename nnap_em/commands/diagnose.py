@@ -10,28 +10,29 @@ from ..diagnose.findings import findings
 from ..diagnose.search import close_the_loop
 from ..em.store import fingerprint, save
 from ..report.diagnosis import write_diagnosis
-from .common import Say, go_on, read_bench, resumable, warn_of_torques
+from ..storage.log import Log
+from .common import go_on, read_bench, resumable, warn_of_torques
 
 SHARE = 0.8
 """Share of the minutes given after which the search begins no new step: the last step, the fit of the last law over the
 whole length and the page take the rest (10 to 25 % of a whole run on two rigs of two joints)."""
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Find it, and report; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
     seconds = SHARE * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
-    with resumable(args, bench, say) as journal:
+    with resumable(args, bench, log) as journal:
 
         def report(text: str) -> None:
             left = f"[{_clock(60.0 * args.minutes - (time.perf_counter() - began))}] " if args.minutes else ""
-            say(left + bench.rig.named(text))
+            log(left + bench.rig.named(text))
 
         spent = time.perf_counter() - began
         key = jax.random.key(args.seed)
-        closed = close_the_loop(bench.rig, bench.train.data, key=key, say=report, seconds=seconds - spent)
+        closed = close_the_loop(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
         journal.open = not closed.complete
         found, mark = findings(closed), fingerprint(bench.train.data)
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
@@ -39,9 +40,9 @@ def run(args: argparse.Namespace, say: Say) -> None:
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, say=report)
+        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, log=report)
     if journal.open:
-        say(go_on(args, journal))
+        log(go_on(args, journal))
 
 
 def _clock(seconds: float) -> str:

@@ -101,13 +101,13 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
     if path.suffix.lower() != ".csv":
         raise DataError(f"{path}: its name does not end in .csv; give a CSV file")
     names, rows = csv_fields(path)
-    found = {}
+    columns = {}
     for name, texts in zip(names, zip(*rows, strict=True), strict=True):
         try:
-            found[name] = np.array([float(text.strip() or "nan") for text in texts])
+            columns[name] = np.array([float(text.strip() or "nan") for text in texts])
         except ValueError:
             continue
-    return found
+    return columns
 
 
 def meaning(name: str) -> _Column:
@@ -146,12 +146,12 @@ def _system(path: Path, columns: Sequence[_Column], specs: Mapping[str, SystemSp
     if kinds & {"theta2", "dtheta2"} and not kinds & {"x", "dx"}:
         return "pendubot" if [c.number for c in columns if c.kind == "input"] == [1] else "acrobot"
     if kinds & {"x", "dx"}:
-        found = "a coordinate x and an angle are of no machine that is known by its columns"
+        reason = "a coordinate x and an angle are of no machine that is known by its columns"
     elif angles:
-        found = "theta1 may be of a pendulum or of an arm with a hidden joint"
+        reason = "theta1 may be of a pendulum or of an arm with a hidden joint"
     else:
-        found = "no column is named as a state"
-    raise DataError(f"{path}: line 1: {found}; give --system {', '.join(sorted(specs))}")
+        reason = "no column is named as a state"
+    raise DataError(f"{path}: line 1: {reason}; give --system {', '.join(sorted(specs))}")
 
 
 def _model(system: str, spec: SystemSpec) -> Iterator[str]:
@@ -171,11 +171,11 @@ def _what(name: str) -> str:
 
 
 def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
-    found = [(c.name, spec.driven if c.number is None else c.number) for c in columns if c.kind == "input"]
-    found = [(name, joint) for name, joint in found if joint <= spec.joints]
-    names = f"[{', '.join(toml_text(name) for name, _ in found)}]" if found else "..."
-    joints = str([joint for _, joint in found]) if found else "..."
-    mark = "" if found else "# "
+    inputs = [(c.name, spec.driven if c.number is None else c.number) for c in columns if c.kind == "input"]
+    inputs = [(name, joint) for name, joint in inputs if joint <= spec.joints]
+    names = f"[{', '.join(toml_text(name) for name, _ in inputs)}]" if inputs else "..."
+    joints = str([joint for _, joint in inputs]) if inputs else "..."
+    mark = "" if inputs else "# "
     yield from ("", "[input]", f'{mark}columns = {names}    # N m, or N on a slide; such as ["u"]')
     yield f"{mark}joints = {joints}    # the joint that each drives, counted from 1; such as [1]"
 
@@ -231,9 +231,9 @@ def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
             continue
         if state and column.kind != column.name and column.kind in names:
             continue
-        mends = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
-        mends += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
-        if mends:
-            yield f"column {column.name!r}: {' and '.join(mends)}"
+        hints = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
+        hints += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
+        if hints:
+            yield f"column {column.name!r}: {' and '.join(hints)}"
     if "time" not in {column.kind for column in columns}:
         yield "no column 'time': add one [s]"

@@ -26,16 +26,16 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
     """
     machine = read_machine(model)
     topics = reader(path).topics(path)
-    found, inputs = _joints(machine, topics), _inputs(machine, topics)
-    if not found:
+    columns, inputs = _joints(machine, topics), _inputs(machine, topics)
+    if not columns:
         names = ", ".join(joint.name for joint in machine.joints)
-        mend = "write rig.toml by hand, with [import.columns]"
-        raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {mend}")
-    found |= (sensed := _sensors(machine, topics))
-    named, senses = tuple(found), tuple(sense for sense in machine.senses if sense.name in sensed)
-    machine = machine._replace(states=_called(machine, named), senses=senses)
+        hint = "write rig.toml by hand, with [import.columns]"
+        raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
+    columns |= (sensed := _sensors(machine, topics))
+    named, sensors = tuple(columns), tuple(sensor for sensor in machine.sensors if sensor.name in sensed)
+    machine = machine._replace(states=_called(machine, named), sensors=sensors)
     spec, text = SystemSpec(machine.states, (), {}, len(machine.joints)), packed(machine)
-    everything = found | {column: at for column, (at, _) in inputs.items()}
+    everything = columns | {column: at for column, (at, _) in inputs.items()}
     table = _table(path, everything)
     lines = [
         *_model(machine, os.path.relpath(model, home)),
@@ -50,9 +50,9 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
 def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
     """The states, by the sensors whose columns are there."""
     names, dof = list(states(machine.joints)), len(machine.joints)
-    for gauge in machine.gauges:
-        if gauge.name in columns:
-            names[gauge.joint + dof * gauge.rate] = gauge.name
+    for sensor in machine.joint_sensors:
+        if sensor.name in columns:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
     return tuple(names)
 
 
@@ -72,7 +72,7 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     kinds = _kinds(fields)
     for rate, (d, array, kind) in enumerate((("", "position", "theta"), ("d", "velocity", "dtheta"))):
         for i, joint in enumerate(machine.joints):
-            own = [gauge.name for gauge in machine.gauges if (gauge.joint, gauge.rate) == (i, bool(rate))]
+            own = [sensor.name for sensor in machine.joint_sensors if (sensor.joint, sensor.rate) == (i, bool(rate))]
             at = _first(fields, [d + joint.name, f"{array}[{joint.name}]"])
             if at is None and (sensor := next((name for name in own if _first(fields, [name])), None)):
                 out[sensor] = _first(fields, [sensor])
@@ -88,20 +88,20 @@ _IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
 def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
     every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
-    for sense in machine.senses:
-        alone = sum(other.kind == sense.kind for other in machine.senses) == 3
-        usual = f"{_IMU[sense.kind]}.{'xyz'[sense.axis]}" if alone and sense.kind in _IMU else sense.name
-        at = [at for at in every if at.path == sense.name] or [at for at in every if at.path == usual]
-        if sense.kind in SENSE_UNITS and len(at) == 1:
-            out[sense.name] = at[0]
+    for sensor in machine.sensors:
+        alone = sum(other.kind == sensor.kind for other in machine.sensors) == 3
+        usual = f"{_IMU[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in _IMU else sensor.name
+        at = [at for at in every if at.path == sensor.name] or [at for at in every if at.path == usual]
+        if sensor.kind in SENSE_UNITS and len(at) == 1:
+            out[sensor.name] = at[0]
     return out
 
 
 def _kinds(fields: Sequence[tuple[Address, str]]) -> dict[str, Address]:
     """Meanings of names that are not in the file: `theta2`, and `input2` for a torque."""
-    told = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
+    columns = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
     out: dict[str, Address] = {}
-    for column, (at, _) in zip(told, fields, strict=True):
+    for column, (at, _) in zip(columns, fields, strict=True):
         number = "" if column.kind != "input" or column.number is None else str(column.number)
         out.setdefault(column.kind + number, at)
     return out
@@ -128,13 +128,13 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
     return out
 
 
-def _table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """Some of the log on uniform rows; of a CSV file its own."""
     if path.suffix.lower() != ".csv":
-        return columns_table(path, found)
+        return columns_table(path, columns)
     given = numbers(path)
     time = next((given[name] for name in given if meaning(name).kind == "time"), None)
-    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in found.items()}
+    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in columns.items()}
 
 
 def _model(machine: Machine, file: str) -> Iterator[str]:
@@ -178,10 +178,10 @@ def _servos(machine: Machine) -> Iterator[str]:
         yield "# delay = { mean = 0.01, std = 0.01 }    # s"
 
 
-def _addresses(topics: Sequence[Topic], found: Mapping[str, Address]) -> Iterator[str]:
+def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
     """Addresses of columns that have another name in the log."""
-    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if str(at) != name]
+    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if str(at) != name]
     if lines:
         yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
-        yield from (f"# not used: {each}" for each in others(topics, found))
+        yield from (f"# not used: {each}" for each in others(topics, columns))
         yield from lines

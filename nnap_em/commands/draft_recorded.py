@@ -24,14 +24,14 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
     Raises DataError where the log cannot be read, or nothing in it looks like a machine.
     """
     topics = reader(path).topics(path)
-    found = found_columns(topics)
-    if not found:
+    columns = found_columns(topics)
+    if not columns:
         names = ", ".join(topic.name for topic in topics) or "none"
-        mend = "write rig.toml by hand, with [import.columns]"
-        raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {mend}")
-    made = drafted(path, columns_table(path, found), system, specs)
-    lines = [f"# not used: {each}" for each in others(topics, found)]
-    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in found.items() if f'"{name}"' in made.text]
+        hint = "write rig.toml by hand, with [import.columns]"
+        raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
+    made = drafted(path, columns_table(path, columns), system, specs)
+    lines = [f"# not used: {each}" for each in others(topics, columns)]
+    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in made.text]
     head = "\n[import.columns]    # where each column is in the log\n"
     return made._replace(text=made.text + head + "\n".join(lines) + "\n")
 
@@ -44,9 +44,9 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
         names = {joint: f"theta{i}" for i, joint in enumerate(joints, 1)}
         for column, at in (*joint_columns(topic, names).items(), *_called(topic)):
             out.setdefault(column, at)
-    told = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
+    torques = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
     efforts = {f"tau{i}": at for i, at in enumerate(_efforts(topics), 1)}
-    return out | ({} if any(meaning(name).kind == "input" for name in out) else told or efforts)
+    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques or efforts)
 
 
 def joints_of(topic: Topic) -> list[str]:
@@ -75,22 +75,22 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
     """Fields whose names mean a state or an input; rows of a wide data set count from 0."""
     for field in topic.fields:
         word = re.sub(r"\[(\d+)\]$", lambda m: str(int(m[1]) + 1), field.rpartition(".")[2])
-        told = meaning(word)
-        if told.kind and told.kind != "time" and "[" not in word and "stamp" not in field:
-            yield (word if told.kind == "input" else told.kind), Address(topic.name, field)
+        column = meaning(word)
+        if column.kind and column.kind != "time" and "[" not in word and "stamp" not in field:
+            yield (word if column.kind == "input" else column.kind), Address(topic.name, field)
 
 
-def others(topics: Sequence[Topic], found: Mapping[str, Address]) -> list[str]:
+def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
     """Topics of numbers that no column is from."""
-    used = {at.topic for at in found.values()}
+    used = {at.topic for at in columns.values()}
     return [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in topics if t.fields and
             t.name not in used][:10]  # fmt: skip
 
 
-def columns_table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
     wanted: dict[str, list[str]] = {}
-    for at in found.values():
+    for at in columns.values():
         wanted.setdefault(at.topic, []).append(at.path)
     tracks = reader(path).read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in wanted.items()}).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
@@ -100,7 +100,7 @@ def columns_table(path: Path, found: Mapping[str, Address]) -> dict[str, Float[n
     if at.size < 2:
         raise DataError(f"{path}: its topics have no time in common; name others in [import.columns] by hand")
     table = {"time": at}
-    for name, place in found.items():
+    for name, place in columns.items():
         track = tracks[place.topic]
         y = track.values[place.path]
         there = np.isfinite(y)

@@ -10,27 +10,27 @@ from ..portable.draws import TABLE, write_draws
 from ..portable.export import export
 from ..portable.mjcf import write_mjcf
 from ..portable.urdf import write_urdf
-from .common import Say
+from ..storage.log import Log
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write it as JSON, NumPy and StableHLO, for a simulator, for a controller, or as draws of its posterior."""
     fitted = load(model_file(args.model))
     if args.mjcf is not None:
         for line in write_mjcf(fitted, args.mjcf, alone=args.alone):
-            say(f"{args.mjcf} has no place for {line}")
-        say(f"wrote {args.mjcf}")
+            log(f"{args.mjcf} has no place for {line}")
+        log(f"wrote {args.mjcf}")
     if args.urdf is not None:
         for line in write_urdf(fitted, args.urdf):
-            say(f"{args.urdf} has no place for {line}")
-        say(f"wrote {args.urdf}")
+            log(f"{args.urdf} has no place for {line}")
+        log(f"wrote {args.urdf}")
     if args.c is not None:
         for line in write_c(fitted, args.c):
-            say(f"{args.c} leaves out {line}")
-        say(f"wrote {args.c}")
+            log(f"{args.c} leaves out {line}")
+        log(f"wrote {args.c}")
     if args.draws is not None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
-        say(f"wrote {args.draws} draws of the posterior to {args.out}: {TABLE}")
+        log(f"wrote {args.draws} draws of the posterior to {args.out}: {TABLE}")
     elif args.out is not None:
         export(fitted, args.out)
-        say(f"wrote parameters.json, predictor.py and model.stablehlo to {args.out}")
+        log(f"wrote parameters.json, predictor.py and model.stablehlo to {args.out}")

@@ -16,19 +16,20 @@ from ..em.identify import MakeSmoother, Watch, identify
 from ..em.loop import EMState
 from ..em.store import MODEL, fingerprint, save
 from ..report.identification import write_identification
+from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import Say, read_bench, resumable, warn_of_torques
+from .common import read_bench, resumable, warn_of_torques
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Fit, and report; the test logs serve for the reported error alone."""
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
     data, epochs = bench.train.data, []
-    with resumable(args, bench, say):
+    with resumable(args, bench, log):
         most = args.epochs * (1 + bench.rig.memory)
-        watch, key = _watch(bench.rig, most, epochs, say), jax.random.key(args.seed)
+        watch, key = _watch(bench.rig, most, epochs, log), jax.random.key(args.seed)
         fitted = identify(bench.rig, data, key=key, smoother=smoother(args), epochs=args.epochs, watch=watch)
         for name in ("report.json", "report.html"):  # older ones are not of the model that is written now
             (args.out / name).unlink(missing_ok=True)
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
         save(args.out / MODEL, fitted, fingerprint=fingerprint(data), notes=notes)
         write_identification(
             args.out, fitted, bench.train, bench.test, epochs,
-            smoother=args.smoother, seed=args.seed, began=began, say=say,
+            smoother=args.smoother, seed=args.seed, began=began, log=log,
         )  # fmt: skip
 
 
@@ -48,7 +49,7 @@ def smoother(args: argparse.Namespace) -> MakeSmoother:
     return functools.partial(getattr(importlib.import_module(f"nnap_em.smoother.{home}"), name), **options)
 
 
-def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch:
+def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch:
     """Add an entry to `epochs` and a line to the log after every epoch."""
     last = time.perf_counter()
 
@@ -62,7 +63,7 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], say: Say) -> Watch
         last = now
         noise = _noise(rig, np.asarray(state.best.log_r))
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
-        say(
+        log(
             f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s"
             f"  log-likelihood {loglik:.2f} per sequence"
             f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {seconds:.1f} s"

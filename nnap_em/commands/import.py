@@ -7,18 +7,18 @@ import time
 import tomllib
 from pathlib import Path
 
-from ..data.recordings.bring import Brought, bring
 from ..data.recordings.declared import read_plan
 from ..data.recordings.folder import completed, places, write_sequences
+from ..data.recordings.resample import Resampled, resample
 from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
 from ..report.imported import describe, write_page
 from ..storage.files import replace_text, whole_folder
+from ..storage.log import Log
 from ..systems import specs
-from .common import Say
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write the data set, whole or not at all."""
     began = time.perf_counter()
     with whole_folder(args.out) as part:
@@ -27,8 +27,8 @@ def run(args: argparse.Namespace, say: Say) -> None:
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:
-            logs.append(bring(path, rig, build_system(rig).states, plan, shifts))
-            say(f"{path}: {_told(logs[-1])}")
+            logs.append(resample(path, rig, build_system(rig).states, plan, shifts))
+            log(f"{path}: {_summary(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
         text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
@@ -36,9 +36,9 @@ def run(args: argparse.Namespace, say: Say) -> None:
         document = describe(logs, files, rig, plan, shifts, seconds=time.perf_counter() - began)
         write_page(part, document)
     for line in document["look"]:
-        say(f"look at this: {line}")
+        log(f"look at this: {line}")
     test = sum(file.startswith("test/") for file in files)
-    say(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
+    log(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
 
 
 def _reaching(text: str, here: Path, out: Path) -> str:
@@ -47,9 +47,9 @@ def _reaching(text: str, here: Path, out: Path) -> str:
     if file is None:
         return text
     path = toml_text(os.path.relpath(here / file, out))
-    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda found: found[1] + path, text, count=1)
+    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
 
 
-def _told(log: Brought) -> str:
+def _summary(log: Resampled) -> str:
     used = [stretch for stretch in log.sequences if not stretch.why]
     return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

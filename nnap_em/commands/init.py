@@ -4,24 +4,24 @@ import argparse
 
 from ..data.dataset import DataError
 from ..storage.files import replace_text
+from ..storage.log import Log
 from ..systems import specs
-from .common import Say
 from .draft import draft
 from .draft_machine import draft_machine
 from .draft_recorded import draft_recorded
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write it, to be filled in; one that is there stays as it is."""
     home = args.log.parent.parent if args.log.parent.name in ("train", "test") else args.log.parent
     path = (args.out or home) / "rig.toml"
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
     if args.model is not None:
-        found = draft_machine(args.log, args.model, path.parent)
+        drafted = draft_machine(args.log, args.model, path.parent)
     else:
-        found = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
-    replace_text(path, found.text)
-    for note in found.notes:
-        say(f"in the log: {note}")
-    say(f"wrote {path}" + (f"; fill in {', '.join(found.missing)}" if found.missing else ""))
+        drafted = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
+    replace_text(path, drafted.text)
+    for note in drafted.notes:
+        log(f"in the log: {note}")
+    log(f"wrote {path}" + (f"; fill in {', '.join(drafted.missing)}" if drafted.missing else ""))

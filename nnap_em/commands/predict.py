@@ -9,19 +9,20 @@ from ..data.logs import read_logs
 from ..data.recordings.mcap_writer import require_mcap, write_mcap
 from ..em.predict import predict
 from ..em.store import load, model_file
-from .common import Say, log_of, states_of, write_states
+from ..storage.log import Log
+from .common import log_of, states_of, write_states
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write the distribution of every state after the readings up to the given time."""
     if args.mcap is not None:
         require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
-    found = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
-    mean, std = np.asarray(found.mean), np.asarray(found.std)
+    prediction = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
+    mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
-    say(f"wrote {len(logs.files)} files to {args.out}")
+    log(f"wrote {len(logs.files)} files to {args.out}")
     if args.mcap is not None:
         write_mcap(args.mcap, logs, {"/log": log_of(fitted, logs), "/predicted": states_of(fitted, mean, std)})
-        say(f"wrote {args.mcap}")
+        log(f"wrote {args.mcap}")

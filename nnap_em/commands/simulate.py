@@ -15,11 +15,11 @@ from ..model.simulate import Experiment, declared, examples, sensed, sweep_exper
 from ..model.state_space import StateSpaceModel
 from ..report.tables import visited_nodes, write_friction
 from ..storage.files import whole_folder
+from ..storage.log import Log
 from ..systems import specs
-from .common import Say
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write it, whole or not at all."""
     with whole_folder(args.out) as part:
         model, sweep = examples[args.system]()
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace, say: Say) -> None:
         count, key = args.sequences + args.test, jax.random.key(args.seed)
         experiment = sweep_experiment(model, sweep, count, args.steps, key=key)
         _write(part, model, declared(args.system, model), experiment, args.sequences)
-    say(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
+    log(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
 
 
 def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:

@@ -12,10 +12,11 @@ from ..em.identify import Identified
 from ..em.predict import smoothed_states
 from ..em.store import load, model_file
 from ..residual.residual import names_of, residual
-from .common import Say, log_of, states_of, write_states
+from ..storage.log import Log
+from .common import log_of, states_of, write_states
 
 
-def run(args: argparse.Namespace, say: Say) -> None:
+def run(args: argparse.Namespace, log: Log) -> None:
     """Write the distribution of every state after all readings of the sequence."""
     if args.mcap is not None:
         require_mcap(args.mcap)
@@ -24,12 +25,12 @@ def run(args: argparse.Namespace, say: Say) -> None:
     state = smoothed_states(fitted, logs.data)
     mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
-    say(f"wrote {len(logs.files)} files to {args.out}")
+    log(f"wrote {len(logs.files)} files to {args.out}")
     for other in branches(fitted.model, logs.data, fitted.smoother.tolerant(), key=fitted.state.key):
-        say(_line(other, fitted, logs))
+        log(_line(other, fitted, logs))
     if args.mcap is not None:
         _write_channels(args.mcap, fitted, logs, states_of(fitted, mean, std))
-        say(f"wrote {args.mcap}")
+        log(f"wrote {args.mcap}")
 
 
 def _line(other: Branch, fitted: Identified, logs: Logs) -> str:

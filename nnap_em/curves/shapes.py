@@ -61,17 +61,17 @@ class _Seen(NamedTuple):
         return size[..., 0], self.target - (seen @ size)[..., 0]
 
 
-def shape(found: Curve) -> Shape:
+def shape(curve: Curve) -> Shape:
     """The simplest shape that explains a learned curve, with numbers and units; a smooth function where none does.
 
     Every shape is seen through the basis of the curve, so that a sharp step and the transition that the basis makes of
     it are one. Places and widths from a grid, polished, sizes by linear least squares [Golub & Pereyra 1973]; of the
     shapes the first, in the order of simplicity, whose Schwarz criterion is not clearly above the lowest.
     """
-    known = _known(found)
+    known = _known(curve)
     if known is None:
-        return _smooth(found, np.ones(found.x.shape, bool))
-    view, seen = _view(found, known), _seen(found, known)
+        return _smooth(curve, np.ones(curve.x.shape, bool))
+    view, seen = _view(curve, known), _seen(curve, known)
     total, n = float(seen.target @ seen.target), len(seen.target)
     tried: list[tuple[float, int, float, Description]] = []
     for family in sorted(waves(view) + forms(view), key=lambda family: family.price):
@@ -83,46 +83,46 @@ def shape(found: Curve) -> Shape:
             criterion = (n + 1) * np.log(rss + known.sum()) + family.price * np.log(n + 1)  # an error at every node
             tried.append((criterion, family.price, explains, family.describe(view, place, size)))
     if not tried:
-        return _smooth(found, known)
+        return _smooth(curve, known)
     lowest = min(criterion for criterion, *_ in tried)
     (_, price, explains, chosen), *others = [one for one in tried if one[0] < lowest + INDISTINGUISHABLE]
     rivals = tuple(dict.fromkeys(t.kind for _, p, _, t in others if t.kind != chosen.kind and p <= price))
-    words = chosen.words + _looked(found, known)
+    words = chosen.words + _looked(curve, known)
     if rivals:
         words += f" (a {' or '.join(rivals)} would explain it as well)"
     limits = view.low + view.length * view.start, view.low + view.length * (view.start + view.span)
     return Shape(chosen.kind, chosen.numbers, explains, view.fine * view.length, limits, rivals, words)
 
 
-def _known(found: Curve) -> np.ndarray | None:
+def _known(curve: Curve) -> np.ndarray | None:
     """Nodes at which the curve is better known than it is large; None where these are less than a quarter."""
-    weight = 1 / np.maximum(found.std, 1e-3 * np.ptp(found.mean) + 1e-300) ** 2
-    level = np.average(found.mean, weights=weight)
-    rms = np.sqrt(np.average((found.mean - level) ** 2, weights=weight))
-    known = found.std < KNOWN * rms
+    weight = 1 / np.maximum(curve.std, 1e-3 * np.ptp(curve.mean) + 1e-300) ** 2
+    level = np.average(curve.mean, weights=weight)
+    rms = np.sqrt(np.average((curve.mean - level) ** 2, weights=weight))
+    known = curve.std < KNOWN * rms
     return known if rms > 0 and known.mean() > 0.25 else None
 
 
-def _view(found: Curve, known: np.ndarray) -> View:
+def _view(curve: Curve, known: np.ndarray) -> View:
     """The axis of the curve; an angle is cut at the end of the widest unknown gap."""
-    low, length = float(found.x[0]), float(np.ptp(found.x))
-    z = (found.x - low) / length
-    whole = found.turns and bool(known.mean() > 0.9)
-    if found.turns and not whole:
+    low, length = float(curve.x[0]), float(np.ptp(curve.x))
+    z = (curve.x - low) / length
+    whole = curve.turns and bool(known.mean() > 0.9)
+    if curve.turns and not whole:
         inside = np.sort(z[known])
         gaps = np.diff(inside, append=inside[0] + 1)
         cut = inside[(int(np.argmax(gaps)) + 1) % inside.size]
         z = cut + (z - cut) % 1.0
     start, end = float(z[known].min()), float(z[known].max())
-    across = found.signal, found.signal_unit, found.unit
-    return View(*across, low, length, found.turns, whole, start, end - start, _fine(found), z[known])
+    across = curve.signal, curve.signal_unit, curve.unit
+    return View(*across, low, length, curve.turns, whole, start, end - start, _fine(curve), z[known])
 
 
-def _seen(found: Curve, known: np.ndarray) -> _Seen:
+def _seen(curve: Curve, known: np.ndarray) -> _Seen:
     """Orthonormal directions that the basis has where the curve is known, in units of its error there."""
-    y = found.mean[known]
-    root = 1 / np.hypot(found.std[known], FLOOR * np.std(y))
-    basis = np.eye(y.size) if found.basis is None else found.basis[known]
+    y = curve.mean[known]
+    root = 1 / np.hypot(curve.std[known], FLOOR * np.std(y))
+    basis = np.eye(y.size) if curve.basis is None else curve.basis[known]
     one = root / np.linalg.norm(root)
     left, size, _ = np.linalg.svd(root[:, None] * basis - one[:, None] * (one @ (root[:, None] * basis)))
     project = left[:, : size.size].T[size > 1e-3 * size[0]] * root
@@ -162,28 +162,28 @@ def _polished(
     free = [i for i in free if low[i] < high[i]]
     if not free:
         return start
-    found = least_squares(lambda part: left(moved(part)), start[free], bounds=(low[free], high[free]), max_nfev=15)
-    return moved(found.x)
+    solution = least_squares(lambda part: left(moved(part)), start[free], bounds=(low[free], high[free]), max_nfev=15)
+    return moved(solution.x)
 
 
-def _smooth(found: Curve, known: np.ndarray) -> Shape:
+def _smooth(curve: Curve, known: np.ndarray) -> Shape:
     """A curve that no shape explains: the place and the size of its largest value."""
-    x, y, unit = found.x[known], found.mean[known], found.unit
+    x, y, unit = curve.x[known], curve.mean[known], curve.unit
     top, size = float(x[int(np.argmax(y))]), float(np.ptp(y))
-    at, tall = quantity(top, found.signal_unit), quantity(size, unit)
-    words = f"a smooth function of {found.signal}, largest at {at}, {tall} from trough to peak"
-    numbers = {"largest_at": (top, found.signal_unit), "height": (size, unit)}
-    fine, limits = _fine(found) * float(np.ptp(found.x)), (float(x[0]), float(x[-1]))
-    return Shape("smooth", numbers, 0.0, fine, limits, (), words + _looked(found, known))
+    at, tall = quantity(top, curve.signal_unit), quantity(size, unit)
+    words = f"a smooth function of {curve.signal}, largest at {at}, {tall} from trough to peak"
+    numbers = {"largest_at": (top, curve.signal_unit), "height": (size, unit)}
+    fine, limits = _fine(curve) * float(np.ptp(curve.x)), (float(x[0]), float(x[-1]))
+    return Shape("smooth", numbers, 0.0, fine, limits, (), words + _looked(curve, known))
 
 
-def _fine(found: Curve) -> float:
+def _fine(curve: Curve) -> float:
     """Distance of the basis functions, as a share of the axis."""
-    count = found.x.size if found.basis is None else found.basis.shape[1]
-    return 1 / (count - (not found.turns))
+    count = curve.x.size if curve.basis is None else curve.basis.shape[1]
+    return 1 / (count - (not curve.turns))
 
 
-def _looked(found: Curve, known: np.ndarray) -> str:
+def _looked(curve: Curve, known: np.ndarray) -> str:
     """Words for the known share of the range, unless it is nearly all of it."""
     share = known.mean()
-    return "" if share > 0.9 else f", seen on {100 * share:.0f} % of the range of {found.signal}"
+    return "" if share > 0.9 else f", seen on {100 * share:.0f} % of the range of {curve.signal}"

@@ -16,13 +16,13 @@ def waves(view: View) -> list[Family]:
     enough = (low * view.span > 1.8) | (view.whole & (high > 2.9))  # once and twice a turn: any smooth curve
     pairs = np.stack([low, high - low], axis=1)[enough & ((high - low) * view.span > 0.89)]
     cycles = product(rates[rates <= 0.8 * finest], np.linspace(0, 1, 17), [0.2, 0.35, 0.5, 0.65, 0.8])
-    found = [
+    families = [
         Family(_ripples, _describe_ripple, once, (), 3),
         Family(_ripples, _describe_ripple, rates[:, None], () if view.whole else (0,), 3),
         Family(_square, _describe_square, cycles, (1, 2) if view.whole else (0, 1, 2), 4),
         Family(_ripples, _describe_two, pairs, () if view.whole else (0, 1), 6),
     ]
-    return [family for family in found if len(family.grid)]
+    return [family for family in families if len(family.grid)]
 
 
 def _ripples(view: View, place: Places) -> Columns:

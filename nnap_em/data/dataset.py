@@ -28,8 +28,8 @@ class Dataset(NamedTuple):
         count, gone = valid[..., 0].size, np.isnan(y[valid]).mean() if y[valid].size else 0.0
         t = np.asarray(self.t)
         longest, inputs = float(np.max(t[..., -1] - t[..., 0])), np.shape(self.u)[-1]
-        said = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
-        return f"Dataset: {said}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
+        size = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
+        return f"Dataset: {size}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
 
 
 def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
@@ -42,8 +42,8 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     inputs, obs = (np.shape(x)[-1] for x in sequences[0][1:])
     for i, (t, u, y) in enumerate(sequences):
         wanted = (len(t),), (len(t), inputs), (len(t), obs)
-        if (found := (np.shape(t), np.shape(u), np.shape(y))) != wanted or not len(t):
-            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {found}; they must be {wanted}, time above 0")
+        if (shapes := (np.shape(t), np.shape(u), np.shape(y))) != wanted or not len(t):
+            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}; they must be {wanted}, time above 0")
     lengths = [len(t) for t, _, _ in sequences]
     time = max(lengths)
     return Dataset(

@@ -28,9 +28,9 @@ def log_files(folder: Path) -> list[Path]:
     files = _logs(folder)
     if not files:
         every = sorted(path for path in folder.glob("*") if not path.name.startswith("."))
-        found = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
+        problem = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
         others = f"; found there: {', '.join(path.name for path in every[:3])}" if every else ""
-        raise DataError(f"{folder}: {found}{others}; put one CSV file per sequence there")
+        raise DataError(f"{folder}: {problem}{others}; put one CSV file per sequence there")
     for one, two in pairwise(sorted(files, key=lambda path: (path.stem, path.name))):
         if one.stem == two.stem:
             raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
@@ -59,9 +59,9 @@ def place(path: Path, column: str, row: int | None = None) -> str:
     return f"{f'line {row + 2}' if path.suffix.lower() == '.csv' else f'row {row + 1}'}, column {column!r}"
 
 
-def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
     """Raise the DataError."""
-    raise DataError(f"{path}: {where}: {found}; {mend}")
+    raise DataError(f"{path}: {where}: {problem}; {hint}")
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " time"]]) -> None:
@@ -97,8 +97,8 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
     text = _text(path)
     names = _header(text)
     other = next((mark for mark in (";", "\t") if mark in text.split("\n", 1)[0]), None)
-    mend = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
-    _check_names(path, names, (*required, *gaps), "line 1, ", mend)
+    hint = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
+    _check_names(path, names, (*required, *gaps), "line 1, ", hint)
     columns = list(zip(*_rows(path, text), strict=True))
     return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
 
@@ -116,9 +116,9 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
 
 def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
-    found = _mat_columns(path)
-    _check_names(path, list(found), (*required, *gaps))
-    return _stack(path, {name: np.asarray(found[name]) for name in (*required, *gaps)}, gaps)
+    columns = _mat_columns(path)
+    _check_names(path, list(columns), (*required, *gaps))
+    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps)
 
 
 _readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
@@ -131,18 +131,18 @@ def _mat_columns(path: Path) -> dict[str, Any]:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
-    found = {name: value for name, value in content.items() if not name.startswith("__")}
-    if len(found) == 1 and (only := next(iter(found.values()))).dtype.names:
-        found = {name: np.asarray(only[name].item()) for name in only.dtype.names}
-    return found
+    columns = {name: value for name, value in content.items() if not name.startswith("__")}
+    if len(columns) == 1 and (only := next(iter(columns.values()))).dtype.names:
+        columns = {name: np.asarray(only[name].item()) for name in only.dtype.names}
+    return columns
 
 
 def _parquet_file(path: Path) -> Any:
     try:
         from pyarrow import parquet
     except ImportError:
-        mend = "pip install 'nnap-em[formats]', or write the log as CSV"
-        raise DataError(f"{path}: cannot be read without pyarrow; {mend}") from None
+        hint = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without pyarrow; {hint}") from None
     with _damaged(path, "Parquet"):
         return parquet.ParquetFile(path)
 
@@ -168,8 +168,8 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise _unreadable(path, error) from None
-        mend = "use another copy, or write it as CSV"
-        raise DataError(f"{path}: no {form} file, or damaged or cut short; {mend}") from None
+        hint = "use another copy, or write it as CSV"
+        raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
 
 def _check_size(path: Path) -> None:
@@ -178,8 +178,8 @@ def _check_size(path: Path) -> None:
     except OSError as error:
         raise _unreadable(path, error) from None
     if size > LARGEST:
-        mend = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
-        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {mend}")
+        hint = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
+        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {hint}")
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
@@ -212,19 +212,19 @@ def _rows(path: Path, text: str) -> list[list[str]]:
     names = lines[0].count(",") + 1
     for number, row in enumerate(rows, 2):
         if len(row) != names:
-            mend = "separate columns by ',', write decimals with '.', and give every column a field"
-            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", mend)
+            hint = "separate columns by ',', write decimals with '.', and give every column a field"
+            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", hint)
     return rows
 
 
 def _check_names(
-    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", mend: str | None = None
+    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", hint: str | None = None
 ) -> None:
     spare = [name for name in names if name not in wanted]
     for name in wanted:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            refuse(path, f"{line}column {name!r}", "missing", mend or (nearest(name, spare) if spare else alone))
+            refuse(path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) if spare else alone))
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
@@ -251,9 +251,9 @@ def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
     return value
 
 
-def _no_number(path: Path, name: str, row: int, found: str, missing: bool, gaps: bool) -> NoReturn:
-    mend = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
-    refuse(path, place(path, name, row), f"found {found}", mend + ("; time and inputs are never empty" * missing))
+def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
+    hint = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
+    refuse(path, place(path, name, row), f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
 def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
@@ -273,7 +273,7 @@ def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float
         values = values.astype(np.float64)
         wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
         if wrong.size:
-            found = values[wrong[0]]
-            _no_number(path, name, int(wrong[0]), f"{found:g}", bool(np.isnan(found)), name in gaps)
+            value = values[wrong[0]]
+            _no_number(path, name, int(wrong[0]), f"{value:g}", bool(np.isnan(value)), name in gaps)
         out.append(values)
     return np.stack(out, -1)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sense, of_body, packed, states
+from .machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
 from .mjcf import Part, read_machine
-from .rig import Declared, RigWarning, SystemSpec, Told, flat, kinds_of, nearest
+from .rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
 from .servo import TORQUE, Drive, read_drives
 from .servo import keys as drive_keys
 from .servo import named as drive_numbers
@@ -18,7 +18,7 @@ _FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
 _UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
 
 
-def declare(root: Any) -> Told:
+def declare(root: Any) -> Declaration:
     """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
     model = root.table("model")
     model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
@@ -26,15 +26,15 @@ def declare(root: Any) -> Told:
         model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
     part = _part(model)
     machine = read_machine(root.path.parent / str(model.items["file"]), part)
-    possible = tuple(sense.name for sense in machine.senses if sense.kind in SENSE_UNITS)
+    possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
     machine = machine._replace(
         file=str(model.items["file"]),
         states=_states(machine, root),
         rubs=model.items.get("friction") == "none",
-        senses=tuple(_senses(machine, root)),
+        sensors=tuple(_sensors(machine, root)),
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
-    _say_left_out(root, machine)
+    _warn_of_left_out(root, machine)
     columns, joints, motored = _inputs(machine, root)
     motors = {motor.name: motor for motor in machine.motors} if motored else {}
     given = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
@@ -43,7 +43,7 @@ def declare(root: Any) -> Told:
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
-    return Told(spec, parameters, columns, joints, machine, kinds_of(drives))
+    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives))
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:
@@ -56,7 +56,7 @@ def _part(model: Any) -> Part:
     joints = model.items.get("joints")
     if joints is not None:
         if not (isinstance(joints, list) and joints and all(type(name) is str for name in joints)):
-            model.refuse("joints", mend='write the names of the joints that move, joints = ["joint1", "joint2"]')
+            model.refuse("joints", hint='write the names of the joints that move, joints = ["joint1", "joint2"]')
         joints = tuple(dict.fromkeys(joints))
     locked = model.table("locked", absent={})
     for name in locked.items:
@@ -66,56 +66,56 @@ def _part(model: Any) -> Part:
     return Part(joints, {name: locked.number(name) for name in locked.items})
 
 
-def _say_left_out(root: Any, machine: Machine) -> None:
+def _warn_of_left_out(root: Any, machine: Machine) -> None:
     """Friction of the file has no part where it is learned."""
     names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
     if names and not machine.rubs:
-        found = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
-        warnings.warn(f'{root.path}: {machine.file}: {found}; friction = "none" takes the file\'s', RigWarning, 2)
+        problem = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {machine.file}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
 
 
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:
     """Every joint by its name, or by that of the sensor whose column is measured."""
     names, dof = list(states(machine.joints)), len(machine.joints)
     wanted = root.table("measurement").items.get("columns")
-    for gauge in machine.gauges:
-        if isinstance(wanted, list) and gauge.name in wanted:
-            names[gauge.joint + dof * gauge.rate] = gauge.name
+    for sensor in machine.joint_sensors:
+        if isinstance(wanted, list) and sensor.name in wanted:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
     return tuple(names)
 
 
-def _senses(machine: Machine, root: Any) -> Iterator[Sense]:
+def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
     """The components of sensors that are measured."""
     table = root.table("measurement")
     wanted = table.items.get("columns")
     for column in wanted if isinstance(wanted, list) else ():
-        for sense in machine.senses:
-            if sense.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
+        for sensor in machine.sensors:
+            if sensor.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
                 continue
-            if sense.kind not in SENSE_UNITS:
-                mend = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
-                table.refuse("columns", f"{column!r} is of a sensor of type {sense.kind}", mend)
-            if sense.name == column:
-                yield sense
+            if sensor.kind not in SENSE_UNITS:
+                hint = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
+                table.refuse("columns", f"{column!r} is of a sensor of type {sensor.kind}", hint)
+            if sensor.name == column:
+                yield sensor
 
 
 def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
     """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
     motors = {motor.name: motor for motor in machine.motors}
     if not motors and "input" not in root.items:
-        found = f"{machine.file} has no actuator"
-        mend = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
-        root.refuse("input", found, mend)
+        problem = f"{machine.file} has no actuator"
+        hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", problem, hint)
     table = root.table("input", absent={})
     table.check((), drive_keys(table))
     columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
     for column in columns:
         if column in ("time", *machine.states):
-            mend = "give the motor another name than the joint's, or name torque columns and joints in [input]"
-            table.refuse("columns", f"{column!r} is a state, and no torque or command", mend)
+            hint = "give the motor another name than the joint's, or name torque columns and joints in [input]"
+            table.refuse("columns", f"{column!r} is a state, and no torque or command", hint)
     if "joints" in table.items:
         joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
         if len(joints) != len(columns):
@@ -124,15 +124,15 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
     else:
         for column in columns:
             if column not in motors:
-                mend = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
-                table.refuse("columns", f"{column!r} is no motor of {machine.file}", mend)
+                hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+                table.refuse("columns", f"{column!r} is no motor of {machine.file}", hint)
         joints = tuple(motors[column].joint + 1 for column in columns)
         motored = True
     for joint in joints:
         if joints.count(joint) > 1:
-            found = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
-            found += f", {machine.joints[joint - 1].name!r}"
-            table.refuse("columns", found, "name one of them in [input] columns, and log their sum")
+            problem = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
+            problem += f", {machine.joints[joint - 1].name!r}"
+            table.refuse("columns", problem, "name one of them in [input] columns, and log their sum")
     return columns, joints, motored
 
 
@@ -175,8 +175,8 @@ def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
         inertia[i, j] = inertia[j, i] = values[what]
     low, middle, high = np.linalg.eigvalsh(inertia)
     if low + middle < (1 - 1e-9) * high:
-        found = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
-        table.refuse(f"{body}.inertia", found, "write means of which the largest is at most the sum of the others")
+        problem = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
+        table.refuse(f"{body}.inertia", problem, "write means of which the largest is at most the sum of the others")
 
 
 def _declared(table: Any, name: str, value: object, mean: float) -> Declared:

@@ -42,10 +42,10 @@ def _range(table: Any, key: str, *, place: bool = False) -> Range:
     value = table.items[key]
     pair = value if isinstance(value, list) else [value, value] if place else [0.0, value]
     if len(pair) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in pair):
-        table.refuse(key, mend=f"write {key} = 0.3 or {key} = [-0.3, 0.3]")
+        table.refuse(key, hint=f"write {key} = 0.3 or {key} = [-0.3, 0.3]")
     low, high = float(pair[0]), float(pair[1])
     if not place and not isinstance(value, list):
         low = -high
     if low > high or (low == high and not place):
-        table.refuse(key, mend=f"write the lower bound first, {key} = [-0.3, 0.3]; a single number is above 0")
+        table.refuse(key, hint=f"write the lower bound first, {key} = [-0.3, 0.3]; a single number is above 0")
     return low, high

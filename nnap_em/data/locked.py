@@ -62,19 +62,19 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         bodies=tuple(bodies),
         joints=tuple(joint._replace(body=number[joint.body]) for joint in joints),
         motors=free(machine.motors),
-        gauges=free(machine.gauges),
-        spots=tuple(
-            spot._replace(body=number[carrier[spot.body]], place=place(spot.body, spot.place))
-            for spot in machine.spots
-            if carrier[spot.body] >= 0
+        joint_sensors=free(machine.joint_sensors),
+        sites=tuple(
+            site._replace(body=number[carrier[site.body]], place=place(site.body, site.place))
+            for site in machine.sites
+            if carrier[site.body] >= 0
         ),
-        senses=tuple(
-            sense._replace(
-                body=number[carrier[sense.body]],
-                place=place(sense.body, sense.place),
-                turn=_matrix(within[sense.body].turn @ np.asarray(sense.turn)),
+        sensors=tuple(
+            sensor._replace(
+                body=number[carrier[sensor.body]],
+                place=place(sensor.body, sensor.place),
+                turn=_matrix(within[sensor.body].turn @ np.asarray(sensor.turn)),
             )
-            for sense in machine.senses
+            for sensor in machine.sensors
         ),
     )
 

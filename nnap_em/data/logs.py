@@ -13,14 +13,14 @@ from jaxtyping import Float, Int
 from .dataset import DataError, Dataset, pad
 from .formats import log_files, place, read_table, refuse
 from .frozen import FULL
-from .lost import retell
+from .lost import interpolated
 from .plausible import Columns, doubts, repeats
 from .rig import Rig
 from .rough import Rough, rough
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
-TOLD = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
+INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 _REASONS = {
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
@@ -77,10 +77,10 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     files = log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]
     early = [table.readings(rig, until) for table in tables]
-    found = [[] if trust else rough(readings, rig.dt) for readings in early]
-    if limits := {limit for readings, each in zip(early, found, strict=True) for limit in _limits(readings, each)}:
-        found = [rough(readings, rig.dt, limits) for readings in early]
-    sequences = [_sequence(table, each, rig) for table, each in zip(tables, found, strict=True)]
+    entries = [[] if trust else rough(readings, rig.dt) for readings in early]
+    if limits := {limit for readings, each in zip(early, entries, strict=True) for limit in _limits(readings, each)}:
+        entries = [rough(readings, rig.dt, limits) for readings in early]
+    sequences = [_sequence(table, each, rig) for table, each in zip(tables, entries, strict=True)]
     data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
     unmasked = pad([s.as_read for s in sequences]) if masked else None
     return Logs(tuple(path.name for path in files), data, (*rig.input_columns, *rig.measured), masked, unmasked)
@@ -97,10 +97,10 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
         leaks = name.startswith("test") and other.startswith("train")
         if whole:
             raise DataError(f"{name}: the same content as {other}; remove one of the two")
-        found = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
+        problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
         if leaks:
-            raise DataError(f"{found}; remove one of the two: test sequences are new to the fit")
-        warnings.warn(f"{found}; cut sequences without overlap", DataWarning, 2)
+            raise DataError(f"{problem}; remove one of the two: test sequences are new to the fit")
+        warnings.warn(f"{problem}; cut sequences without overlap", DataWarning, 2)
 
 
 def together(parts: Mapping[str, Logs]) -> Logs:
@@ -138,9 +138,9 @@ class _Table(NamedTuple):
         return dict(zip(rig.measured, self.table[early, 1 + len(rig.input_columns) :].T, strict=True))
 
 
-def _limits(readings: Columns, found: Sequence[Rough]) -> set[tuple[str, float]]:
+def _limits(readings: Columns, entries: Sequence[Rough]) -> set[tuple[str, float]]:
     """Columns and the values at which they saturate."""
-    flat = [(entry.column, readings[entry.column][entry.rows]) for entry in found if entry.kind == FULL]
+    flat = [(entry.column, readings[entry.column][entry.rows]) for entry in entries if entry.kind == FULL]
     return {(column, float(limit)) for column, y in flat for limit in (y.min(), y.max()) if np.sum(y == limit) > 2}
 
 
@@ -157,27 +157,27 @@ def _read_table(path: Path, rig: Rig) -> _Table:
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
 
 
-def _sequence(whole: _Table, found: Sequence[Rough], rig: Rig) -> _Sequence:
+def _sequence(whole: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     """One file, checked against the rig, without what was found in it."""
     path, table, masked = whole.path, whole.table, list(whole.masked)
     first = 1 + len(rig.input_columns)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
     line = np.searchsorted(whole.rows, np.arange(len(t)))  # of each row of the table, in the file
     y = read.copy()
-    for entry in found:
+    for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
     inputs, readings = dict(zip(rig.input_columns, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
     for doubt in doubts(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, doubt.column, None if doubt.row is None else int(line[doubt.row]))
         if doubt.ruins:
-            refuse(path, where, doubt.found, doubt.mend)
-        warnings.warn(f"{path}: {where}: {doubt.found}; {doubt.mend}", DataWarning, 2)
-    for entry in found:
+            refuse(path, where, doubt.problem, doubt.hint)
+        warnings.warn(f"{path}: {where}: {doubt.problem}; {doubt.hint}", DataWarning, 2)
+    for entry in entries:
         k, count = int(entry.rows[0]), entry.rows.size
         masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
-        said = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
-        mend = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {said}; {mend}", DataWarning, 2)
+        problem = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
+        hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
+        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {hint}", DataWarning, 2)
     return _Sequence((t, u, y), (t, u, read), masked)
 
 
@@ -187,8 +187,8 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
         thousand = 0.99 < typical / 1000 < 1.01 or 0.99 < typical * 1000 < 1.01
-        mend = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
-        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", mend)
+        hint = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
+        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
     whole = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - whole) > TOLERANCE
     lost = int(np.sum(whole[~wrong] - 1))
@@ -197,12 +197,12 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
-        found = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
-        mend = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
-        refuse(path, place(path, "time", int(k) + 1), found, f"{mend} (dt = {rig.dt:g} s)")
+        problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
+        hint = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
+        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} s)")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
-        mend = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
-        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", mend)
+        hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
+        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", hint)
     return np.append(0, np.cumsum(whole)).astype(int)
 
 
@@ -215,21 +215,21 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     full[rows] = table
     lost = np.isnan(full[:, 0])
     full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
-    told = [retell(u, lost) for u in full[:, inputs].T]
-    full[:, inputs] = np.stack([u for u, _ in told], axis=1) if told else full[:, inputs]
-    dark = np.any([doubt > TOLD for _, doubt in told], axis=0) if told else np.zeros(size, bool)
+    filled = [interpolated(u, lost) for u in full[:, inputs].T]
+    full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
+    dark = np.any([doubt > INTERPOLATION_ERROR for _, doubt in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
     here, masked = rows[rows < end], []
-    for first, count, kind, mend in (
+    for first, count, kind, hint in (
         (int(lost.argmax()), int(lost[:end].sum()), "gap", "inputs there are told from the rows around"),
         (end, len(rows) - len(here), "cut", "inputs before these rows were lost and cannot be told: not used"),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
-            said = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
-            said += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
-            warnings.warn(f"{path}: {place(path, 'time', k)}: {said}; {mend}", DataWarning, 2)
+            problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
+            problem += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
+            warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], here, masked)
 
 

@@ -12,7 +12,7 @@ _ORDER = 16  # of the linear prediction of an input
 _TRIALS = 40  # gaps that are made on purpose to measure the error of interpolation
 
 
-class Told(NamedTuple):
+class Interpolated(NamedTuple):
     """An input with its lost rows."""
 
     u: Float[np.ndarray, " time"]
@@ -20,7 +20,7 @@ class Told(NamedTuple):
     """Interpolation error of the gap of a lost row: estimated minus true, summed, over the size of one row."""
 
 
-def retell(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) -> Told:
+def interpolated(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) -> Interpolated:
     """An input with its lost rows interpolated, and the interpolation error.
 
     The lost rows are those that linear prediction from the rows around makes likeliest [Janssen, Veldhuis & Vries
@@ -28,7 +28,7 @@ def retell(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) -> To
     """
     size, doubt = float(np.sqrt(np.mean(u[~lost] ** 2))), np.zeros(u.size)
     if size == 0.0:
-        return Told(np.where(lost, 0.0, u), doubt)
+        return Interpolated(np.where(lost, 0.0, u), doubt)
     whole, gaps = u / size, runs(np.where(lost, 1.0, 0.0))
     weights = _prediction(whole, lost)
     for length in {run.length for run in gaps if lost[run.first]}:
@@ -36,7 +36,7 @@ def retell(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) -> To
         for run in gaps:
             if lost[run.first] and run.length == length:
                 doubt[run.first : run.end] = worst
-    return Told(size * _told(whole, lost, weights), doubt)
+    return Interpolated(size * _filled(whole, lost, weights), doubt)
 
 
 def _worst(
@@ -48,7 +48,7 @@ def _worst(
         if not lost[first - 1 : first + length + 1].any():
             part = slice(max(first - reach, 0), first + length + reach)
             made = (np.arange(u.size) >= first) & (np.arange(u.size) < first + length)
-            errors.append(float(np.sum((_told(u[part], (lost | made)[part], weights) - u[part])[made[part]])))
+            errors.append(float(np.sum((_filled(u[part], (lost | made)[part], weights) - u[part])[made[part]])))
     return max(map(abs, errors)) if len(errors) > 3 else math.inf
 
 
@@ -63,7 +63,7 @@ def _prediction(u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"]) 
     return np.linalg.solve(past.T @ past + 1e-9 * len(rows) * np.eye(order), past.T @ now)
 
 
-def _told(
+def _filled(
     u: Float[np.ndarray, " time"], lost: Bool[np.ndarray, " time"], weights: Float[np.ndarray, " lag"]
 ) -> Float[np.ndarray, " time"]:
     """The lost rows with which the errors of prediction are smallest."""

@@ -80,7 +80,7 @@ class Motor(NamedTuple):
     """Numbers of the servo, by their keys."""
 
 
-class Gauge(NamedTuple):
+class JointSensor(NamedTuple):
     """A sensor that reads a joint."""
 
     name: str
@@ -89,7 +89,7 @@ class Gauge(NamedTuple):
     """True where it reads the velocity."""
 
 
-class Spot(NamedTuple):
+class Site(NamedTuple):
     """A marked point of a body."""
 
     name: str
@@ -98,7 +98,7 @@ class Spot(NamedTuple):
     """[m]"""
 
 
-class Sense(NamedTuple):
+class Sensor(NamedTuple):
     """A component of a sensor at a site; its column is called as the sensor with the component behind a dot."""
 
     name: str
@@ -126,8 +126,8 @@ class Machine(NamedTuple):
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
     motors: tuple[Motor, ...]
-    gauges: tuple[Gauge, ...]
-    spots: tuple[Spot, ...]
+    joint_sensors: tuple[JointSensor, ...]
+    sites: tuple[Site, ...]
     states: tuple[str, ...] = ()
     """Names of the coordinates, then of the rates, in the logs."""
     gears: tuple[float, ...] = ()
@@ -136,7 +136,7 @@ class Machine(NamedTuple):
     """True where the inputs are motors of the file; False where rig.toml names joints."""
     rubs: bool = False
     """True where friction of the file acts, because none is learned."""
-    senses: tuple[Sense, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
     """All sensors of a file, measured ones of a rig."""
     part: tuple[tuple[str, ...] | None, tuple[tuple[str, float], ...]] | None = None
     """The joints that rig.toml names, and those that it holds with their values; None where all of the file move."""
@@ -150,9 +150,16 @@ def packed(machine: Machine) -> str:
 @lru_cache(maxsize=64)
 def unpacked(text: str) -> Machine:
     """The machine in a text of `packed`."""
-    told = json.loads(text, parse_int=int)
-    fields = [_tuples(part) for part in told]
-    kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "gauges": Gauge, "spots": Spot, "senses": Sense}
+    parts = json.loads(text, parse_int=int)
+    fields = [_tuples(part) for part in parts]
+    kinds = {
+        "bodies": Body,
+        "joints": Joint,
+        "motors": Motor,
+        "joint_sensors": JointSensor,
+        "sites": Site,
+        "sensors": Sensor,
+    }
     named = dict(zip(Machine._fields, fields, strict=False))  # models that were saved before a field was there
     whole: dict[str, Any] = {
         name: tuple(kinds[name](*one) for one in value) if name in kinds else value for name, value in named.items()
@@ -167,9 +174,9 @@ def _tuples(value):
 def machine_unit(text: str, name: str) -> str:
     """The SI unit of a state, sensor or parameter of the machine in a text of `packed`."""
     machine = unpacked(text)
-    for sense in machine.senses:
-        if name == sense.name:
-            return SENSE_UNITS[sense.kind]
+    for sensor in machine.sensors:
+        if name == sensor.name:
+            return SENSE_UNITS[sensor.kind]
     dof, (owner, _, own) = len(machine.joints), name.partition(".")
     if name in machine.states:
         place = machine.states.index(name)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from .locked import NOTHING, groups, lock
-from .machine import SENSE_UNITS, Body, Gauge, Joint, Machine, Motor, Rotation, Sense, Spot, Vector
+from .machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site, Vector
 from .rig import RigError, RigWarning, nearest
 from .servo import TORQUE
 
@@ -64,15 +64,17 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
         bodies=bodies,
         joints=joints,
         motors=tuple(motor._replace(joint=numbers.index(motor.joint)) for motor in driven),
-        gauges=tuple(
-            gauge._replace(joint=numbers.index(gauge.joint)) for gauge in _gauges(model) if gauge.joint in numbers
+        joint_sensors=tuple(
+            sensor._replace(joint=numbers.index(sensor.joint))
+            for sensor in _joint_sensors(model)
+            if sensor.joint in numbers
         ),
-        spots=tuple(
-            Spot(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
+        sites=tuple(
+            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
             for i in range(model.nsite)
             if model.site_bodyid[i] > 0
         ),
-        senses=tuple(_senses(model)),
+        sensors=tuple(_sensors(model)),
     )
     if not part.whole:
         joined = range(len(bodies)) if root.tag == "robot" else {int(i) - 1 for i in model.jnt_bodyid}
@@ -93,16 +95,16 @@ def _part(
     for joint in machine.joints:
         body = machine.bodies[joint.body]
         if joint.name in values and (body.mass <= NOTHING or np.trace(body.inertia) <= 10 * NOTHING):
-            found = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
-            warnings.warn(f"{path}: {found}; it is joined to the body that carries it", RigWarning, 2)
+            problem = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
+            warnings.warn(f"{path}: {problem}; it is joined to the body that carries it", RigWarning, 2)
     machine = lock(machine, values, joined)
     group = groups(machine, {joint.body for joint in machine.joints}.__contains__)
     for i in sorted({joint.body for joint in machine.joints}):
         whole = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
         if sum(body.mass for body in whole) <= NOTHING:
             joint = next(joint.name for joint in machine.joints if joint.body == i)
-            mend = f"give it an <inertial>, or hold its joint: {_line(joint)}"
-            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", mend)
+            hint = f"give it an <inertial>, or hold its joint: {_line(joint)}"
+            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", hint)
     return machine
 
 
@@ -123,9 +125,9 @@ def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
             refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
-def refuse(path: Path, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, problem: str, hint: str) -> NoReturn:
     """Raise MachineError."""
-    raise MachineError(f"{path}: {found}; {mend}")
+    raise MachineError(f"{path}: {problem}; {hint}")
 
 
 def _mujoco() -> Any:
@@ -174,20 +176,20 @@ def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
             return _build(mujoco.MjSpec.from_string(_bare_urdf(root)), part)
         return _build(mujoco.MjSpec.from_file(str(path)), part)
     except ValueError as error:
-        said = " ".join(str(error).split())
-    if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", said, re.I):
+        message = " ".join(str(error).split())
+    if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", message, re.I):
         whole = _included(path, root)
         _strip(path, whole)
         try:
             return _build(mujoco.MjSpec.from_string(ET.tostring(whole, encoding="unicode")), part)
         except ValueError as error:
-            said = " ".join(str(error).split())
-    refuse(path, f"MuJoCo's compiler refuses it: {said}", _mend(said))
+            message = " ".join(str(error).split())
+    refuse(path, f"MuJoCo's compiler refuses it: {message}", _hint(message))
 
 
-def _mend(said: str) -> str:
+def _hint(message: str) -> str:
     """Remedies for the commonest errors of the compiler."""
-    mends = {
+    hints = {
         r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
         r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
         r"inertia.*(positive|negative)|(positive|negative).*inertia": "masses and inertias are above 0: correct it",
@@ -195,8 +197,8 @@ def _mend(said: str) -> str:
         r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
         r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
     }
-    found = (mend for pattern, mend in mends.items() if re.search(pattern, said, re.I))
-    return next(found, "correct the file; MuJoCo's viewer shows the same error")
+    matching = (hint for pattern, hint in hints.items() if re.search(pattern, message, re.I))
+    return next(matching, "correct the file; MuJoCo's viewer shows the same error")
 
 
 # --- files whose meshes are elsewhere
@@ -257,12 +259,12 @@ def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
         if (mimic := joint.find("mimic")) is not None:
             leader = str(mimic.get("joint"))
             if not (held and part.holds(leader)):
-                mend = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
-                refuse(path, f"joint {name!r} mimics another", mend)
+                hint = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
+                refuse(path, f"joint {name!r} mimics another", hint)
             joint.remove(mimic)
         if kind != "fixed" and not held and links[child].find("inertial") is None and not _carries(child, root):
-            mend = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
-            refuse(path, f"link {child!r} moves and has no <inertial>", mend)
+            hint = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
+            refuse(path, f"link {child!r} moves and has no <inertial>", hint)
     if parents and not set(links) - set(parents):
         refuse(path, "its links form a ring", "a machine here is a tree: one link has no parent")
     for name in parents:
@@ -276,8 +278,8 @@ def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
 
 def _link(joint: ET.Element, end: str) -> str:
     """The link at an end of a joint."""
-    found = joint.find(end)
-    return "" if found is None else str(found.get("link"))
+    element = joint.find(end)
+    return "" if element is None else str(element.get("link"))
 
 
 def _carries(link: str, root: ET.Element) -> bool:
@@ -338,8 +340,8 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
         elif child.tag == "frame":
             _strip_body(path, child, name, weighed)
         elif child.tag == "geom" and not weighed and child.get("mesh"):
-            found = f"body {name!r} has no <inertial>, and its mesh {child.get('mesh')!r} is missing"
-            refuse(path, found, "put the mesh beside the file, or give the body an <inertial>")
+            problem = f"body {name!r} has no <inertial>, and its mesh {child.get('mesh')!r} is missing"
+            refuse(path, problem, "put the mesh beside the file, or give the body an <inertial>")
         elif child.tag in ("geom", "camera", "light"):
             if weighed or child.tag != "geom":
                 body.remove(child)
@@ -351,8 +353,8 @@ def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
 
 
 def _refuse_all(path: Path, model: Any, part: Part) -> None:
-    for found, mend in _obstacles(model, part):
-        refuse(path, found, mend)
+    for problem, hint in _obstacles(model, part):
+        refuse(path, problem, hint)
 
 
 def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
@@ -374,9 +376,9 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
         yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
     if closed := list(_closed(model, held)):
         lines = list(dict.fromkeys(name for names in closed for name in names))
-        mend = "a loop or coupling is no tree: take <equality> out"
-        mend += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
-        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), mend
+        hint = "a loop or coupling is no tree: take <equality> out"
+        hint += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
+        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
     loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
     if loose:
         yield f"it has {len(loose)} tendons", "put their springs and motors on joints, and take <tendon> out"
@@ -451,22 +453,22 @@ def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
     gain, bias, state, acts = (
         int(getattr(model, f"actuator_{kind}type")[i]) for kind in ("gain", "bias", "dyn", "trn")
     )
-    mend = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
+    hint = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
     if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or state == int(mujoco.mjtDyn.mjDYN_MUSCLE):
-        yield f"actuator {name!r} is a muscle", mend
+        yield f"actuator {name!r} is a muscle", hint
     elif state != int(mujoco.mjtDyn.mjDYN_NONE):
         lag = "log the goal that it has integrated and make it <position>" if _integrates(model, i) else _LAG
         yield f"actuator {name!r} has a state of its own", lag
     elif bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
-        yield f"actuator {name!r} has a bias that is not affine", mend
+        yield f"actuator {name!r} has a bias that is not affine", hint
     elif gain not in (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)):
-        yield f"actuator {name!r} has a gain that is neither fixed nor affine", mend
-    elif (found := _drive(model, i)) is None:
-        mend = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
-        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", mend
-    elif found[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
-        mend = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
-        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", mend
+        yield f"actuator {name!r} has a gain that is neither fixed nor affine", hint
+    elif (drive := _drive(model, i)) is None:
+        hint = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
+        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", hint
+    elif drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
+        hint = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
+        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", hint
     elif acts not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
         yield f"actuator {name!r} drives no joint", "let every motor drive a joint"
 
@@ -593,15 +595,15 @@ def _limits(model: Any, i: int) -> tuple[float, float] | None:
     return (max(float(x[0]) for x in own), min(float(x[1]) for x in own)) if own else None
 
 
-def _gauges(model: Any) -> Iterator[Gauge]:
+def _joint_sensors(model: Any) -> Iterator[JointSensor]:
     kinds = _mujoco().mjtSensor
     for i in range(model.nsensor):
         kind, rate = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTVEL)
         if kind in (int(kinds.mjSENS_JOINTPOS), rate):
-            yield Gauge(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
+            yield JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
 
 
-def _senses(model: Any) -> Iterator[Sense]:
+def _sensors(model: Any) -> Iterator[Sensor]:
     """The components of every sensor that reads no joint."""
     mujoco = _mujoco()
     sites, joints = int(mujoco.mjtObj.mjOBJ_SITE), (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
@@ -616,7 +618,7 @@ def _senses(model: Any) -> Iterator[Sense]:
         place, turn = (model.site_pos[at], model.site_quat[at]) if at >= 0 else (np.zeros(3), np.array([1.0, 0, 0, 0]))
         body = int(model.site_bodyid[at]) - 1 if at >= 0 else -1
         for axis, letter in enumerate("xyz"):
-            yield Sense(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
+            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:

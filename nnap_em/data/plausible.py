@@ -35,8 +35,8 @@ class Doubt(NamedTuple):
     """True where a fit would be wrong without a word; False where it may be meant."""
     column: str
     row: int | None
-    found: str
-    mend: str
+    problem: str
+    hint: str
 
 
 class Repeat(NamedTuple):
@@ -64,8 +64,8 @@ def doubts(
     for name, values in readings.items():
         observed = values[np.isfinite(values)]
         if not observed.size:
-            mend = "take the file out, or the column out of [measurement]"
-            yield Doubt(True, name, None, "no sample at all", mend)
+            hint = "take the file out, or the column out of [measurement]"
+            yield Doubt(True, name, None, "no sample at all", hint)
             return
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Doubt(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
@@ -91,8 +91,8 @@ def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]])
         whole = rows.tobytes() if own else None
         if whole in wholes:
             yield Repeat(name, 0, wholes[whole], 0, True)
-        elif found := next((content for content in own if content in seen), None):
-            yield Repeat(name, own[found], *seen[found], False)
+        elif same := next((content for content in own if content in seen), None):
+            yield Repeat(name, own[same], *seen[same], False)
         for content, row in own.items():
             seen.setdefault(content, (name, row))
         if whole:
@@ -120,25 +120,25 @@ def _copies(inputs: Columns, readings: Columns) -> Iterator[Doubt]:
     for i, (name, values) in enumerate(columns[len(inputs) :], len(inputs)):
         for other, others in columns[:i]:
             if np.nanmax(values) > np.nanmin(values) and np.array_equal(values, others, equal_nan=True):
-                found = f"the same numbers as column {other!r}"
-                yield Doubt(True, name, None, found, "write what each sensor reads, or take the column out")
+                problem = f"the same numbers as column {other!r}"
+                yield Doubt(True, name, None, problem, "write what each sensor reads, or take the column out")
 
 
 def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Iterator[Doubt]:
     """A coordinate against the integral of its rate: units, sign, and what is swapped."""
     fit, ratio = _follows(columns[name], columns[rate], dt)
-    found = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
-    for factor, wrong, mend in (*(_ANGLE if angle else ()), *_ANY):
-        close = (0.7, 0.7 < ratio / factor < 1.4) if mend == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
+    problem = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
+    for factor, wrong, hint in (*(_ANGLE if angle else ()), *_ANY):
+        close = (0.7, 0.7 < ratio / factor < 1.4) if hint == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
         if fit > close[0] and close[1]:
-            yield Doubt(True, rate if wrong else name, None, found, mend)
+            yield Doubt(True, rate if wrong else name, None, problem, hint)
             return
     ways = "units, signs and names of the two"
     if fit > 0.9 and not 0.8 < ratio < 1.25:
-        yield Doubt(False, rate, None, found, f"it should be once: check {ways}")
+        yield Doubt(False, rate, None, problem, f"it should be once: check {ways}")
     elif fit < -0.7 and 0.7 < ratio < 1.4:
-        found = f"the rate of {name!r} is minus column {rate!r}"
-        yield Doubt(True, rate, None, found, "turn the sign of the wrong one: both count in the same direction")
+        problem = f"the rate of {name!r} is minus column {rate!r}"
+        yield Doubt(True, rate, None, problem, "turn the sign of the wrong one: both count in the same direction")
     elif fit < 0.5:
         for one, two, wrong, other in (
             (rate, name, name, rate),
@@ -147,8 +147,10 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
         ):
             fit, ratio = _follows(columns[one], columns[two], dt)
             if fit > 0.95 and 0.8 < ratio < 1.25:
-                found = f"{two!r} is the rate of {one!r}, and {rate!r} is not that of {name!r}"
-                yield Doubt(True, wrong, None, found, f"columns {wrong!r} and {other!r} look swapped: name them right")
+                problem = f"{two!r} is the rate of {one!r}, and {rate!r} is not that of {name!r}"
+                yield Doubt(
+                    True, wrong, None, problem, f"columns {wrong!r} and {other!r} look swapped: name them right"
+                )
                 return
         if _moves(columns[name]) and _moves(columns[rate]):
             yield Doubt(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")
@@ -184,8 +186,8 @@ def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
         jumps = (np.abs(np.abs(step) - turn) < 0.15 * turn) & (np.diff(rows) <= 2)
         if jumps.any() and np.median(np.abs(step)) < 0.1 * turn:
             k, row = step[jumps][0], int(rows[1:][jumps][0])
-            mend = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
-            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", mend)
+            hint = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
+            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", hint)
             return
 
 

@@ -23,7 +23,7 @@ from .units import parameter_unit, quantities, with_names
 
 _FRICTION = ("unknown", "dynamic", "none")
 _CLOCKS = ("sequence", "session")
-_MEND = {  # how the line of a key or table should look
+_HINTS = {  # how the line of a key or table should look
     "format": "format = 1",
     "name": 'name = "my_rig"',
     "model": 'a table [model] with type = "acrobot" and its parameters',
@@ -79,11 +79,11 @@ class SystemSpec:
     """The joint of an input whose name does not determine it."""
     sensors: tuple[str, ...] = ()
     """Columns that are read beside states."""
-    declare: "Callable[[_Table], Told] | None" = None
+    declare: "Callable[[_Table], Declaration] | None" = None
     """Declaration by the file that rig.toml names and by the whole table, for a system with names from a file."""
 
 
-class Told(NamedTuple):
+class Declaration(NamedTuple):
     """Declaration of [model] and [input]."""
 
     spec: SystemSpec
@@ -179,8 +179,8 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
     system = model.choice("type", systems)
-    told = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
-    spec = told.spec
+    declaration = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
+    spec = declaration.spec
     sampling.check(("dt", "input_hold", "clock"))
     sampling.choice("input_hold", ("zero-order",))
     start.check((), spec.states)
@@ -188,18 +188,18 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     return Rig(
         name=root.text("name"),
         system=system,
-        parameters=told.parameters,
+        parameters=declaration.parameters,
         friction=model.choice("friction", _FRICTION) != "none",
-        input_columns=told.input_columns,
-        input_joints=told.input_joints,
+        input_columns=declaration.input_columns,
+        input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
         clock=sampling.choice("clock", _CLOCKS),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},
-        limits=read_bounds(root.table("limits", absent={}), told.input_columns, spec.states),
-        machine=told.machine,
-        input_kinds=told.input_kinds,
+        limits=read_bounds(root.table("limits", absent={}), declaration.input_columns, spec.states),
+        machine=declaration.machine,
+        input_kinds=declaration.input_kinds,
         memory=model.text("friction") == "dynamic",
     )
 
@@ -207,13 +207,13 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
     parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
-    told = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
+    bodies = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
-    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else told
+    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
     friction = "dynamic" if rig.memory else "unknown" if rig.friction else "none"
     kind = "map with memory" if rig.memory else "static map velocity -> torque"
     lines += [f'friction = "{friction}"    # {kind} in each joint']
-    lines += ["", "[model.uncertain]", *told] if rig.machine and told else []
+    lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
     unit = "" if rig.input_kinds else "    # N m, or N on a slide"
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
     lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
@@ -272,10 +272,10 @@ class _Table:
     name: str
     items: Mapping[str, object]
 
-    def refuse(self, key: str, found: str | None = None, mend: str | None = None) -> NoReturn:
+    def refuse(self, key: str, problem: str | None = None, hint: str | None = None) -> NoReturn:
         place = f"[{self.name}] {key}" if self.name else key
-        found = found or f"found {self.items[key]!r}"
-        raise RigError(f"{self.path}: {place}: {found}; {mend or f'write {_MEND[key]}'}")
+        problem = problem or f"found {self.items[key]!r}"
+        raise RigError(f"{self.path}: {place}: {problem}; {hint or f'write {_HINTS[key]}'}")
 
     def check(self, required: Collection[str], optional: Collection[str] = ()) -> None:
         """Refuse unknown keys first: a misspelt key is also a missing one, and its name is the better hint."""
@@ -290,14 +290,14 @@ class _Table:
 
     def value(self, key: str) -> object:
         if key not in self.items:
-            mend = _MEND.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
-            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {mend}")
+            hint = _HINTS.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
+            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {hint}")
         return self.items[key]
 
     def table(self, key: str, absent: Mapping[str, object] | None = None) -> "_Table":
         value = self.value(key) if absent is None else self.items.get(key, absent)
         if not isinstance(value, dict):
-            self.refuse(key, mend=None if key in _MEND else f"write {key} = {{ mean = 0.2, std = 0.02 }}")
+            self.refuse(key, hint=None if key in _HINTS else f"write {key} = {{ mean = 0.2, std = 0.02 }}")
         return _Table(self.path, f"{self.name}.{key}" if self.name else key, value)
 
     def text(self, key: str) -> str:
@@ -309,13 +309,13 @@ class _Table:
     def choice(self, key: str, known: Collection[str]) -> str:
         value = self.text(key)
         if value not in known:
-            self.refuse(key, mend=nearest(value, known))
+            self.refuse(key, hint=nearest(value, known))
         return value
 
     def number(self, key: str) -> float:
         value = self.value(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            self.refuse(key, mend=f"write a finite number, {key} = 0.2")
+            self.refuse(key, hint=f"write a finite number, {key} = 0.2")
         return float(value)
 
     def quantity(self, key: str) -> Declared:
@@ -325,14 +325,14 @@ class _Table:
     def positive(self, key: str) -> float:
         value = self.number(key)
         if value <= 0:
-            self.refuse(key, mend=f"write a number above 0, {key} = 0.01")
+            self.refuse(key, hint=f"write a number above 0, {key} = 0.01")
         return value
 
     def declared(self, key: str) -> Declared:
         pair = self.table(key)
         pair.check(("mean", "std"))
         if pair.number("std") < 0:
-            pair.refuse("std", mend="write a standard deviation of 0 (trusted) or more")
+            pair.refuse("std", hint="write a standard deviation of 0 (trusted) or more")
         return Declared(pair.number("mean"), pair.number("std"))
 
     def distinct(self, key: str, kind: type) -> tuple:
@@ -361,23 +361,23 @@ def _parameter(model: _Table, key: str) -> Declared:
     value = model.quantity(key)
     unit = parameter_unit(key)
     if unit == "kg" and value.mean <= 0:
-        model.refuse(key, mend="write a mass above 0 [kg]")
+        model.refuse(key, hint="write a mass above 0 [kg]")
     if unit in ("m", "m/s^2") and value.mean < 0:
-        model.refuse(key, mend=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
+        model.refuse(key, hint=f"write 0 or more [{unit}]: directions are in the equations, not in the signs")
     if value.mean > {"m/s^2": 100.0, "m": 50.0}.get(unit, math.inf):
-        found = f"{model.path}: [model] {key}: found {value.mean:g}"
-        warnings.warn(f"{found}; is it in m{unit}? write it in {unit}", RigWarning, 2)
+        problem = f"{model.path}: [model] {key}: found {value.mean:g}"
+        warnings.warn(f"{problem}; is it in m{unit}? write it in {unit}", RigWarning, 2)
     return value
 
 
-def _declared(root: _Table, spec: SystemSpec) -> Told:
+def _declared(root: _Table, spec: SystemSpec) -> Declaration:
     """Declaration of a system of these parameters by [model] and [input]."""
     model = root.table("model")
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
     parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
     columns, joints, drives = _input(root, model, spec)
-    return Told(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
+    return Declaration(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
 
 
 def kinds_of(drives: Mapping[str, Drive]) -> tuple[str, ...]:
@@ -404,7 +404,7 @@ def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ..
         joint = model.value(key)
         joints = (joint,) if type(joint) is int else model.refuse(key)
     if not all(1 <= joint <= spec.joints for joint in joints):
-        table.refuse(key, mend=f"joints count from 1 to {spec.joints}")
+        table.refuse(key, hint=f"joints count from 1 to {spec.joints}")
     return columns, joints, drives
 
 

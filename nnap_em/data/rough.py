@@ -27,14 +27,14 @@ def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = 
     """
     first = {name: spikes(values) for name, values in readings.items()}
     rest = {name: _without(values, first[name]) for name, values in readings.items()}
-    found = []
+    entries = []
     for name, values in rest.items():
         still = list(frozen(name, rest, dt, [value for column, value in limits if column == name]))
-        found += [Rough(kind, name, rows[np.isfinite(values[rows])]) for kind, rows in still]
+        entries += [Rough(kind, name, rows[np.isfinite(values[rows])]) for kind, rows in still]
         y = _without(values, *(rows for _, rows in still))
         rows = np.sort(np.concatenate([first[name], spikes(y)])) if still else first[name]
-        found += [Rough("spike", name, rows)] * bool(rows.size)
-    return found
+        entries += [Rough("spike", name, rows)] * bool(rows.size)
+    return entries
 
 
 def _without(y: Float[np.ndarray, " time"], *rows: Int[np.ndarray, "_"]) -> Float[np.ndarray, " time"]:

@@ -58,8 +58,8 @@ def read_drives(table: Any, columns: Collection[str], given: Mapping[str, Drive]
     kinds = {drive.kind for drive in drives.values()}
     for key in table.items:
         if key in KEYS and not any(key in KINDS[kind] for kind in kinds):
-            found = f"no input has a {key} (kinds: {', '.join(sorted(kinds)) or 'none'})"
-            table.refuse(key, found, f"write {_LINE} beside it, or take it out")
+            problem = f"no input has a {key} (kinds: {', '.join(sorted(kinds)) or 'none'})"
+            table.refuse(key, problem, f"write {_LINE} beside it, or take it out")
     return drives
 
 
@@ -76,9 +76,9 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
         numbers |= {key: _number(place, key, about) for key, about in KINDS[kind].items() if key in place.items}
     for key, about in KINDS[kind].items():
         if about.needed and key not in numbers:
-            found = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
-            mend = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
-            (own if own.items else table).refuse(key, found, mend)
+            problem = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
+            hint = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
+            (own if own.items else table).refuse(key, problem, hint)
     return Drive(kind, numbers)
 
 
@@ -91,9 +91,9 @@ def _refuse_unknown(table: Any, columns: Collection[str]) -> None:
     """A table of a column that is not there."""
     for key, value in table.items.items():
         if isinstance(value, dict) and key not in (*columns, *RESERVED):
-            found = f"no input column is called {key!r}"
-            mend = "name it in columns and its joint in joints, or take the table out"
-            table.refuse(key, found, f"{mend}; columns are {', '.join(columns) or 'none'}")
+            problem = f"no input column is called {key!r}"
+            hint = "name it in columns and its joint in joints, or take the table out"
+            table.refuse(key, problem, f"{hint}; columns are {', '.join(columns) or 'none'}")
 
 
 def _kind(table: Any) -> str | None:

@@ -32,10 +32,10 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
         sigma = max(noise(y), 1e-9 * float(np.nanmax(np.abs(y), initial=0.0)), 1e-300)
         tried = list(_candidates(y, sigma))
         alone = [int(run[0]) for run in tried if run.size == 1]
-        taken = [run for run in tried if _is_spike(y, run, alone, sigma)]
-        if not taken:
+        confirmed = [run for run in tried if _is_spike(y, run, alone, sigma)]
+        if not confirmed:
             return np.array(sorted(out), int)
-        for run in taken:
+        for run in confirmed:
             out += [int(row) for row in run if np.isfinite(y[row])]
             y[run] = np.nan
 

@@ -29,7 +29,7 @@ def joint_called(coordinates: Sequence[str], joint: int) -> str:
 
 def with_names(text: str, coordinates: Sequence[str]) -> str:
     """`text` with the name of every joint behind its number."""
-    return re.sub(r"\bjoint (\d+)\b(?! \()", lambda found: joint_called(coordinates, int(found[1])), text)
+    return re.sub(r"\bjoint (\d+)\b(?! \()", lambda match: joint_called(coordinates, int(match[1])), text)
 
 
 def state_unit(angle: bool, *, rate: bool) -> str:

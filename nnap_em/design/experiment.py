@@ -1,5 +1,6 @@
 """The next experiment: which inputs, played on the machine, would answer the open questions best."""
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,12 +13,13 @@ from ..data.dataset import Dataset
 from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import drawn_paths, smooth
+from ..storage.log import Log, renamed, silent
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .questions import AbstractQuestion, Apart, Friction, Parameters, Several, Told, share
+from .questions import AbstractQuestion, Apart, Friction, Information, Parameters, Several, share
 from .rivals import Rivals
-from .search import EFFORT, Bench, Effort, Plan, Say, search, tell, told
+from .search import EFFORT, Bench, Effort, Plan, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
 DRAWN = 32
@@ -46,9 +48,9 @@ class Design(NamedTuple):
     middle: Float[np.ndarray, "sequence time readable"]
     high: Float[np.ndarray, "sequence time readable"]
     fit: Fit
-    told: Told
+    expected: Information
     """Information of all sequences."""
-    old: Told
+    old: Information
     """Information of as much time of the old inputs."""
     question: AbstractQuestion
     rivals: tuple[Rivals, ...]
@@ -59,11 +61,18 @@ class Design(NamedTuple):
     """Weight of velocities; 0 where the logs never were."""
 
     @property
-    def nothing(self) -> Told:
+    def nothing(self) -> Information:
         """Information without an experiment."""
-        return jax.tree.map(np.zeros_like, self.told)
+        return jax.tree.map(np.zeros_like, self.expected)
+
+    @property
+    def told(self) -> Information:
+        """The old name of `expected`, for one release."""
+        warnings.warn("Design.told is now Design.expected", DeprecationWarning, stacklevel=2)
+        return self.expected
 
 
+@renamed(say="log")
 def design_experiment(
     fitted: Identified,
     data: Dataset,
@@ -74,7 +83,7 @@ def design_experiment(
     seconds: float = 30.0,
     sequences: int = 6,
     effort: Effort = EFFORT,
-    say: Say = lambda text: None,
+    log: Log = silent,
 ) -> Design:
     """The `sequences` inputs of `seconds` [s] together that serve a criterion best, found by a seeded search.
 
@@ -94,7 +103,7 @@ def design_experiment(
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
     slow = _slow(fit, visited)
     friction = _friction(fit, visited, slow)
-    asked = _question(question, fitted, fit, friction, apart)
+    criterion = _question(question, fitted, fit, friction, apart)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
@@ -104,12 +113,12 @@ def design_experiment(
     count = float(np.sum(np.asarray(data.valid)[used]))
     bench = bench._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
-    quick = bench._replace(informed=not isinstance(asked, Apart))
-    plan = search(quick, asked, sequences, rng=rng, effort=effort, say=say)
+    quick = bench._replace(informed=not isinstance(criterion, Apart))
+    plan = search(quick, criterion, sequences, rng=rng, effort=effort, log=log)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
-    plan, found = _checked(bench, checked, plan, effort, say)
+    plan, trials = _checked(bench, checked, plan, effort, log)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
-    low, middle, high = np.quantile(np.asarray(found.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
+    low, middle, high = np.quantile(np.asarray(trials.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
     return Design(
         fitted,
         limits,
@@ -120,9 +129,9 @@ def design_experiment(
         middle,
         high,
         fit,
-        plan.told.sum(),
+        plan.expected.sum(),
         row.times(bench.share * sequences * t.size),
-        asked,
+        criterion,
         tuple(rivals),
         apart,
         slow,
@@ -182,21 +191,21 @@ SHRINKS, LAST = 0.85, 12
 """Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
 
 
-def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, say: Say):
+def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, log: Log):
     """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
     proposal = Proposal(*map(np.array, plan.proposal))
     for _ in range(LAST):
         u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-        found = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
-        ok = allowed(found, bench.limits)
+        trials = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
+        ok = allowed(trials, bench.limits)
         if ok.all():
             break
-        say(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
+        log(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
         proposal.shape[~ok, :, -1] *= SHRINKS
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
-    _, each = tell(bench, _padded(proposal, effort.batch), effort.few)
-    return Plan(proposal, each.of(np.arange(len(proposal.family)))), found
+    _, each = evaluated(bench, _padded(proposal, effort.batch), effort.few)
+    return Plan(proposal, each.of(np.arange(len(proposal.family)))), trials
 
 
 def _padded(proposal: Proposal, batch: int) -> Proposal:
@@ -204,7 +213,7 @@ def _padded(proposal: Proposal, batch: int) -> Proposal:
     return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
 
 
-def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Told:
+def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:
     """Information of a row of the logs, the mean along their smoothed motions, as far as a new sequence is long."""
     rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
@@ -213,5 +222,5 @@ def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time 
     t, u, y = (grow(a, mode="edge") for a in cut[:3])
     cut = Dataset(t, u, y, grow(cut.valid))
     x = grow(path[used, :rows], mode="edge")
-    each = told(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
+    each = expected_information(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
     return each.sum().times(1.0 / max(float(cut.valid.sum()), 1.0))

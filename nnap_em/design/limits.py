@@ -57,15 +57,15 @@ def limits_of(
     reached = mean[valid & used[:, None] & np.isfinite(mean).all(axis=-1)]
     change = np.abs(np.diff(u, axis=1))[valid[:, 1:] & valid[:, :-1]] / rig.dt
     bounds = rig.limits
-    inputs = _told(rig.input_columns, bounds.values, u[valid].min(axis=0), u[valid].max(axis=0))
-    rate = _told(rig.input_columns, bounds.rate, -change.max(axis=0), change.max(axis=0))[1]
-    low, high = _told(names, bounds.values, *np.percentile(reached, [OUTER, 100 - OUTER], axis=0))
+    inputs = _bounds(rig.input_columns, bounds.values, u[valid].min(axis=0), u[valid].max(axis=0))
+    rate = _bounds(rig.input_columns, bounds.rate, -change.max(axis=0), change.max(axis=0))[1]
+    low, high = _bounds(names, bounds.values, *np.percentile(reached, [OUTER, 100 - OUTER], axis=0))
     still, begun = jnp.zeros(dof), mean[used, 0]
     stays = bool(jnp.all(jnp.abs(system.bias(still, still)) < 1e-9))
     rest = np.zeros(2 * dof)
     if not (stays and np.all((low[:dof] <= 0) & (high[:dof] >= 0))):
         rest[:dof] = begun[np.isfinite(begun).all(axis=-1), :dof].mean(axis=0)
-    first, last = _told(names, bounds.start, rest, rest)
+    first, last = _bounds(names, bounds.start, rest, rest)
     for name, a, b, lo, hi in zip(names, first, last, low, high, strict=True):
         if a < lo or b > hi:
             where = f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}"
@@ -79,7 +79,7 @@ def limits_of(
     return Limits(*inputs, rate, low, high, first, last)
 
 
-def _told(names: Sequence[str], declared: Mapping[str, Range], low, high) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(names: Sequence[str], declared: Mapping[str, Range], low, high) -> tuple[np.ndarray, np.ndarray]:
     """Declared bounds, and others where there are none."""
     pairs = [declared.get(name, (lo, hi)) for name, lo, hi in zip(names, low, high, strict=True)]
     first, last = np.array(pairs, float).T

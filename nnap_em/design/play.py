@@ -87,9 +87,9 @@ def _motions(common: _Common, one) -> Motions:
     return Motions(low, high, jnp.swapaxes(x, 0, 1))
 
 
-def allowed(found: Motions, limits: Limits) -> Bool[np.ndarray, " proposal"]:
+def allowed(trials: Motions, limits: Limits) -> Bool[np.ndarray, " proposal"]:
     """True where all motions stay inside the limits, and their excursions far enough for those that were not drawn."""
-    low, high = np.asarray(found.lowest), np.asarray(found.highest)
+    low, high = np.asarray(trials.lowest), np.asarray(trials.highest)
     with np.errstate(invalid="ignore", over="ignore"):
         inside = (low >= limits.lowest).all(axis=(1, 2)) & (high <= limits.highest).all(axis=(1, 2))
         below = (low.mean(axis=1) - SAFE * low.std(axis=1) >= limits.lowest).all(axis=1)

@@ -13,28 +13,30 @@ from scipy.optimize import root_scalar
 from .information import Contrast, Fit
 
 
-class Told(NamedTuple):
+class Information(NamedTuple):
     """Information of some sequences together, or of each; leading axes are proposals."""
 
     information: Float[np.ndarray, "*proposal phi phi"]
     contrasts: tuple[Contrast, ...] = ()
 
-    def __add__(self, other: "Told") -> "Told":  # type: ignore[override]
+    def __add__(self, other: "Information") -> "Information":  # type: ignore[override]
         pairs = zip(self.contrasts, other.contrasts, strict=True)
         both = (Contrast(*(a + b for a, b in zip(one, two, strict=True))) for one, two in pairs)
-        return Told(self.information + other.information, tuple(both))
+        return Information(self.information + other.information, tuple(both))
 
-    def times(self, amount: float) -> "Told":
+    def times(self, amount: float) -> "Information":
         """The information `times` as large."""
         return jax.tree.map(lambda a: amount * a, self)
 
-    def of(self, which) -> "Told":
+    def of(self, which) -> "Information":
         """Some of the proposals."""
-        return Told(self.information[which], tuple(Contrast(*(a[which] for a in c)) for c in self.contrasts))
+        return Information(self.information[which], tuple(Contrast(*(a[which] for a in c)) for c in self.contrasts))
 
-    def sum(self) -> "Told":
+    def sum(self) -> "Information":
         """All together."""
-        return Told(self.information.sum(axis=0), tuple(Contrast(*(a.sum(axis=0) for a in c)) for c in self.contrasts))
+        return Information(
+            self.information.sum(axis=0), tuple(Contrast(*(a.sum(axis=0) for a in c)) for c in self.contrasts)
+        )
 
 
 def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "*proposal phi phi"]:
@@ -65,7 +67,7 @@ class AbstractQuestion(eqx.Module):
     """The cost of a whole answer."""
 
     @abstractmethod
-    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """The smaller, the better it is answered; one less is a factor e in a standard deviation."""
 
 
@@ -78,9 +80,9 @@ class Friction(AbstractQuestion):
     weight: Float[np.ndarray, "range dof node"]
     """Weight of velocities, in every range; their sum is 1."""
 
-    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         shape = self.weight.shape[1:]
-        variance = np.diagonal(after(np.asarray(self.fit.cov), told.information), axis1=-2, axis2=-1)
+        variance = np.diagonal(after(np.asarray(self.fit.cov), expected.information), axis1=-2, axis2=-1)
         variance = variance[..., : math.prod(shape)].reshape(*variance.shape[:-1], *shape)
         relative = variance / self.scale[:, None] ** 2
         mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
@@ -96,9 +98,9 @@ class Parameters(AbstractQuestion):
     places: tuple[int, ...] = eqx.field(static=True)
     """Among all parameters."""
 
-    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         where = np.asarray(self.places) + self.fit.nodes.size
-        cov = after(np.asarray(self.fit.cov), told.information)
+        cov = after(np.asarray(self.fit.cov), expected.information)
         variance = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1)[..., where], 1e-30)
         return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
 
@@ -120,17 +122,17 @@ class Apart(AbstractQuestion):
     covs: tuple[Float[np.ndarray, "_ _"], ...]
     """Covariances of every rival."""
 
-    def distance(self, told: Told) -> Float[np.ndarray, "*proposal pair"]:
+    def distance(self, expected: Information) -> Float[np.ndarray, "*proposal pair"]:
         """Distance of every pair [standard deviations]."""
         out = []
-        for cov, (information, pull, square) in zip(self.covs, told.contrasts, strict=True):
+        for cov, (information, pull, square) in zip(self.covs, expected.contrasts, strict=True):
             adapted = np.einsum("...i,...ij,...j->...", pull, after(cov, information), pull)
             out.append(np.sqrt(np.maximum(square - adapted, 0.0)))
         return np.stack(out, axis=-1)
 
-    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
+    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """Half the distance still to go."""
-        far = np.minimum(self.distance(told), SURE)
+        far = np.minimum(self.distance(expected), SURE)
         return np.asarray(0.5 * np.mean(SURE - far, axis=-1) + 0.5 * np.max(SURE - far, axis=-1))
 
 
@@ -139,5 +141,5 @@ class Several(AbstractQuestion):
 
     questions: tuple[AbstractQuestion, ...]
 
-    def cost(self, told: Told) -> Float[np.ndarray, "*proposal"]:
-        return np.asarray(np.sum([q.cost(told) for q in self.questions], axis=0))
+    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
+        return np.asarray(np.sum([q.cost(expected) for q in self.questions], axis=0))

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..data.dataset import Dataset
-from ..diagnose.context import Say
 from ..diagnose.keys import key_of, words
 from ..diagnose.rivals import instead, possible
 from ..effects import AbstractEffect
 from ..em.identify import Identified
+from ..storage.log import Log, silent
 from .limits import DesignError
 
 
@@ -41,15 +41,15 @@ class Rivals(NamedTuple):
 
 def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
     """Pairs that a diagnosis left open: a law of its model, or None where nothing was added, and a rival."""
-    law = lambda told: Law(told["name"], told.get("joint"), told.get("channel"))  # noqa: E731
-    out: list[tuple[Law | None, Law]] = [(None, law(told)) for told in report.get("cannot_tell", [])]
+    law = lambda entry: Law(entry["name"], entry.get("joint"), entry.get("channel"))  # noqa: E731
+    out: list[tuple[Law | None, Law]] = [(None, law(entry)) for entry in report.get("cannot_tell", [])]
     for effect in report.get("effects", []):
         out += [(law(effect), law(other)) for other in effect.get("equivalent", [])]
     return out
 
 
 def rivals(
-    fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], say: Say = lambda text: None
+    fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], log: Log = silent
 ) -> list[Rivals]:
     """Models to be discriminated: `fitted` beside itself with another law in the place of one of its own, and, where
     there is none (None), all that may come on top beside each other and beside `fitted` as it is, if there is but one.
@@ -58,7 +58,7 @@ def rivals(
     """
     out, beside = [], []
     for own, other in wanted:
-        say(f"fitting {other} in place of {own or 'nothing'}")
+        log(f"fitting {other} in place of {own or 'nothing'}")
         model = _instead(fitted, data, own, other)
         if own is None:
             beside.append((str(other), model))
@@ -75,8 +75,8 @@ def _instead(fitted: Identified, data: Dataset, own: Law | None, other: Law) -> 
     if own is not None and place is None:
         held = ", ".join(words(key_of(effect)) for effect in effects)
         raise DesignError(f"the fit holds no {own}; it holds {held or 'no effect'}")
-    found = instead(fitted, data, place, other.means)
-    if found is None:
+    refit = instead(fitted, data, place, other.means)
+    if refit is None:
         known = sorted({words(key_of(effect)) for effect in possible(fitted, data)})
         raise DesignError(f"this machine cannot have {other}; possible here: {', '.join(known)}")
-    return found
+    return refit

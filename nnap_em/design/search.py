@@ -4,7 +4,6 @@ Friction has kinks, limits are walls and a free arm is chaotic, so that a slope 
 search is a seeded one.  Motions and information of a batch of proposals are a step that a resumed run finds again.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,13 +13,12 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..em.predict import Paths
 from ..storage.journal import HERE, step
+from ..storage.log import Log, silent
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
-from .questions import AbstractQuestion, Told
+from .questions import AbstractQuestion, Information
 from .signals import Proposal, drawn, mutated, played, starts
-
-Say = Callable[[str], None]
 
 
 class Effort(NamedTuple):
@@ -66,23 +64,23 @@ class Plan(NamedTuple):
     """Sequences, and the information of each."""
 
     proposal: Proposal
-    told: Told
+    expected: Information
 
 
-@step(lambda bench, *_: (HERE, Told(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
-def tell(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Told]:
+@step(lambda bench, *_: (HERE, Information(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
+def evaluated(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
     """Proposals that stay inside the limits, and the information of each."""
     u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-    found = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
+    trials = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
     seq = blank(bench.t, u, len(bench.fit.model.measured))
-    return allowed(found, bench.limits), told(bench, seq, found.x, start).times(bench.share)
+    return allowed(trials, bench.limits), expected_information(bench, seq, trials.x, start).times(bench.share)
 
 
-def told(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Told:
+def expected_information(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Information:
     """Information of sequences along the motions x, and from `start` on about the rivals."""
     pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
     none = np.zeros((len(start), *bench.fit.cov.shape))
-    return Told(information(bench.fit, seq, x) if bench.informed else none, pairs)
+    return Information(information(bench.fit, seq, x) if bench.informed else none, pairs)
 
 
 def search(
@@ -92,49 +90,49 @@ def search(
     *,
     rng: np.random.Generator,
     effort: Effort = EFFORT,
-    say: Say = lambda text: None,
+    log: Log = silent,
 ) -> Plan:
     """The `count` sequences that answer best together.
 
     Raises DesignError where hardly any proposal stays inside the limits.
     """
-    pool = _pool(bench, count, rng, effort, say)
+    pool = _pool(bench, count, rng, effort, log)
     chosen, total = [], None
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
-        costs = question.cost(pool.told if total is None else total + pool.told)
+        costs = question.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
-        one = pool.told.of(chosen[-1])
+        one = pool.expected.of(chosen[-1])
         total = one if total is None else total + one
     plan = _of(pool, np.asarray(chosen))
-    say(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.told.sum())):.3f}")
+    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
-        if float(question.cost(plan.told.sum())) <= question.least:
+        if float(question.cost(plan.expected.sum())) <= question.least:
             break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(bench, question, plan, rng, reach, effort)
-        cost = float(question.cost(plan.told.sum()))
-        say(
+        cost = float(question.cost(plan.expected.sum()))
+        log(
             f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
         )
     return plan
 
 
-def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, say: Say) -> Plan:
+def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, log: Log) -> Plan:
     """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
     inputs, states = bench.limits.low.size, bench.limits.first.size
-    found, waiting = [], drawn(rng, effort.batch, inputs, states)
+    plans, waiting = [], drawn(rng, effort.batch, inputs, states)
     for _ in range(effort.tries):
-        ok, told = tell(bench, waiting, effort.few)
-        found.append(_of(Plan(waiting, told), ok))
-        have = sum(len(plan.proposal.family) for plan in found)
-        say(f"{have} of {effort.pool} proposals inside the limits")
+        ok, expected = evaluated(bench, waiting, effort.few)
+        plans.append(_of(Plan(waiting, expected), ok))
+        have = sum(len(plan.proposal.family) for plan in plans)
+        log(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
             break
         waiting.shape[~ok, :, -1] *= SHRINKS
         fresh = drawn(rng, effort.batch, inputs, states)
         again = ~ok & (waiting.shape[..., -1].max(axis=1) > SHRINKS**6)
         waiting = Proposal(*(_where(again, a, b) for a, b in zip(waiting, fresh, strict=True)))
-    plan = _joined(found)
+    plan = _joined(plans)
     if len(plan.proposal.family) < count:
         raise DesignError(
             f"only {len(plan.proposal.family)} of {effort.batch * effort.tries} proposals stay inside the limits; "
@@ -150,21 +148,21 @@ def _bettered(
     count = len(plan.proposal.family)
     place = np.arange(effort.batch) % count
     other = mutated(rng, Proposal(*(a[place] for a in plan.proposal)), reach)
-    ok, told = tell(bench, other, effort.few)
+    ok, expected = evaluated(bench, other, effort.few)
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
-        rest = _of(plan, np.arange(count) != slot).told.sum()
-        costs = question.cost(rest + told.of(np.append(mine, 0)))[: len(mine)]
-        now = float(question.cost(plan.told.sum()))
+        rest = _of(plan, np.arange(count) != slot).expected.sum()
+        costs = question.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
+        now = float(question.cost(plan.expected.sum()))
         if len(mine) and np.nanmin(costs, initial=np.inf) < now:
             best = int(mine[np.nanargmin(costs)])
-            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, told), np.asarray([best])),
+            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),
                             _of(plan, np.arange(count) > slot)])  # fmt: skip
     return plan
 
 
 def _of(plan: Plan, which) -> Plan:
-    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.told.of(which))
+    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.expected.of(which))
 
 
 def _joined(plans: list[Plan]) -> Plan:

@@ -173,8 +173,8 @@ def candidate_columns(
         force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
-            for stack, found in zip(group, every, strict=True):
-                for whole, own in ((force, found.force), (reading, found.reading)):
+            for stack, columns in zip(group, every, strict=True):
+                for whole, own in ((force, columns.force), (reading, columns.reading)):
                     whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
         return Columns(force, reading)
 

@@ -149,14 +149,14 @@ class Comparison(NamedTuple):
         if not self.changed:
             nothing = "No tested quantity" if self.differences else "Nothing"
             return f"{nothing} changed {between} beyond the stated errors: {_counted(tests)} tested at {CHANGED:.0%}."
-        told = []
+        changed = []
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
-            told += [f"the {curve.name}{parts}"] * curve.changed
-        told += [number.name for number in self.numbers if number.changed]
-        rest = tests - len(told)
+            changed += [f"the {curve.name}{parts}"] * curve.changed
+        changed += [number.name for number in self.numbers if number.changed]
+        rest = tests - len(changed)
         others = f"{_counted(rest, 'other ')} did not" if rest else "no other quantity was tested"
-        text = f"{listed(told)} changed {between}; {others}."
+        text = f"{listed(changed)} changed {between}; {others}."
         return text[0].upper() + text[1:]
 
     def __str__(self) -> str:
@@ -281,7 +281,7 @@ def _check(one: Fit, two: Fit) -> None:
 
 def _body(fitted: Identified):
     """The machine of a file without its path and its sensors."""
-    return unpacked(fitted.rig.machine)._replace(file="", gauges=(), spots=(), senses=())
+    return unpacked(fitted.rig.machine)._replace(file="", joint_sensors=(), sites=(), sensors=())
 
 
 def _identity(fitted: Identified) -> tuple:
@@ -316,9 +316,9 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
 
 def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) -> tuple[Number, ...]:
     """Stribeck numbers of one joint, their p-values corrected among each other."""
-    found = fit_law(velocity, torque, cov)
+    law_fit = fit_law(velocity, torque, cov)
     value, std = np.full((2, count, len(CALLED)), np.nan)
-    value[list(places)], std[list(places)] = found.value, found.std
+    value[list(places)], std[list(places)] = law_fit.value, law_fit.std
     rows = [
         number(name, unit, value[:, i], std[:, i])
         for i, (name, unit) in enumerate(zip(CALLED, UNITS[angle], strict=True))
@@ -347,13 +347,13 @@ def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
     for key in dict.fromkeys(itertools.chain(*each)):
         reported = [effects.get(key, {}) for effects in each]
         for name in dict.fromkeys(itertools.chain(*reported)):
-            found = [parameters.get(name) for parameters in reported]
-            value = np.asarray([np.nan if one is None else one.value for one in found])
-            std = np.asarray([np.nan if one is None else one.std for one in found])
+            entries = [parameters.get(name) for parameters in reported]
+            value = np.asarray([np.nan if one is None else one.value for one in entries])
+            std = np.asarray([np.nan if one is None else one.std for one in entries])
             if name in PERIODIC:
                 first = value[np.isfinite(value)][0]
                 value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-            unit = next(one.unit for one in found if one is not None)
+            unit = next(one.unit for one in entries if one is not None)
             yield number(f"{name} of {words(key)}", unit, value, std)
 
 
@@ -377,7 +377,7 @@ def number(
 def _differences(fits: Sequence[Fit]) -> Iterator[str]:
     """Effects, learned friction and estimated parameters that some fits have and others lack."""
 
-    def told(name: str, has: Bool[np.ndarray, " fit"], lacking: str) -> Iterator[str]:
+    def lines(name: str, has: Bool[np.ndarray, " fit"], lacking: str) -> Iterator[str]:
         if has.any() and not has.all():
             inside, outside = (
                 [fit.name for fit, h in zip(fits, has, strict=True) if h == side] for side in (True, False)
@@ -386,11 +386,11 @@ def _differences(fits: Sequence[Fit]) -> Iterator[str]:
 
     keys: list[list[Key]] = [[key_of(effect) for effect in fit.fitted.model.effects] for fit in fits]
     for key in dict.fromkeys(itertools.chain(*keys)):
-        yield from told(f"{words(key)} is", np.asarray([key in own for own in keys]), "not")
-    yield from told("friction is learned", np.asarray([fit.fitted.rig.friction for fit in fits]), "not")
+        yield from lines(f"{words(key)} is", np.asarray([key in own for own in keys]), "not")
+    yield from lines("friction is learned", np.asarray([fit.fitted.rig.friction for fit in fits]), "not")
     tables = [parameter_table(fit.fitted) for fit in fits]
     for name in dict.fromkeys(itertools.chain(*tables)):
-        yield from told(f"{name} is estimated", np.asarray([name in table for table in tables]), "kept as declared")
+        yield from lines(f"{name} is estimated", np.asarray([name in table for table in tables]), "kept as declared")
 
 
 def _warnings(fits: Sequence[Fit]) -> Iterator[str]:

@@ -1,7 +1,6 @@
 """Constants of a search, and its two long steps: smooth a hypothesis, and extend its fit to the whole length."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -16,12 +15,12 @@ from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
 from ..em.mstep import kept
 from ..em.multistep import JUDGED, errors, followed, ratio
 from ..model.state_space import StateSpaceModel
+from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss
 from .smoothed import SmoothedFit
 
 _Tree = TypeVar("_Tree")
-Say = Callable[[str], None]
 
 Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 """State of a fit at the end of each of its horizons, and the sequences used."""
@@ -58,7 +57,7 @@ class SearchContext(NamedTuple):
     data: Dataset
     loss: AbstractLoss
     effort: Effort
-    say: Say
+    log: Log
     pieces: tuple[int, ...] = ()
     """Recording that every sequence is a piece of; empty: each is a recording."""
     until: float = math.inf
@@ -91,9 +90,9 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
     posterior = e_step(now.model, every, smoother, key=before.state.key)
     whole = np.asarray(kept(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    found = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
+    fit = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
     if whole.all():
-        return found, whole
+        return fit, whole
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
     loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.loud)
@@ -106,7 +105,7 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
-    return found._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
+    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
 def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:
@@ -134,7 +133,7 @@ def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:
             pass
     if context.loss.predicts:
         state = _predicting(context, now, state)
-    context.say(f"  fitted over the whole length in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
+    context.log(f"  fitted over the whole length in {state.epoch - 1} epochs: {state.loglik[-1]:.1f} nat per sequence")
     return state
 
 

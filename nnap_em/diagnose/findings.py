@@ -109,8 +109,8 @@ def findings(closed: Closed) -> list[Finding]:
             "share_of_error": found.share,
         }
         beside = drawn is None and rest is not None
-        told = Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest, form or remains, beside)
-        out.append(told)
+        one = Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest, form or remains, beside)
+        out.append(one)
     return out
 
 
@@ -207,15 +207,15 @@ class Dispute(NamedTuple):
 def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
     """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
-    for told in [one for step in closed.last for one in step.disputed][:most]:
-        name, joint, channel, inputs = told.key
-        against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in told.against))
+    for dispute in [one for step in closed.last for one in step.disputed][:most]:
+        name, joint, channel, inputs = dispute.key
+        against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
-            f"{words(told.key)} would remove {told.share:.0%} of the prediction error, but {listed(against)} "
-            f"{'says' if len(against) == 1 else 'say'} the opposite (up to {told.harm:.0%} more error)"
+            f"{words(dispute.key)} would remove {dispute.share:.0%} of the prediction error, but {listed(against)} "
+            f"{'says' if len(against) == 1 else 'log'} the opposite (up to {dispute.harm:.0%} more error)"
         )
         key = catalogue[name].key()
-        out.append(Dispute(key, joint, channel, list(inputs), told.share, against, told.harm, text))
+        out.append(Dispute(key, joint, channel, list(inputs), dispute.share, against, dispute.harm, text))
     return out
 
 
@@ -266,7 +266,7 @@ def advice(
     out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     out += [MORE] if suspects else []
     out += [f"To see a {each.law} by itself: {each.confirm}" for each in suspects if each.confirm]
-    out += [f"{told.description}: look at what is different there." for told in disputed]
+    out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
     for finding in found:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")

@@ -89,9 +89,9 @@ class Hypothesis(NamedTuple):
 
     def because(self, place: int, found: Found) -> "Hypothesis":
         """The same with the evidence of the effect at `place`."""
-        told = list(self.found)
-        told[place] = found
-        return self._replace(found=tuple(told))
+        evidence = list(self.found)
+        evidence[place] = found
+        return self._replace(found=tuple(evidence))
 
 
 def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:

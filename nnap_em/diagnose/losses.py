@@ -113,21 +113,21 @@ class MultiStep(AbstractLoss):
         track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
         along = candidate_columns(_machine(fit), candidates)
         every = tuple(sorted(set(sum(self.bands, ()))))
-        found = forks(
+        predictions = forks(
             followed(model, weights.prior, path, data),
             weights,
             lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),
             every,
         )
         size = len(weights.nodes.ravel()) + len(weights.prior.names) + sum(len(c.probes) for c in candidates)
-        rows, weight = starts(model, data, every), weighed(found, fit.used)
+        rows, weight = starts(model, data, every), weighed(predictions, fit.used)
         bands = [[every.index(h) for h in band] for band in self.bands]
         return tuple(
             Linearised(
-                _flat(found.error[:, :, band]),
-                _flat(found.columns[:, :, band, :, :size], 1),
+                _flat(predictions.error[:, :, band]),
+                _flat(predictions.columns[:, :, band, :, :size], 1),
                 _flat(weight[:, :, band]),
-                float(np.mean(found.overlap[band])),
+                float(np.mean(predictions.overlap[band])),
                 rows,
             )
             for band in bands
@@ -161,8 +161,8 @@ class OneStep(AbstractLoss):
         common = (model.log_q, model.log_r, model.start, weights.nodes)
         parts = []
         for _, (local, own) in turns(len(data.t), here, track):  # columns of all at once fill the memory
-            found = each(_innovations, common, (local, own.middle, along(own)), together=1)
-            parts.append([np.asarray(a, np.float32) for a in found])
+            innovations = each(_innovations, common, (local, own.middle, along(own)), together=1)
+            parts.append([np.asarray(a, np.float32) for a in innovations])
         error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
         sound = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
         weight = (np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None] & sound[:, None, None]).astype(
@@ -202,12 +202,12 @@ def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
 
 def _innovations(common, one) -> tuple[Float[Array, "time obs"], Float[Array, "time obs column"]]:
     """Whitened innovations of one sequence and what friction nodes, parameters and candidates take off them."""
-    (log_q, log_r, start, nodes), (here, middle, found) = common, one
+    (log_q, log_r, start, nodes), (here, middle, columns) = common, one
     dof = nodes.shape[0]
     filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
-    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
+    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, columns.force)
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
     states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-    read = read_columns(nodes, here, middle, found)
+    read = read_columns(nodes, here, middle, columns)
     states = jnp.where(here.seq.active[:, None, None], states, 0.0)
     return filtered.innovation, whitened_sensitivities(filtered, states, read, here.seq.observed)

@@ -26,20 +26,20 @@ def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMSt
         y = np.asarray(context.data.y)[..., i]
         step = grid_step(y.ravel())
         model = cast(StateSpaceModel, state.best if state else now.model)
-        told, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
-        share = step**2 / 12 / (told**2 if told else max(now_r - step**2 / 12, 0.25 * now_r))
+        declared, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
+        share = step**2 / 12 / (declared**2 if declared else max(now_r - step**2 / 12, 0.25 * now_r))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
         if share < 0.1 or gain < ONE_STEP.nats:
             continue
-        context.say(f"  {channel} comes in steps of {step:.4g}")
+        context.log(f"  {channel} comes in steps of {step:.4g}")
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
         found = Found(float(gain), float(gain), 0.0)
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         now = now.refitted(early).plus(effect, candidate, found)
-        if told:
-            log_r = now.model.log_r.at[i].set(math.log(told**2 + step**2 / 12))
+        if declared:
+            log_r = now.model.log_r.at[i].set(math.log(declared**2 + step**2 / 12))
             now = now.refitted(eqx.tree_at(lambda m: m.log_r, now.model, log_r))
         state = extend(context, now, first)
     return now, state

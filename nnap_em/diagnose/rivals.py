@@ -11,6 +11,7 @@ from ..data.dataset import Dataset
 from ..effects import AbstractEffect
 from ..em.identify import Identified, finished
 from ..em.memory import extended
+from ..storage.log import silent
 from .context import EFFORT, SearchContext, extend, smooth
 from .hypothesis import Hypothesis
 from .keys import Key, key_of
@@ -99,7 +100,7 @@ def _settled(fitted: Identified, data: Dataset) -> Identified:
 
 
 def _context(fitted: Identified, data: Dataset) -> SearchContext:
-    return SearchContext(fitted, {}, data, OneStep(), EFFORT, lambda text: None)
+    return SearchContext(fitted, {}, data, OneStep(), EFFORT, silent)
 
 
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:

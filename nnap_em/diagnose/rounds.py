@@ -72,7 +72,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
-def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+def _accepted(sound: list[Refit], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
     """Choose among laws that the screen cannot distinguish.
 
     The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
@@ -86,14 +86,14 @@ def _accepted(sound: list[Refit], found: Round, fit: SmoothedFit, context: Searc
     rivals = [case for case in even if other_cause(case.effect, law, fit.model.system)]
     if rivals and context.loss.predicts:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
-        context.say(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
-        return found._replace(step=found.step._replace(rivals=keys))
-    candidates = [s.candidate.start for s in found.screen.screened]
-    parts = zip(candidates, overlaps(found.screen, best.screened), strict=True)
+        context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
+        return outcome._replace(step=outcome.step._replace(rivals=keys))
+    candidates = [s.candidate.start for s in outcome.screen.screened]
+    parts = zip(candidates, overlaps(outcome.screen, best.screened), strict=True)
     same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EVEN_NATS)]
     same += [key_of(case.effect) for case in even if case.effect.named and best.gain - case.gain < EVEN_NATS]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
-    return Round(found.step._replace(accepted=key_of(best.effect)), found.screen, best, equivalent)
+    return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
 
 
 def _entries(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
@@ -174,12 +174,12 @@ def _log(case: Refit, context: SearchContext) -> None:
     """One line on a refit."""
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
     share, reason = case.screened.share.least, case.rejection
-    context.say(
+    context.log(
         f"  refitted {words(key_of(case.effect))} {values}: {share:.1%} of the squared error before the refit, "
         f"{case.removed:.1%} after it ({case.gain:.0f} nat); bar {case.screened.bar:.1%}"
     )
     if reason is not None:
-        context.say(f"  {words(key_of(case.effect))} {reason.sentence}")
+        context.log(f"  {words(key_of(case.effect))} {reason.sentence}")
 
 
 def _removals(tried: Sequence[Refit]) -> tuple[tuple[Key, float], ...]:

@@ -100,35 +100,35 @@ def spans(candidates: Sequence[Candidate]) -> list[slice]:
 
 
 def project(
-    found: Linearised,
+    linearised: Linearised,
     fold: Int[np.ndarray, "seq time"],
     block: Int[np.ndarray, "seq time"],
     precision: Float[np.ndarray, "nuisance nuisance"],
     pull: Float[np.ndarray, " nuisance"],
 ) -> Rows:
     """Errors and candidates without the part that the nuisance explains under its prior."""
-    keep = found.weight > 0
+    keep = linearised.weight > 0
     step = int(block.max(initial=0)) + 1
     cell = np.broadcast_to((fold * step + block)[:, :, None], keep.shape)[keep]
-    order, root = np.argsort(cell, kind="stable"), np.sqrt(found.weight[keep])
-    error = (root * found.error[keep])[order]
-    columns = (root[:, None] * found.columns[keep])[order].astype(float)
+    order, root = np.argsort(cell, kind="stable"), np.sqrt(linearised.weight[keep])
+    error = (root * linearised.error[keep])[order]
+    columns = (root[:, None] * linearised.columns[keep])[order].astype(float)
     nuisance, own = columns[:, : len(pull)], columns[:, len(pull) :]
     factor = np.linalg.cholesky(nuisance.T @ nuisance + precision)
     solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
     error = error - nuisance @ solve(nuisance.T @ error - pull)
-    return Rows(error, own - nuisance @ solve(nuisance.T @ own), cell[order], step, found.overlap)
+    return Rows(error, own - nuisance @ solve(nuisance.T @ own), cell[order], step, linearised.overlap)
 
 
-def shifted(found: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
+def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
     """Errors beside candidate columns of another time of their own sequence.
 
     The columns behind the first `nuisance` ones are rolled over the moments of each sequence, by a quarter to three
     quarters of them: they keep their size, their colour and their number, and lose their meaning.  What is rolled over
     the end changes its sign, since a constant would keep its meaning.
     """
-    columns = found.columns.copy()
-    for weight, own in zip(found.weight, columns, strict=True):
+    columns = linearised.columns.copy()
+    for weight, own in zip(linearised.weight, columns, strict=True):
         at = np.flatnonzero((weight > 0).any(axis=1))
         if len(at) < SHIFTABLE:
             own[..., nuisance:] = 0.0  # too few to lose their meaning: they take no part
@@ -137,7 +137,7 @@ def shifted(found: Linearised, nuisance: int, rng: np.random.Generator) -> Linea
         moved = np.roll(own[at][..., nuisance:], by, axis=0)
         moved[:by] *= -1
         own[at, ..., nuisance:] = moved
-    return found._replace(columns=columns)
+    return linearised._replace(columns=columns)
 
 
 class _Sums(NamedTuple):
@@ -242,15 +242,16 @@ def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
     precision, pull = friction_prior(model, weights)
     timed = ["time" in c.start.signals(model.system) for c in candidates]
     out = []
-    for found in loss.linearise(fit, candidates):
-        fold, block = parts(model, fit.path, fit.data, fit.used, fit.recording, found.rows)
+    for linearised in loss.linearise(fit, candidates):
+        fold, block = parts(model, fit.path, fit.data, fit.used, fit.recording, linearised.rows)
         rng, of = np.random.default_rng(0), lambda one: project(one, fold, block, precision, pull)  # noqa: B023
-        rows = of(found)
+        rows = of(linearised)
         real = shares(rows, candidates, timed)
-        moved = (of(shifted(found, len(pull), rng)) for _ in range(shifts))
+        moved = (of(shifted(linearised, len(pull), rng)) for _ in range(shifts))
         placebos = tuple(shares(one, candidates, timed) for one in moved)
         columns = rows.columns.astype(np.float32)
-        independent, held = len(rows.error) / rows.overlap, members(fold, np.asarray((found.weight > 0).any(axis=2)))
+        independent = len(rows.error) / rows.overlap
+        held = members(fold, np.asarray((linearised.weight > 0).any(axis=2)))
         out.append(_Band(real, placebos, columns.T @ columns, independent, held))
     return tuple(out)
 
@@ -282,12 +283,12 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
 
 
 def _screened(
-    found: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float, independent: float
+    shares: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float, independent: float
 ) -> Iterator[Screened]:
     for i, (candidate, here) in enumerate(zip(candidates, spans(candidates), strict=True)):
-        share = Share(float(found.inside[i]), float(found.left_out[i]), tuple(found.folds[i].tolist()))
-        directions = round(float(found.directions[i]))
-        yield Screened(candidate, found.coefficients[here], directions, share, band, floor, chance, independent)
+        share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
+        directions = round(float(shares.directions[i]))
+        yield Screened(candidate, shares.coefficients[here], directions, share, band, floor, chance, independent)
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:

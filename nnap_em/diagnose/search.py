@@ -18,11 +18,12 @@ from ..em.identify import Identified, finished, identify
 from ..em.loop import EMState, FitError
 from ..em.noise import white_readings
 from ..model.state_space import StateSpaceModel
-from ..numerics.programs import let_go
+from ..numerics.programs import release_programs
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
 from ..storage.deadline import TimeUp, until
-from .context import EFFORT, SHORT, Effort, Say, SearchContext, Stages, extend, smooth
+from ..storage.log import Log, renamed, silent
+from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, replaced, rest_of, words
 from .losses import AbstractLoss, MultiStep, OneStep
@@ -36,23 +37,23 @@ from .verdict import Rejection, explains, needed
 
 def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
     """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
-    let_go()
+    release_programs()
     fit, whole = smooth(context, now, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
-    context.say(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
+    context.log(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
     added = sum(not effect.read_off for effect in now.model.effects)
     if not fit.used.any() or added >= context.effort.most:
         return now
-    found = screening_round(fit, context)
-    steps.append(found.step)
-    if found.step.untried:
+    outcome = screening_round(fit, context)
+    steps.append(outcome.step)
+    if outcome.step.untried:
         raise TimeUp
-    return now if found.accepted is None else _with(now, found.accepted, _found(found, context.loss), context)
+    return now if outcome.accepted is None else _with(now, outcome.accepted, _found(outcome, context.loss), context)
 
 
 def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
     """`now` with a refitted law; a named law whose remainder explains the larger part of both gives way to that."""
-    context.say(f"  added {words(key_of(case.effect))}")
+    context.log(f"  added {words(key_of(case.effect))}")
     m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, now.m_step.tie)  # under the old hold on noise
     following, rest = case.after._replace(m_step=m_step), rest_of(case.effect, now.model)
     form = replaced(case.effect, now.model)
@@ -64,7 +65,7 @@ def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) ->
     following = following.because(-1, both)
     if form is not None:  # its place is taken already
         return following
-    context.say(f"  {words(key_of(now.model.effects[cast(int, rest)]))} is a part of it, and is removed")
+    context.log(f"  {words(key_of(now.model.effects[cast(int, rest)]))} is a part of it, and is removed")
     return following.without(cast(int, rest))
 
 
@@ -73,14 +74,14 @@ def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
     return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
 
 
-def _found(found: Round, loss: AbstractLoss) -> Found:
+def _found(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
-    case = cast(Refit, found.accepted)
+    case = cast(Refit, outcome.accepted)
     screened, directions = case.screened, max(case.screened.directions, 1)
-    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * found.step.tried)
+    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * outcome.step.tried)
     left_out = screened.share.left_out
     held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
-    return Found(case.gain, held_out, p_value, found.equivalent, share, case.removed)
+    return Found(case.gain, held_out, p_value, outcome.equivalent, share, case.removed)
 
 
 def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
@@ -100,7 +101,7 @@ def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
             break
         name = words(key_of(now.model.effects[least]))
         reason = f"without it {lost[least]:.1%} of the squared error is lost, {floor:.1%} counts"
-        context.say(f"  {name} is removed: {reason if lost[least] > -math.inf else Rejection('impossible').sentence}")
+        context.log(f"  {name} is removed: {reason if lost[least] > -math.inf else Rejection('impossible').sentence}")
         now = now.without(least)
     return now
 
@@ -144,7 +145,7 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     try:
         return apart(closed, data)
     except FitError as error:
-        context.say(f"  equivalent laws could not be compared over the whole length ({error})")
+        context.log(f"  equivalent laws could not be compared over the whole length ({error})")
         return closed
 
 
@@ -153,7 +154,7 @@ def _by_one_step(context: SearchContext, now: Hypothesis, state: EMState | None)
     found = _search(context._replace(loss=OneStep()), now, state, _ladder(context))
     white = white_innovations(_outcome(context.before, found.now, found.state), context.data)
     if not white:
-        context.say(
+        context.log(
             "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
         )
     return found if white else None
@@ -164,7 +165,7 @@ def _quantised(context: SearchContext) -> tuple[Hypothesis, EMState | None]:
     try:
         return quantised(context, context.declared)
     except FitError as error:
-        context.say(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
+        context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         return context.declared, None
 
 
@@ -227,12 +228,12 @@ def _search(context: SearchContext, now: Hypothesis, state: EMState | None, leng
                     if more.found is now.found:
                         return _Searched(now, state, steps)
         except TimeUp:
-            context.say("the time is up: the search is not finished")
+            context.log("the time is up: the search is not finished")
             return _Searched(now, state, steps, complete=False)
         try:
             now, state = more, extend(context, more, length) if more.found else None
         except FitError as error:
-            context.say(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
+            context.log(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
             return _Searched(now, state, steps)
         if _names(now) in searched:
@@ -240,13 +241,14 @@ def _search(context: SearchContext, now: Hypothesis, state: EMState | None, leng
         ahead = [longest]
 
 
+@renamed(say="log")
 def close_the_loop(
     rig: Rig,
     data: Dataset,
     *,
     key: PRNGKeyArray,
     effort: Effort = EFFORT,
-    say: Say = lambda text: None,
+    log: Log = silent,
     seconds: float = math.inf,
 ) -> Closed:
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
@@ -258,14 +260,14 @@ def close_the_loop(
     """
     end = time.monotonic() + seconds
     if rig.memory:  # the search has a law with memory of its own
-        say("friction is learned as a static map; the search tries memory as the law presliding_friction")
+        log("friction is learned as a static map; the search tries memory as the law presliding_friction")
         rig = dataclasses.replace(rig, memory=False)
     data = jax.device_put(data)
     stages: Stages = {}
 
     def watch(seen: Stages, state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
         seen[rows] = (state, used)
-        say(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+        log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}
@@ -275,12 +277,12 @@ def close_the_loop(
         return outcome
 
     if len(data.t) < 2:
-        say("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
+        log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
     if white_readings(data, before.model):
-        return search(SearchContext(before, stages, data, MultiStep(), effort, say, until=end), white=True)
+        return search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True)
     before, data, touches, pieces = disturbance_free(identified, before, data)
     if touches:
-        say(f"{len(touches)} external disturbances: their rows are left out")
-    closed = search(SearchContext(before, stages, data, MultiStep(), effort, say, pieces, end), white=False)
+        log(f"{len(touches)} external disturbances: their rows are left out")
+    closed = search(SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), white=False)
     return closed._replace(interventions=touches, pieces=pieces)

@@ -14,8 +14,8 @@ from .base import Around, Candidate, JointEffect, Scalar, a, known, one
 
 def varieties(around: Around, name: str) -> list[tuple[int, float]]:
     """Joints at which the system has the variation `name`, and its typical size."""
-    found = [(j, size) for (kind, j), (_, size) in around.system.variations.items() if kind == name]
-    return [(j, float(size(around.system))) for j, size in found]
+    sizes = [(j, size) for (kind, j), (_, size) in around.system.variations.items() if kind == name]
+    return [(j, float(size(around.system))) for j, size in sizes]
 
 
 class Variation(JointEffect):

@@ -146,11 +146,11 @@ class LoadFriction(JointEffect):
 
     def values(self):
         mu, load, stribeck, load_stribeck = self._shares()
-        told = {"mu": mu, "mu_load": load, "mu_stribeck": stribeck, "mu_load_stribeck": load_stribeck}
+        numbers = {"mu": mu, "mu_load": load, "mu_stribeck": stribeck, "mu_load_stribeck": load_stribeck}
         if self.log_velocity is not None:
-            told["stribeck_velocity"] = jnp.exp(self.log_velocity)
-        told |= {"square_motor": self.square_motor, "square_load": self.square_load}
-        return {name: value for name, value in told.items() if value is not None}
+            numbers["stribeck_velocity"] = jnp.exp(self.log_velocity)
+        numbers |= {"square_motor": self.square_motor, "square_load": self.square_load}
+        return {name: value for name, value in numbers.items() if value is not None}
 
     def _shares(self) -> tuple[Scalar | None, ...]:
         """Coefficients of motor and load, steady and at rest; None: no such number."""

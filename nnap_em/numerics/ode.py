@@ -86,5 +86,5 @@ def apart(
     def again(carry, _):
         return (carry[0], tuple(function(jnp.stack(carry[0])))), None
 
-    (_, found), _ = jax.lax.scan(again, (tuple(x), (jnp.zeros((), x.dtype),) * count), None, length=2)
-    return found
+    (_, results), _ = jax.lax.scan(again, (tuple(x), (jnp.zeros((), x.dtype),) * count), None, length=2)
+    return results

@@ -22,24 +22,24 @@ class Profile:
         self.spent: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
         self._began = time.perf_counter()
 
-    def __call__(self, event: str, duration_secs: float, **told: str | int) -> None:
+    def __call__(self, event: str, duration_secs: float, **labels: str | int) -> None:
         """One event, as `jax.monitoring` reports it."""
         if event in STAGES:
-            name = str(told.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
+            name = str(labels.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
             self.spent[name][STAGES[event]].append(duration_secs)
 
     def __str__(self) -> str:
         whole = time.perf_counter() - self._began
         row = lambda *cells: "{:32.32} {:>8} {:>9} {:>9} {:>9}".format(*cells)  # noqa: E731
-        tell = lambda stages: [f"{sum(stages[stage]):.2f}" for stage in STAGES.values()]  # noqa: E731
+        seconds = lambda stages: [f"{sum(stages[stage]):.2f}" for stage in STAGES.values()]  # noqa: E731
         order = sorted(self.spent.items(), key=lambda one: -sum(map(sum, one[1].values())))
         programs = [(name, stages) for name, stages in order if stages["compile"]]
         every = {stage: [s for _, stages in order for s in stages[stage]] for stage in STAGES.values()}
         return "\n".join(
             [
                 row("program", "count", "trace s", "lower s", "compile s"),
-                *(row(name, len(stages["compile"]), *tell(stages)) for name, stages in programs),
-                row(f"all of {len(programs)} names", len(every["compile"]), *tell(every)),
+                *(row(name, len(stages["compile"]), *seconds(stages)) for name, stages in programs),
+                row(f"all of {len(programs)} names", len(every["compile"]), *seconds(every)),
                 f"{whole:.1f} s in all; a program within another is traced with it, and counts in both",
             ]
         )

@@ -1,11 +1,11 @@
-"""Compiled programs hold memory maps, and a process may have 65,530 of them: those no longer needed are let go."""
+"""Compiled programs hold memory maps, and a process may have 65,530 of them: those no longer needed are released."""
 
 from pathlib import Path
 
 import jax
 
 MOST = 40_000
-"""Maps beyond which programs are let go; a large one holds some hundred."""
+"""Maps beyond which programs are released; a large one holds some hundred."""
 
 
 def maps() -> int:
@@ -16,7 +16,7 @@ def maps() -> int:
         return 0
 
 
-def let_go(most: int = MOST) -> bool:
+def release_programs(most: int = MOST) -> bool:
     """Drop all compiled programs where they hold more than `most` maps; what is needed again is compiled again."""
     if maps() <= most:
         return False

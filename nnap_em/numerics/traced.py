@@ -27,8 +27,8 @@ STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
 
 
 @runtime_checkable
-class Shelf(Protocol):
-    """Folder of programs between runs."""
+class Cache(Protocol):
+    """Cache of programs between runs."""
 
     def get(self, key: str) -> bytes | None:
         """Entry under this key, if any."""
@@ -39,16 +39,16 @@ class Shelf(Protocol):
         ...
 
 
-class _Kept:
-    """The shelf in use, and the programs made ready in this process."""
+class _Programs:
+    """The cache in use, and the programs made ready in this process."""
 
-    shelf: ClassVar[Shelf | None] = None
+    cache: ClassVar[Cache | None] = None
     ready: ClassVar[dict[Any, Callable]] = {}
 
 
-def keep_on(shelf: Shelf | None) -> None:
-    """Keep programs there from here on; None: nowhere, as at first.  Commands do."""
-    _Kept.shelf = shelf
+def use_cache(cache: Cache | None) -> None:
+    """Keep traced programs in `cache` from here on; None: nowhere, as at first.  Commands do."""
+    _Programs.cache = cache
 
 
 def traced(run: Callable, function: Callable) -> Callable:
@@ -57,18 +57,18 @@ def traced(run: Callable, function: Callable) -> Callable:
 
     def call(*arguments):
         leaves, structure = jax.tree.flatten(arguments)
-        if _Kept.shelf is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if _Programs.cache is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
             return plain(*arguments)
         known = function, structure, tuple(_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
-        if known not in _Kept.ready:
-            _Kept.ready[known] = _ready(run, function, arguments, _Kept.shelf) or (lambda *_: plain(*arguments))
-        return _Kept.ready[known](*(leaf for leaf in leaves if eqx.is_array(leaf)))
+        if known not in _Programs.ready:
+            _Programs.ready[known] = _ready(run, function, arguments, _Programs.cache) or (lambda *_: plain(*arguments))
+        return _Programs.ready[known](*(leaf for leaf in leaves if eqx.is_array(leaf)))
 
     return call
 
 
-def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> Callable | None:
-    """The program, from the shelf or traced and laid there; None where it cannot be kept."""
+def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> Callable | None:
+    """The program, from the cache, or traced and put there; None where it cannot be kept."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, inside = jax.tree.flatten(dynamic)
     try:
@@ -76,24 +76,24 @@ def _ready(run: Callable, function: Callable, arguments: Any, shelf: Shelf) -> C
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
-    found = _unpacked(shelf.get(key))
-    if found is None:
-        told = []
+    entry = _unpacked(cache.get(key))
+    if entry is None:
+        structures = []
 
         def flat(*arrays):
             out, outside = jax.tree.flatten(run(*eqx.combine(jax.tree.unflatten(inside, arrays), static)))
-            told.append(outside)
+            structures.append(outside)
             return out
 
         flat.__name__ = flat.__qualname__ = run.__name__
         try:
             exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
-            shelf.put(key, pickle.dumps((bytes(exported.serialize()), told[-1])))
+            cache.put(key, pickle.dumps((bytes(exported.serialize()), structures[-1])))
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
-        found = exported, told[-1]
-    exported, outside = found
+        entry = exported, structures[-1]
+    exported, outside = entry
 
     def again(*arrays):
         return exported.call(*arrays)
@@ -146,9 +146,9 @@ class _Telling(pickle.Pickler):
 @functools.cache
 def _surroundings() -> bytes:
     """The package's text, what it stands on and how JAX is set, as one number."""
-    package, told = Path(__file__).resolve().parents[1], hashlib.sha256()
+    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        told.update(str(path.relative_to(package)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
     versions = [f"{name} {importlib.metadata.version(name)}" for name in STANDS_ON]
-    told.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
-    return told.digest()
+    digest.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
+    return digest.digest()

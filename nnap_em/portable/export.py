@@ -178,8 +178,8 @@ def unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments:
     wanted = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):
-        found = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
-    for mine, truth in zip((found,) if len(wanted) == 1 else found, wanted, strict=True):
+        outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
+    for mine, truth in zip((outputs,) if len(wanted) == 1 else outputs, wanted, strict=True):
         flat = np.asarray(truth, np.float64).reshape(4, -1)
         own = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
         bound = math.sqrt(jnp.finfo(truth.dtype).eps)

@@ -123,13 +123,15 @@ def _fit(
     columns += [sign * np.exp(-((v / dip) ** 2))] if dip else []
     columns += [np.ones_like(v), -np.ones_like(v)] if constant else []
     basis = np.stack(columns, axis=1)
-    found, _ = scipy.optimize.nnls(basis * weight[:, None], -torque * weight)
-    rest = torque + basis @ found
+    coefficients, _ = scipy.optimize.nnls(basis * weight[:, None], -torque * weight)
+    rest = torque + basis @ coefficients
     share = np.sqrt(np.average(rest**2, weights=weight) / max(np.average(torque**2, weights=weight), 1e-300))
-    offset = found[-1] - found[-2] if constant else 0.0
-    breakaway = found[0] + (found[2] if dip else 0.0)
+    offset = coefficients[-1] - coefficients[-2] if constant else 0.0
+    breakaway = coefficients[0] + (coefficients[2] if dip else 0.0)
     top = np.max(np.abs(v))
-    return FrictionForm(*map(float, (found[0], breakaway, dip or 1.0, found[1], offset, smooth, top, share)))
+    return FrictionForm(
+        *map(float, (coefficients[0], breakaway, dip or 1.0, coefficients[1], offset, smooth, top, share))
+    )
 
 
 def _finer(

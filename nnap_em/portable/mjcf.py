@@ -85,8 +85,8 @@ def write_model(
     ]
     root = _model(sheet, motors_of(fitted, system))
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
-    said = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
-    root.insert(0, ET.Comment(said.replace("--", "- -")))
+    comment = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
+    root.insert(0, ET.Comment(comment.replace("--", "- -")))
     ET.indent(root)
     if acting and acting.plays:
         replace_text(beside(out), acting.text)
@@ -223,9 +223,9 @@ def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.El
         if float(mass) > 0:
             full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
             ET.SubElement(own, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
-        for spot in machine.spots:
-            if spot.body == i:
-                ET.SubElement(own, "site", name=spot.name, pos=_text(*spot.place))
+        for site in machine.sites:
+            if site.body == i:
+                ET.SubElement(own, "site", name=site.name, pos=_text(*site.place))
     return places
 
 
@@ -354,11 +354,11 @@ def _bristled(own: JointSheet) -> bool:
 
 def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], world: ET.Element, step: float) -> None:
     machine = sheet.system.machine
-    named = {gauge.name for gauge in machine.gauges}
-    for gauge in machine.gauges:
-        kind = "jointvel" if gauge.rate else "jointpos"
-        given = {"name": gauge.name, "joint": machine.joints[gauge.joint].name}
-        ET.SubElement(sensors, kind, given | _reading(sheet.sensors.get(gauge.name), step))
+    named = {sensor.name for sensor in machine.joint_sensors}
+    for sensor in machine.joint_sensors:
+        kind = "jointvel" if sensor.rate else "jointpos"
+        given = {"name": sensor.name, "joint": machine.joints[sensor.joint].name}
+        ET.SubElement(sensors, kind, given | _reading(sheet.sensors.get(sensor.name), step))
     dof = len(machine.joints)
     for name, sensor in sheet.sensors.items():
         if name in named or name not in machine.states or not sensor.delay:
@@ -367,13 +367,13 @@ def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], wo
         kind = "jointvel" if place >= dof else "jointpos"
         given = {"name": name, "joint": machine.joints[place % dof].name}
         ET.SubElement(sensors, kind, given | _reading(sensor, step))
-    for name, sense in {one.name.rpartition(".")[0]: one for one in machine.senses}.items():
-        axes = _text(*(row[0] for row in sense.turn), *(row[1] for row in sense.turn))
-        where = places[sense.body] if sense.body >= 0 else world
-        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sense.place), xyaxes=axes)
-        at = {"objtype": "site", "objname": f"{name}_site"} if sense.kind == "framepos" else {"site": f"{name}_site"}
+    for name, sensor in {one.name.rpartition(".")[0]: one for one in machine.sensors}.items():
+        axes = _text(*(row[0] for row in sensor.turn), *(row[1] for row in sensor.turn))
+        where = places[sensor.body] if sensor.body >= 0 else world
+        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sensor.place), xyaxes=axes)
+        at = {"objtype": "site", "objname": f"{name}_site"} if sensor.kind == "framepos" else {"site": f"{name}_site"}
         reading = next((sheet.sensors[f"{name}.{x}"] for x in "xyz" if f"{name}.{x}" in sheet.sensors), None)
-        ET.SubElement(sensors, sense.kind, {"name": name, **at, **_reading(reading, step)})
+        ET.SubElement(sensors, sensor.kind, {"name": name, **at, **_reading(reading, step)})
 
 
 def _reading(sensor: SensorSheet | None, step: float) -> dict[str, str]:

@@ -143,9 +143,9 @@ def _smooth(model: Model, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
     affine = _affine(model, *path, u)
     reading = (*_linear(model.reading, path[0], u, model.parameters), path[0])
     mean, cov = np.repeat(model.mean[None], count, 0), np.repeat(model.cov[None], count, 0)
-    *found, loglik = _filter(model, mean, cov, u, y, model.log_q, affine, reading)
+    *filtered, loglik = _filter(model, mean, cov, u, y, model.log_q, affine, reading)
     best = np.argmax(np.where(np.isfinite(loglik), loglik, -np.inf))
-    mean, cov = _backwards(*found)
+    mean, cov = _backwards(*filtered)
     return mean[best], cov[best]
 
 
@@ -270,9 +270,9 @@ def main(model: Model) -> None:
     u, y = (
         np.array([column(name) for name in names]).T.reshape(len(time), -1) for names in (model.inputs, model.measured)
     )
-    found = predict(model, time, u, y, args.given, seed=args.seed)
+    prediction = predict(model, time, u, y, args.given, seed=args.seed)
     names = model.states[: 2 * len(model.nodes)] + model.sensors
     with open(args.out, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["time", *names, *(f"{name}_std" for name in names)])
-        writer.writerows(np.column_stack([time, found.mean, found.std]).tolist())
+        writer.writerows(np.column_stack([time, prediction.mean, prediction.std]).tolist())

@@ -73,8 +73,8 @@ class _Writer:
         if not any(isinstance(value, str) for value in values):
             with np.errstate(all="ignore"):
                 # the forms are the constants above
-                found = eval(form.format(*map(_text, values)), {"np": np, "inf": np.inf, "nan": np.nan})
-            return found.item() if isinstance(found, np.ndarray) else found
+                number = eval(form.format(*map(_text, values)), {"np": np, "inf": np.inf, "nan": np.nan})
+            return number.item() if isinstance(number, np.ndarray) else number
         if (plain := _simpler(form, values)) is not None:
             return plain
         key = (form, *((type(value), value) for value in values))
@@ -153,8 +153,8 @@ def _run(
         return _array(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     for equation in jaxpr.eqns:
-        found = _equation(writer, equation, [read(atom) for atom in equation.invars])
-        values |= dict(zip(equation.outvars, found, strict=True))
+        outputs = _equation(writer, equation, [read(atom) for atom in equation.invars])
+        values |= dict(zip(equation.outvars, outputs, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -222,8 +222,8 @@ def _converted(old: str, new: str) -> str:
 def _constant(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Numbers alone: JAX computes them."""
     typed = [jnp.asarray(x.tolist(), _dtype(atom)) for x, atom in zip(operands, equation.invars, strict=True)]
-    found = equation.primitive.bind(*typed, **equation.params)
-    return [_array(x) for x in (found if equation.primitive.multiple_results else [found])]
+    outputs = equation.primitive.bind(*typed, **equation.params)
+    return [_array(x) for x in (outputs if equation.primitive.multiple_results else [outputs])]
 
 
 def _each(writer: _Writer, form: str, operands: list[np.ndarray]) -> np.ndarray:
@@ -277,11 +277,11 @@ def _move(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
             raise UnrollError(f"JAX's {name!r} moves numbers to where other numbers say")
         else:
             places.append(jnp.asarray(operand.tolist(), _dtype(atom)))
-    found = equation.primitive.bind(*places, **equation.params)
+    indices = equation.primitive.bind(*places, **equation.params)
     values = np.array(pool, object)
     return [
         np.asarray(values[np.asarray(x, int)], object)
-        for x in (found if equation.primitive.multiple_results else [found])
+        for x in (indices if equation.primitive.multiple_results else [indices])
     ]
 
 
@@ -294,8 +294,8 @@ def _scatter(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray
     first = neutral + 1
     count = jnp.arange(first, first + other.size).reshape(other.shape)
     index = jnp.asarray(where.tolist(), _dtype(equation.invars[1]))
-    found = equation.primitive.bind(jnp.full(base.shape, neutral), index, count, **equation.params)
-    places = np.asarray(found - neutral, int)
+    scattered = equation.primitive.bind(jnp.full(base.shape, neutral), index, count, **equation.params)
+    places = np.asarray(scattered - neutral, int)
     if sorted(places[places > 0]) != list(range(1, other.size + 1)):
         raise UnrollError(f"JAX's {equation.primitive.name!r} changes one number several times")
     return _each(writer, form, [base, np.array([neutral, *other.ravel()], object)[places]])
@@ -307,11 +307,11 @@ def _cond(writer: _Writer, branches: Sequence[core.ClosedJaxpr], operands: list[
     if not _symbolic(which):
         return _run(writer, *_opened(branches[int(which.item())]), rest)
     first, *others = (_run(writer, *_opened(branch), rest) for branch in branches)
-    for k, found in enumerate(others, 1):
+    for k, other in enumerate(others, 1):
         held = _each(writer, "{} == {}", [which, np.asarray(k, object)])
         first = [
             _each(writer, _ELEMENTWISE["select_n"], [np.broadcast_to(held, b.shape), a, b])
-            for a, b in zip(first, found, strict=True)
+            for a, b in zip(first, other, strict=True)
         ]
     return first
 
@@ -329,8 +329,8 @@ def _scan(writer: _Writer, given: dict[str, Any], operands: list[np.ndarray]) ->
     rows: list[list[np.ndarray]] = []
     order = range(given["length"])
     for k in reversed(order) if given["reverse"] else order:
-        found = _run(writer, *_opened(given["jaxpr"]), [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
-        carry = found[:carried]
-        rows.append(found[carried:])
+        outputs = _run(writer, *_opened(given["jaxpr"]), [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
+        carry = outputs[:carried]
+        rows.append(outputs[carried:])
     rows = rows[::-1] if given["reverse"] else rows
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]

@@ -85,11 +85,11 @@ def _curve(curve: Curve, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _number(each: Number, names: Sequence[str]) -> dict[str, Any]:
-    told = zip(names, each.value.tolist(), each.std.tolist(), strict=True)
+    rows = zip(names, each.value.tolist(), each.std.tolist(), strict=True)
     return {
         "name": each.name,
         "unit": each.unit,
-        "fits": {name: {"value": value, "std": std} for name, value, std in told if math.isfinite(value)},
+        "fits": {name: {"value": value, "std": std} for name, value, std in rows if math.isfinite(value)},
         "pooled": {part: float(values[0]) for part, values in each.pooled._asdict().items()},
         "test": None if each.test is None else _test(each.test),
         "changed": each.changed,
@@ -130,9 +130,9 @@ def _along(curve: Curve, count: int) -> Iterator[dict[str, Any]]:
 
 
 def _row(each: Number, inner: bool) -> dict[str, Any]:
-    told = zip(each.value.tolist(), each.std.tolist(), strict=True)
+    pairs = zip(each.value.tolist(), each.std.tolist(), strict=True)
     unit = f" [{each.unit}]" if each.unit not in ("", "-") else ""
-    values = [with_std(value, std) if math.isfinite(value) else "–" for value, std in told]
+    values = [with_std(value, std) if math.isfinite(value) else "–" for value, std in pairs]
     return {"name": each.name + unit, "inner": inner, "values": values} | _pooled(each.pooled)
 
 
@@ -160,7 +160,7 @@ def table(comparison: Comparison) -> str:
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     # the name of a curve stands over its empty columns
     widths[0] = max(len(line[0]) for line in lines if any(line[1:-2]))
-    text = [comparison.verdict, *(f"Warning: {told}." for told in comparison.warnings)]
+    text = [comparison.verdict, *(f"Warning: {warning}." for warning in comparison.warnings)]
     text += ["", *(_aligned(line, widths) for line in lines), "", LEGEND]
     return comparison.fits[0].fitted.rig.named("\n".join(text))
 

@@ -1,7 +1,6 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +9,17 @@ from scipy import stats
 
 from ..data.formats import write_csv
 from ..design.experiment import Design
-from ..design.questions import Told, after
+from ..design.questions import Information, after
 from ..diagnose.keys import key_of, listed, words
 from ..numerics.digits import number
 from ..residual.residual import names_of
 from ..storage.files import replace_text
+from ..storage.log import Log
 from .design_plots import bands_figure, motion_figure
 from .document import versions
 from .page import Picture, picture, rendered
 from .tables import write_json
 
-Say = Callable[[str], None]
 INPUTS, MOTIONS = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
 NOTED = 1.1
@@ -29,7 +28,7 @@ ACROSS = 3
 """Sequences in one figure."""
 
 
-def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, say: Say) -> None:
+def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, log: Log) -> None:
     """Write a designed experiment into the folder `out`; `began` is `time.perf_counter()` at the start."""
     files = _write_sequences(out, design)
     document = describe(design) | {
@@ -44,8 +43,8 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     write_json(out / "design.json", document, named)
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
     replace_text(out / "design.html", named(text))
-    say(document["verdict"])
-    say(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
+    log(document["verdict"])
+    log(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
 
 
 def _write_sequences(out: Path, design: Design) -> list[str]:
@@ -75,7 +74,7 @@ def describe(design: Design) -> dict[str, Any]:
     states, inputs = system.coordinates + system.rates, fitted.rig.input_columns
     force = dict(zip(inputs, (system.force_unit(joint) for joint in system.joints), strict=True))
     limits = design.limits
-    told = {
+    document = {
         "format": 1,
         "rig": fitted.rig.name,
         "system": fitted.rig.system,
@@ -89,29 +88,29 @@ def describe(design: Design) -> dict[str, Any]:
             "rate": dict(zip(inputs, map(float, limits.rate), strict=True)),
             "declared": sorted({*fitted.rig.limits.values, *fitted.rig.limits.rate, *fitted.rig.limits.start}),
         },
-        "friction": friction_told(design) if fitted.rig.friction else [],
-        "parameters": parameters_told(design),
-        "apart": apart_told(design),
+        "friction": friction_entries(design) if fitted.rig.friction else [],
+        "parameters": parameter_entries(design),
+        "apart": pair_entries(design),
     }
-    return told | {"verdict": _verdict(told)}
+    return document | {"verdict": _verdict(document)}
 
 
 def _ranges(names, low, high) -> dict[str, list[float]]:
     return {name: [float(a), float(b)] for name, a, b in zip(names, low, high, strict=True)}
 
 
-def _sides(design: Design) -> dict[str, Told]:
+def _sides(design: Design) -> dict[str, Information]:
     """Uncertainty now, and after each of two experiments."""
-    return {"now": design.nothing, "expected": design.told, "same_time_of_old_inputs": design.old}
+    return {"now": design.nothing, "expected": design.expected, "same_time_of_old_inputs": design.old}
 
 
-def friction_told(design: Design) -> list[dict[str, Any]]:
+def friction_entries(design: Design) -> list[dict[str, Any]]:
     """Standard deviation of the friction of every joint over the velocities, now and after."""
     nodes, cov = np.asarray(design.fit.nodes), np.asarray(design.fit.cov)
     weight = design.friction_weight
     stds = {
-        side: np.sqrt(np.diagonal(after(cov, told.information))[: nodes.size]).reshape(nodes.shape)
-        for side, told in _sides(design).items()
+        side: np.sqrt(np.diagonal(after(cov, info.information))[: nodes.size]).reshape(nodes.shape)
+        for side, info in _sides(design).items()
     }
     out = []
     for j, v in enumerate(nodes):
@@ -127,7 +126,7 @@ def friction_told(design: Design) -> list[dict[str, Any]]:
     return out
 
 
-def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
+def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
     """Value and standard deviation of every estimated parameter, now and after."""
     prior, model = design.fit.prior, design.fit.model
     if not prior.size:
@@ -136,7 +135,7 @@ def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
     std = np.asarray(prior.std)
     value = np.asarray(prior.mean + prior.std * prior.read(model))
     stds = {
-        side: std * np.sqrt(np.diagonal(after(cov, told.information))[cut:]) for side, told in _sides(design).items()
+        side: std * np.sqrt(np.diagonal(after(cov, info.information))[cut:]) for side, info in _sides(design).items()
     }
     labels, units = [], []
     for name, place in zip(prior.names, prior.places(model), strict=True):
@@ -153,11 +152,11 @@ def parameters_told(design: Design) -> dict[str, dict[str, Any]]:
     }
 
 
-def apart_told(design: Design) -> list[dict[str, Any]]:
+def pair_entries(design: Design) -> list[dict[str, Any]]:
     """Distance of every pair of rivals, and the probability that the wrong one is likelier."""
     if design.apart is None:
         return []
-    far = {side: design.apart.distance(told) for side, told in _sides(design).items()}
+    far = {side: design.apart.distance(info) for side, info in _sides(design).items()}
     out = []
     for i, pair in enumerate(design.rivals):
         both = {side: float(np.min(d[2 * i : 2 * i + 2])) for side, d in far.items() if side != "now"}
@@ -166,32 +165,32 @@ def apart_told(design: Design) -> list[dict[str, Any]]:
     return out
 
 
-def _verdict(told: dict[str, Any]) -> str:
+def _verdict(document: dict[str, Any]) -> str:
     """Use of the experiment, in one sentence."""
     gains = []
-    if told["friction"]:
+    if document["friction"]:
         ratios = [
             (
                 f["near_rest"]["now"] / f["near_rest"]["expected"],
                 f["near_rest"]["now"] / f["near_rest"]["same_time_of_old_inputs"],
             )
-            for f in told["friction"]
+            for f in document["friction"]
         ]
         best, old = (listed([number(r[i], 2) for r in ratios]) for i in range(2))
-        joints = "joints " + listed([str(f["joint"]) for f in told["friction"]]) if len(ratios) > 1 else "the joint"
+        joints = "joints " + listed([str(f["joint"]) for f in document["friction"]]) if len(ratios) > 1 else "the joint"
         gains.append(
             f"the friction band near rest of {joints} {best} times narrower (as much time of the old inputs: {old})"
         )
-    surer = {name: p["now"] / p["expected"] for name, p in told["parameters"].items() if p["expected"] > 0}
+    surer = {name: p["now"] / p["expected"] for name, p in document["parameters"].items() if p["expected"] > 0}
     told_most = sorted((name for name, times in surer.items() if times > NOTED), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
-    for pair in told["apart"]:
+    for pair in document["apart"]:
         wrong, old = pair["told_wrong"]["expected"], pair["told_wrong"]["same_time_of_old_inputs"]
         gains.append(
             f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
         )
     gains = gains or ["hardly anything surer: widen [limits], or give more --seconds"]
-    what = f"{told['sequences']} sequences of {number(told['seconds_each'])} s"
+    what = f"{document['sequences']} sequences of {number(document['seconds_each'])} s"
     return f"{what} should make {listed(gains)}."
 
 

@@ -21,19 +21,19 @@ def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
         "std_same_time_of_old_inputs": (READING, "old inputs"),
         "std_expected": (AFTER, "designed"),
     }
-    for ax, told, rate in zip(grid, friction, names.rates, strict=True):
+    for ax, entry, rate in zip(grid, friction, names.rates, strict=True):
         for side, (colour, label) in sides.items():
-            ax.plot(told["velocity"], told[side], color=colour, label=label)
-        ax.set_xscale("symlog", linthresh=told["near_rest_below"])
+            ax.plot(entry["velocity"], entry[side], color=colour, label=label)
+        ax.set_xscale("symlog", linthresh=entry["near_rest_below"])
         ax.set_yscale("log")
         ax.axvspan(
-            -told["near_rest_below"], told["near_rest_below"], color="#F1F1F1", lw=0, zorder=0, label="near rest"
+            -entry["near_rest_below"], entry["near_rest_below"], color="#F1F1F1", lw=0, zorder=0, label="near rest"
         )
         ax.set(
             xlabel=f"velocity {symbol(rate)} [{names.unit(rate)}]",
-            ylabel=f"std of friction [{names.force_unit(told['joint'])}]",
+            ylabel=f"std of friction [{names.force_unit(entry['joint'])}]",
         )
-        ax.set_title(names.joint(told["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
+        ax.set_title(names.joint(entry["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
     head(figure, "How well friction is known", list(grid))
     return figure
 

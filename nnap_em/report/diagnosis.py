@@ -20,6 +20,7 @@ from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.files import replace_text
+from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
@@ -27,8 +28,6 @@ from .friction_plots import friction_figure
 from .page import MOST, ROOM, Picture, page, picture
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
-
-Say = Callable[[str], None]
 
 
 def write_diagnosis(
@@ -40,7 +39,7 @@ def write_diagnosis(
     *,
     seed: int,
     began: float,
-    say: Say,
+    log: Log,
 ) -> None:
     """Write the report of a closed loop into the folder `out`; `began` is `time.perf_counter()` at the start."""
     names, both = names_of(closed.before), {"before": closed.before, "after": closed.after}
@@ -51,7 +50,7 @@ def write_diagnosis(
         error.setdefault("after", error["before"])
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
     lacked = left["after"].without_effects() if found else left["before"]
-    told = {name: tests(each, names) for name, each in left.items()}
+    tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
     nodes = visited_nodes(velocities)
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if closed.before.rig.friction}
@@ -64,7 +63,7 @@ def write_diagnosis(
         *_search_pictures(closed.steps, closed.before.rig.named),
     ]
     disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
-    failed = sum(t.p_value < 0.01 and not t.slight for t in told["before"])
+    failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     document = shared(closed.before, train, test, seed=seed, began=began) | {
         "verdict": verdict(found, error, failed, rivals, suspects, closed.complete),
         "complete": closed.complete,
@@ -74,7 +73,7 @@ def write_diagnosis(
         "models": {name: f"{name}.npz" for name in both},
         "visited": visited(closed.before, velocities, train) if closed.before.rig.friction else None,
         "friction_change": friction_change(closed, nodes),
-        "tests": {name: [t._asdict() for t in each] for name, each in told.items()},
+        "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
@@ -86,8 +85,8 @@ def write_diagnosis(
     named = closed.before.rig.named
     write_json(out / "report.json", document, named)
     replace_text(out / "report.html", named(page(document, figures)))
-    say(document["verdict"])
-    say(f"wrote {out / 'report.html'} and report.json")
+    log(document["verdict"])
+    log(f"wrote {out / 'report.html'} and report.json")
 
 
 def _error_pictures(
@@ -185,19 +184,19 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
     return {
         "horizon_s": step.horizon * dt,
         "measure": step.measure,
-        "screened": [_told(*each) for each in step.screened[:10]],
-        "refitted": [_told(*each) for each in step.refitted],
+        "screened": [_screened(*each) for each in step.screened[:10]],
+        "refitted": [_screened(*each) for each in step.refitted],
         "accepted": words(step.accepted) if step.accepted else None,
         "untried": step.untried,
     }
 
 
 def _touch(touch: Intervention, files: Sequence[str]) -> dict[str, Any]:
-    told = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
-    return {"file": files[touch.sequence], **told, "size": touch.size, "std": touch.std, "unit": touch.unit}
+    interval = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
+    return {"file": files[touch.sequence], **interval, "size": touch.size, "std": touch.std, "unit": touch.unit}
 
 
-def _told(key: Key, gain: float) -> dict[str, Any]:
+def _screened(key: Key, gain: float) -> dict[str, Any]:
     return _place(key) | {"gain": gain}
 
 
@@ -206,7 +205,7 @@ def _place(key: Key) -> dict[str, Any]:
     return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs)}
 
 
-def _velocities(found: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
+def _velocities(residuals: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
     """Velocities on the paths that took part."""
-    inside = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
-    return found.state[inside][:, dof : 2 * dof]
+    inside = residuals.valid & residuals.used[:, None] & np.isfinite(residuals.state).all(axis=-1)
+    return residuals.state[inside][:, dof : 2 * dof]

@@ -92,8 +92,8 @@ def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str,
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Any]:
     """Errors of the predictions, for every column and horizon."""
-    found = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items() if test}
-    return {"given_s": GIVEN, "horizons_s": list(HORIZONS), **found}
+    by_model = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items() if test}
+    return {"given_s": GIVEN, "horizons_s": list(HORIZONS), **by_model}
 
 
 def friction_law(fitted: Identified, table: FrictionTable) -> list[dict[str, Any]]:

@@ -9,15 +9,15 @@ from .style import AFTER, READING, ZERO, band, head, styled, symbol
 
 
 @styled
-def effect_figure(found: Curve) -> Figure:
+def effect_figure(curve: Curve) -> Figure:
     """A learned function with its 90 % band."""
     figure = Figure(figsize=(5.4, 3.4), layout="constrained")
     ax = figure.subplots()
-    band(ax, found.x, found.mean, found.std, AFTER, "learned")
+    band(ax, curve.x, curve.mean, curve.std, AFTER, "learned")
     ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
-    signal = " + ".join(symbol(name) for name in found.signal.split(" + "))
-    ax.set(xlim=(found.x[0], found.x[-1]), xlabel=f"{signal} [{found.signal_unit}]")
-    ax.set_ylabel(f"force at joint {found.joint} [{found.unit}]")
+    signal = " + ".join(symbol(name) for name in curve.signal.split(" + "))
+    ax.set(xlim=(curve.x[0], curve.x[-1]), xlabel=f"{signal} [{curve.signal_unit}]")
+    ax.set_ylabel(f"force at joint {curve.joint} [{curve.unit}]")
     head(figure, "What was found", [ax])
     return figure
 

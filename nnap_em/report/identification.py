@@ -2,7 +2,6 @@
 
 import io
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ from ..em.identify import FrictionTable, Identified, friction_table
 from ..em.predict import smooth
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
+from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, visited
 from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, page, picture
 from .tables import visited_nodes, write_friction, write_json
-
-Say = Callable[[str], None]
 
 
 def write_identification(
@@ -36,7 +34,7 @@ def write_identification(
     smoother: str,
     seed: int,
     began: float,
-    say: Say,
+    log: Log,
 ) -> None:
     """Write the report of a fit whose model is model.npz in `out`; `began` is `time.perf_counter()` at the start."""
     figures: list[Picture] = []
@@ -74,10 +72,10 @@ def write_identification(
         "smoother": smoother,
         "model": "model.npz",
     }
-    _tell(document, say)
+    _log_summary(document, log)
     write_json(out / "report.json", document, fitted.rig.named)
     replace_text(out / "report.html", fitted.rig.named(page(document, figures)))
-    say(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
+    log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
 
 
 def _verdict(fitted: Identified, sequences: int) -> str:
@@ -91,17 +89,17 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}" + "s" * (count != 1)
 
 
-def _tell(document: dict[str, Any], say: Say) -> None:
+def _log_summary(document: dict[str, Any], log: Log) -> None:
     for law in document["friction_law"] or []:
-        say(law["text"])
+        log(law["text"])
     for text in document["friction_memory"]:
-        say(text)
+        log(text)
     error = document["error"] or {"fit": {}}
     for name, values in error["fit"].items():
         pairs = zip(error["horizons_s"], values, strict=True)
-        say(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
+        log(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
     for name, entry in document["parameters"].items():
-        say(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
+        log(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
 
 
 def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..data.recordings.bring import Brought, TopicFacts
 from ..data.recordings.declared import Plan
 from ..data.recordings.delays import Delay
+from ..data.recordings.resample import Resampled, TopicFacts
 from ..data.rig import Rig
 from ..numerics.digits import number
 from ..storage.files import replace_text
@@ -24,12 +24,18 @@ SURE = 4.0
 
 
 def describe(
-    logs: Sequence[Brought], files: Sequence[str], rig: Rig, plan: Plan, shifts: Mapping[str, float], *, seconds: float
+    logs: Sequence[Resampled],
+    files: Sequence[str],
+    rig: Rig,
+    plan: Plan,
+    shifts: Mapping[str, float],
+    *,
+    seconds: float,
 ) -> dict[str, Any]:
     """All that import.json holds; times in seconds after the first message of a log."""
     rest = iter(files)
-    told = [_log(log, rest) for log in logs]
-    rows = sum(s["rows"] for log in told for s in log["sequences"] if s["file"])
+    entries = [_log(log, rest) for log in logs]
+    rows = sum(s["rows"] for log in entries for s in log["sequences"] if s["file"])
     return {
         "format": 1,
         "rig": rig.name,
@@ -37,8 +43,8 @@ def describe(
         "input": "mean" if plan.mean else "hold",
         "shifts": dict(shifts),
         "rows_used": rows,
-        "rows_dropped": sum(log["rows"] for log in told) - rows,
-        "logs": told,
+        "rows_dropped": sum(log["rows"] for log in entries) - rows,
+        "logs": entries,
         "look": list(_look(logs, rig)),
         "seconds": seconds,
         "versions": versions(),
@@ -57,7 +63,7 @@ def write_page(folder: Path, document: Mapping[str, Any]) -> None:
     replace_text(folder / "import.html", rendered("import.html.j2", document=document, pictures=[figure]))
 
 
-def _log(log: Brought, files: Iterator[str]) -> dict[str, Any]:
+def _log(log: Resampled, files: Iterator[str]) -> dict[str, Any]:
     return {
         "file": log.path.name,
         "origin_ns": log.origin,
@@ -73,11 +79,11 @@ def _log(log: Brought, files: Iterator[str]) -> dict[str, Any]:
 
 
 def _topic(topic: TopicFacts) -> dict[str, Any]:
-    told = topic._asdict()
-    return told | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
+    entry = topic._asdict()
+    return entry | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
 
 
-def _look(logs: Sequence[Brought], rig: Rig) -> Iterator[str]:
+def _look(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
     """Warnings for the owner before a fit."""
     for log in logs:
         for entry in log.delays:

@@ -72,7 +72,7 @@ def picture(place: str, title: str, caption: str, figure: Figure, choice: str = 
 
 def _rounded(svg: bytes) -> bytes:
     """The drawing with paths and marks to a hundredth of a point: four fifths of the size."""
-    short = lambda found: _DIGITS.sub(rb"\1", found[0])  # noqa: E731
+    short = lambda match: _DIGITS.sub(rb"\1", match[0])  # noqa: E731
     return _PLACES.sub(short, svg)
 
 
@@ -87,14 +87,14 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     for picture in pictures:
         if picture.place not in PLACES:
             raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")
-    error, found = document.get("error") or {}, document.get("effects") or []
+    error, effects = document.get("error") or {}, document.get("effects") or []
     parameters = document.get("parameters") or {}
     return rendered(
         "page.html.j2",
         document=document,
         fitted="effects" not in document and "model" in document,
         pictures=pictures,
-        effects=found,
+        effects=effects,
         errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
         tiles=_error_tiles(document) + _test_tiles(document),
         failed=_failures(document.get("tests")),
@@ -195,8 +195,8 @@ def _doubted(document: Mapping[str, Any]) -> bool:
 
 def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
     """Certainty of the finding in words; empty where it is unknown."""
-    told = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
-    decisive = next(((scale, value) for _, scale, value in told if finite(value)), None)
+    rows = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
+    decisive = next(((scale, value) for _, scale, value in rows if finite(value)), None)
     if decisive is None:
         return ""
     if doubted:
@@ -225,5 +225,5 @@ def _width(image: bytes) -> int:
     """Width in CSS pixels; 0 where it is unknown.  PNG is taken for 150 dots per inch."""
     if image.startswith(b"\x89PNG"):
         return round(struct.unpack(">I", image[16:20])[0] * 96 / 150) if len(image) >= 24 else 0
-    found = re.search(rb"<svg\b[^>]*?\swidth=[\"']([0-9.]+)(pt|in|px)?[\"']", image[:4000])
-    return round(float(found[1]) * _SVG_UNITS.get(found[2], 1.0)) if found else 0
+    match = re.search(rb"<svg\b[^>]*?\swidth=[\"']([0-9.]+)(pt|in|px)?[\"']", image[:4000])
+    return round(float(match[1]) * _SVG_UNITS.get(match[2], 1.0)) if match else 0

@@ -63,24 +63,24 @@ class _Cause(NamedTuple):
         return _Cause(self.label, (self.values + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _causes(found: Residual, names: Names) -> Iterator[_Cause]:
+def _causes(residual: Residual, names: Names) -> Iterator[_Cause]:
     dof = len(names.coordinates)
     rotary = [j for j in range(dof) if names.rotary[j]]
     for j, name in enumerate(names.coordinates):
-        yield _Cause(f"{symbol(name)} [{names.unit(name)}]", found.state[..., j], names.rotary[j])
+        yield _Cause(f"{symbol(name)} [{names.unit(name)}]", residual.state[..., j], names.rotary[j])
     if len(rotary) > 1:
         label = " + ".join(symbol(names.coordinates[j]) for j in rotary) if len(rotary) < 4 else "sum of all angles"
-        yield _Cause(f"{label} [rad]", found.state[..., rotary].sum(-1), True)
+        yield _Cause(f"{label} [rad]", residual.state[..., rotary].sum(-1), True)
     for j, name in enumerate(names.rates):
-        yield _Cause(f"{symbol(name)} [{names.unit(name)}]", found.state[..., dof + j])
+        yield _Cause(f"{symbol(name)} [{names.unit(name)}]", residual.state[..., dof + j])
     for i, name in enumerate(names.inputs):
-        yield _Cause(f"input {name} [{names.unit(name)}]", found.u[..., i])
-    yield _Cause("time [s]", found.t)
+        yield _Cause(f"input {name} [{names.unit(name)}]", residual.u[..., i])
+    yield _Cause("time [s]", residual.t)
 
 
-def _followed(found: Residual) -> Residual:
+def _followed(residual: Residual) -> Residual:
     """Sequences that are followed; all where there is none."""
-    return (found if found.used.any() else found._replace(used=~found.used)).followed()
+    return (residual if residual.used.any() else residual._replace(used=~residual.used)).followed()
 
 
 _Side = tuple[Residual, str, str]
@@ -152,10 +152,10 @@ def residual_figure(
 def _panels(sides: Sequence[_Side], names: Names, joint: int, bins: int) -> list[_Panel]:
     """The force at one joint against every cause."""
     out = []
-    for causes in zip(*(_causes(found, names) for found, _, _ in sides), strict=True):
+    for causes in zip(*(_causes(residual, names) for residual, _, _ in sides), strict=True):
         kind, edges, wrapped = _scale(causes[0], sides[0][0].force[..., joint], bins)
         values = [(cause.wrapped() if wrapped else cause).values for cause in causes]
-        forces = [found.force[..., joint] for found, _, _ in sides]
+        forces = [residual.force[..., joint] for residual, _, _ in sides]
         out.append(_Panel(kind, edges, wrapped, [_binned(x, r, edges) for x, r in zip(values, forces, strict=True)]))
     return out
 
@@ -170,9 +170,9 @@ def _draw(ax: Axes, panel: _Panel, sides: Sequence[_Side], *, bold: bool) -> Non
     ax.set(xlabel=panel.kind.label, xlim=(panel.edges[0], panel.edges[-1]))
     if panel.kind.turn or panel.wrapped:
         _turn_ticks(ax, panel.edges)
-    told = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO)
+    share = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO)
     if bold:
-        told.set(color="#222222", weight="bold")
+        share.set(color="#222222", weight="bold")
 
 
 def _reach(curves: Sequence[_Bins]) -> float:
@@ -228,7 +228,7 @@ def innovation_figure(before: Residual, names: Names, after: Residual | None = N
     figure = Figure(figsize=(7.4 if pairs == 1 else 10.4, 2.3 * deep + 0.7), layout="constrained")
     grid = figure.subplots(deep, 2 * pairs, squeeze=False).reshape(-1, 2)
     for i, ((across, quantile), name) in enumerate(zip(grid, names.measured, strict=False)):
-        errors = [(found.innovation[..., i], colour, label) for found, colour, label in sides]
+        errors = [(residual.innovation[..., i], colour, label) for residual, colour, label in sides]
         _autocorrelations(across, errors)
         _quantiles(quantile, errors)
         across.set(ylabel=f"{symbol(name)}\nautocorrelation [-]", xlabel="lag [samples]")
@@ -244,14 +244,14 @@ _Errors = Sequence[tuple[Float[np.ndarray, "_ _"], str, str]]  # the two fits ma
 
 
 def _autocorrelations(ax: Axes, errors: _Errors) -> None:
-    found = [(*autocorrelation(e, LAGS), colour, label) for e, colour, label in errors]
-    bound = 1.96 / np.sqrt(np.maximum(found[0][1][1:], 1))
+    correlations = [(*autocorrelation(e, LAGS), colour, label) for e, colour, label in errors]
+    bound = 1.96 / np.sqrt(np.maximum(correlations[0][1][1:], 1))
     ax.fill_between(
         np.arange(1, bound.size + 1), -bound, bound, color="#DDDDDD", lw=0, label="95 % bounds if independent"
     )
-    for r, _, colour, label in found:
+    for r, _, colour, label in correlations:
         dotted(ax, np.arange(1, r.size), r[1:], colour, label)
-    reach = max(0.1, *(1.15 * float(np.max(np.abs(r[1:]), initial=0)) for r, *_ in found))
+    reach = max(0.1, *(1.15 * float(np.max(np.abs(r[1:]), initial=0)) for r, *_ in correlations))
     ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
     ax.set(ylim=(-reach, reach), xlim=(0.5, LAGS + 0.5))
 

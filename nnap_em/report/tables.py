@@ -17,8 +17,8 @@ INNER = (0.5, 99.5)
 """Percentiles of the rows between which a range counts as visited."""
 
 
-def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], str] = str) -> None:
-    """Write JSON whole or not at all, texts as `told` returns them; values that are not finite become null."""
+def write_json(path: Path, document: Mapping[str, Any], naming: Callable[[str], str] = str) -> None:
+    """Write JSON whole or not at all, texts as `naming` returns them; values that are not finite become null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -26,7 +26,7 @@ def write_json(path: Path, document: Mapping[str, Any], told: Callable[[str], st
         if isinstance(value, list | tuple):
             return [clean(item) for item in value]
         if isinstance(value, str):
-            return told(value)
+            return naming(value)
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -46,37 +46,37 @@ def white_innovations(fitted: Identified, data: Dataset) -> bool:
     return bool(sizes) and max(map(abs, sizes)) < WHITE
 
 
-def causes(found: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
+def causes(residual: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
     """Names and values of all, known one row before, that the innovations of a right model do not depend on."""
     for i, name in enumerate(names.inputs):
-        before = np.concatenate([np.full_like(found.u[:, :1, i], np.nan), found.u[:, :-1, i]], axis=1)
+        before = np.concatenate([np.full_like(residual.u[:, :1, i], np.nan), residual.u[:, :-1, i]], axis=1)
         yield name, before
     dof = len(names.coordinates)
     for j, name in enumerate(names.coordinates):
-        q = found.predicted[..., j]
+        q = residual.predicted[..., j]
         if names.rotary[j]:
             yield f"sin({name})", np.sin(q)
             yield f"cos({name})", np.cos(q)
         else:
             yield name, q
     for j, name in enumerate(names.rates):
-        v = found.predicted[..., dof + j]
+        v = residual.predicted[..., dof + j]
         yield name, v
         yield f"|{name}| {name}", np.abs(v) * v
-    yield "time", found.t
+    yield "time", residual.t
 
 
-def tests(found: Residual, names: Names) -> list[Test]:
+def tests(residual: Residual, names: Names) -> list[Test]:
     """All tests of the innovations of every measured channel, over the sequences that did not diverge."""
-    found = found.followed()
+    residual = residual.followed()
     rows: list[tuple[str, str, tuple[float, float, float]]] = []
     for i, channel in enumerate(names.measured):
-        e = found.innovation[..., i] if found.t.size else np.zeros((0, 0))
+        e = residual.innovation[..., i] if residual.t.size else np.zeros((0, 0))
         if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
             continue
         rows += [("whiteness", channel, whiteness(e)), ("normality", channel, normality(e))]
         rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
-        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(found, names)]
+        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(residual, names)]
     corrected = holm([p for _, _, (_, p, _) in rows])
     out = []
     for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):

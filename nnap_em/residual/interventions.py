@@ -123,11 +123,11 @@ class Places(NamedTuple):
         return (self.seq != self.seq[at]) | (np.abs(self.row - self.row[at]) >= apart)
 
 
-def places(found: Residual, names: Names, dt: float) -> Places:
+def places(residual: Residual, names: Names, dt: float) -> Places:
     """One place every `STEP` of all sequences, where the state is known."""
     dof = len(names.coordinates)
-    q, v, u = found.state[..., :dof], found.state[..., dof:], averaged(found.u, max(3, round(WIDTHS[0] / dt)))
-    seq, row = np.nonzero(np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1) & found.valid)
+    q, v, u = residual.state[..., :dof], residual.state[..., dof:], averaged(residual.u, max(3, round(WIDTHS[0] / dt)))
+    seq, row = np.nonzero(np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1) & residual.valid)
     keep = row % max(1, round(STEP / dt)) == 0
     seq, row = seq[keep], row[keep]
 
@@ -177,17 +177,17 @@ def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, apart: in
 
 
 def disturbances(
-    found: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"], bar: float = LEVEL
+    residual: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"], bar: float = LEVEL
 ) -> tuple[Intervention, ...]:
     """External disturbances in the missing force, in the order of recordings and times.
 
     The geometric mean of two numbers is at least `bar` standard deviations: the size of the force, and its difference
     from the force on neighbours in state space at other moments.  `least`: smallest size for each joint [N m, or N].
     """
-    known = found.valid & found.used[:, None] & np.isfinite(found.state).all(axis=-1)
-    force = np.where(known[..., None], found.force, np.nan)
+    known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
+    force = np.where(known[..., None], residual.force, np.nan)
     force[:, 0] = np.nan  # no reading before it fixes the start
-    here, apart = places(found._replace(valid=known), names, dt), max(1, round(APART / dt))
+    here, apart = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
     if not here.seq.size:
         return ()
     place, counts = neighbours(here, apart)
@@ -206,7 +206,7 @@ def disturbances(
             beside = np.maximum(min(first, row) - here.row, here.row - max(last, row))
             reach = np.asarray(lengths)[:, None] // 2  # of a window: those beside it average the same push
             sure = np.where((here.seq == i) & (beside[None] <= reach), 0.0, sure)
-            clock = float(found.t[i, first]), float(found.t[i, last])
+            clock = float(residual.t[i, first]), float(residual.t[i, last])
             touch = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
             again = any(overlap(touch, other) for other in out)
             if not again and repeated(means[k], here, int(at), apart) < REPEATED:

@@ -17,7 +17,7 @@ ROUNDS = 3
 
 
 def without(
-    data: Dataset, found: tuple[Intervention, ...], dt: float, *, restart: bool = True
+    data: Dataset, disturbances: tuple[Intervention, ...], dt: float, *, restart: bool = True
 ) -> tuple[Dataset, tuple[int, ...]]:
     """The recordings cut at the disturbances, and the recording that every piece comes from.
 
@@ -28,7 +28,7 @@ def without(
     pieces: list[tuple[int, int, int]] = []
     for i, valid in enumerate(np.asarray(data.valid)):
         use = np.append(valid, False)
-        for touch in found:
+        for touch in disturbances:
             if touch.sequence == i:
                 use[max(0, touch.first - margin) : touch.last + margin + 1] = False
         edges = np.flatnonzero(np.diff(np.concatenate([[False], use]).astype(int)))
@@ -58,16 +58,18 @@ def disturbance_free(
 
     `fitted` is the fit of all rows.
     """
-    used, found, pieces = data, interventions(fitted, data), tuple(range(len(data.t)))
-    for _ in range(ROUNDS if found else 0):
-        cut, of = without(data, found, fitted.rig.dt, restart=not fitted.rig.start)
+    used, disturbances, pieces = data, interventions(fitted, data), tuple(range(len(data.t)))
+    for _ in range(ROUNDS if disturbances else 0):
+        cut, of = without(data, disturbances, fitted.rig.dt, restart=not fitted.rig.start)
         try:
             fitted = fit(cut) if of else fitted
         except FitError:  # too few rows are left: the fit of all rows stays
             break
         used, pieces = (cut, of) if of else (used, pieces)
-        more = [t for t in interventions(fitted, data, MORE * LEVEL) if not any(overlap(t, old) for old in found)]
+        more = [
+            t for t in interventions(fitted, data, MORE * LEVEL) if not any(overlap(t, old) for old in disturbances)
+        ]
         if not more:
             break
-        found = tuple(sorted([*found, *more], key=in_order))
-    return fitted, used, found, pieces
+        disturbances = tuple(sorted([*disturbances, *more], key=in_order))
+    return fitted, used, disturbances, pieces

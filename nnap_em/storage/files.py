@@ -150,9 +150,9 @@ def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.nd
     return header, arrays
 
 
-def refuse(path: Path, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, problem: str, hint: str) -> NoReturn:
     """Raise StoreError."""
-    raise StoreError(f"{path}: {found}; {mend}")
+    raise StoreError(f"{path}: {problem}; {hint}")
 
 
 def _checksum(header: bytes, arrays: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -76,14 +76,14 @@ class Journal:
         blanks, structure = jax.tree.flatten(form)
         if len(entries) != len(blanks):
             refuse(path, f"{len(entries)} numbers and arrays, not {len(blanks)}", _AGAIN)
-        told = enumerate(zip(entries, blanks, strict=True))
-        return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in told])
+        leaves = enumerate(zip(entries, blanks, strict=True))
+        return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in leaves])
 
     def keep(self, name: str, outcome: Any) -> None:
         """Write an outcome."""
-        told = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
-        arrays = {str(i): array for i, (_, array) in enumerate(told) if array is not None}
-        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in told]}
+        leaves = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
+        arrays = {str(i): array for i, (_, array) in enumerate(leaves) if array is not None}
+        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in leaves]}
         write_arrays(self.folder / f"{name}.npz", KIND, header, arrays)
 
     def _read(self, path: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
@@ -97,8 +97,8 @@ class Journal:
                 option = isinstance(value, int) or name.startswith("--")
                 made = f"with {name} {other}, not {value}" if option else f"from another {name}"
                 again = f"resume with {name} {other}" if other is not None else f"resume without {name}"
-                mend = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
-                refuse(path, f"made {made}", f"{mend}, or give another --out")
+                hint = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
+                refuse(path, f"made {made}", f"{hint}, or give another --out")
         return header["leaves"], arrays
 
 
@@ -141,10 +141,10 @@ def digest(*trees: Any) -> str:
 
     Raises TypeError for objects that cannot be distinguished.
     """
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
 
     def feed(text: str, content: bytes = b"") -> None:
-        found.update(f"{text}\0".encode() + content)
+        sha256.update(f"{text}\0".encode() + content)
 
     def walk(node: Any) -> None:
         kind = f"{type(node).__module__}.{type(node).__qualname__}"
@@ -174,4 +174,4 @@ def digest(*trees: Any) -> str:
             raise TypeError(f"{kind} cannot be told from another of its kind")
 
     walk(trees)
-    return found.hexdigest()
+    return sha256.hexdigest()

@@ -29,7 +29,7 @@ class AbstractSystem(eqx.Module):
     """Variations of a body: (effect, joint) to (system, amount) -> system and system -> typical amount."""
 
     spots: ClassVar[dict[int, Any]] = {}
-    """Places (`bodies.Spot`) of candidate loads of any mass and centre, by the joint that carries them, from 1."""
+    """Places (`bodies.LoadPoint`) of candidate loads of any mass and centre, by the joint that carries them, from 1."""
 
     sensors: ClassVar[dict[str, str]] = {}
     """Columns of sensors that are read beside coordinates and rates, in the order of `senses`, and their SI units."""

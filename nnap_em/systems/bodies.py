@@ -45,17 +45,17 @@ def carried_by(
 
     `loads`, by place of the body, are added to the bodies.
     """
-    found = [NOTHING] * len(layout.frames)
+    inertias = [NOTHING] * len(layout.frames)
     for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
             continue
         mass, centre, own = numbers(body, values)
         if any(name.startswith(f"{body.name}.") for name in values):
             mass = jnp.where(physical(mass, own), mass, jnp.nan)
-        found[mount.joint] = united(found[mount.joint], mounted(mass, centre, own, mount))
+        inertias[mount.joint] = united(inertias[mount.joint], mounted(mass, centre, own, mount))
         if place in loads:
-            found[mount.joint] = united(found[mount.joint], carried(loads[place], mount.place, mount.turn))
-    return found
+            inertias[mount.joint] = united(inertias[mount.joint], carried(loads[place], mount.place, mount.turn))
+    return inertias
 
 
 def mounted(mass: Scalar, centre: Three, own: Turn, mount: Mount) -> Inertia:
@@ -86,7 +86,7 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
         if not set(own) <= set(after):
             continue
         goal = numbers(body, after)
-        there = _told(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        there = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
         fine = physical(goal[0], goal[2])
         out |= {name: jnp.where(fine, after[name], one) for name, one in zip(own, there, strict=True)}
     return out
@@ -96,12 +96,12 @@ def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
     return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in own]))
 
 
-def _told(body: Numbers) -> list[Scalar]:
+def _in_order(body: Numbers) -> list[Scalar]:
     """Numbers in the order of `names`."""
     return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 
-class Spot(NamedTuple):
+class LoadPoint(NamedTuple):
     """Place of a candidate load on the body of a joint, and its typical size."""
 
     body: int
@@ -114,7 +114,7 @@ class Spot(NamedTuple):
     """Longest distance from a joint to what it carries [m]."""
 
 
-def spots(machine: Machine, layout: Layout) -> dict[int, Spot]:
+def spots(machine: Machine, layout: Layout) -> dict[int, LoadPoint]:
     """Every outermost joint, counted from 1, with its spot: the first site of its bodies, else its centre of mass."""
     inner = {frame.before for frame in layout.frames}
     moving = [(body, mount) for body, mount in zip(machine.bodies, layout.mounts, strict=True) if mount.joint >= 0]
@@ -126,9 +126,9 @@ def spots(machine: Machine, layout: Layout) -> dict[int, Spot]:
             continue
         place = machine.joints[j].body
         mount, body = layout.mounts[place], machine.bodies[place]
-        sites = sorted((s for s in machine.spots if layout.mounts[s.body].joint == j), key=lambda s: s.body != place)
+        sites = sorted((s for s in machine.sites if layout.mounts[s.body].joint == j), key=lambda s: s.body != place)
         points = [_moved(s.place, layout.mounts[s.body], mount) if s.body != place else s.place for s in sites]
-        out[j + 1] = Spot(place, next(iter(points), body.centre), mass, length)
+        out[j + 1] = LoadPoint(place, next(iter(points), body.centre), mass, length)
     return out
 
 
@@ -149,7 +149,7 @@ def _longest(layout: Layout, moving: Sequence[tuple[Body, Mount]]) -> float:
     return max(lengths, default=0.0)
 
 
-def load(spot: Spot, mass: Scalar, moment: Three) -> Inertia:
+def load(spot: LoadPoint, mass: Scalar, moment: Three) -> Inertia:
     """A point mass in the frame of a body, about its origin, by its mass and its first moment about a spot.
 
     With h = mass (c - point) its second moment is linear but for |h|^2 / mass.  That share fades out below `SLIGHT` of

@@ -46,7 +46,7 @@ class Layout(NamedTuple):
 def laid(text: str) -> Layout:
     """The layout of a machine in a text of `packed`."""
     machine = unpacked(text)
-    found: list[Frame] = []
+    frames: list[Frame] = []
     mounts: list[tuple[int, np.ndarray, np.ndarray]] = []
     for i, body in enumerate(machine.bodies):
         at, place, turn = mounts[body.parent] if body.parent >= 0 else (-1, np.zeros(3), np.eye(3))
@@ -55,11 +55,11 @@ def laid(text: str) -> Layout:
             if joint.body == i:
                 lined = turn @ aligned(joint.axis)
                 anchor = place + turn @ np.asarray(joint.anchor)
-                found.append(Frame(at, _three(anchor), _turn(lined), joint.slide))
+                frames.append(Frame(at, _three(anchor), _turn(lined), joint.slide))
                 at, turn = j, aligned(joint.axis).T
                 place = -turn @ np.asarray(joint.anchor)
         mounts.append((at, place, turn))
-    return Layout(tuple(found), tuple(Mount(at, _three(place), _turn(turn)) for at, place, turn in mounts))
+    return Layout(tuple(frames), tuple(Mount(at, _three(place), _turn(turn)) for at, place, turn in mounts))
 
 
 def aligned(axis: Vector) -> np.ndarray:

@@ -101,9 +101,9 @@ def motions(
     frames: Sequence[Frame], poses: Sequence[Pose], v: Sequence[Scalar], a: Sequence[Scalar], gravity: Three
 ) -> list[Motion]:
     """Motions of the frames of all joints; that of the base stands last, so that -1 finds it."""
-    found: list[Motion] = [Motion(ZERO, ZERO, scaled(-1.0, gravity))]
+    chain: list[Motion] = [Motion(ZERO, ZERO, scaled(-1.0, gravity))]
     for frame, pose, rate, more in zip(frames, poses, v, a, strict=True):
-        spin, turns, rise = found[frame.before]
+        spin, turns, rise = chain[frame.before]
         rise = add(rise, add(cross(turns, pose.place), cross(spin, cross(spin, pose.place))))
         spin, turns, rise = apply(pose.back, spin), apply(pose.back, turns), apply(pose.back, rise)
         own, gain = (0.0, 0.0, rate), (0.0, 0.0, more)
@@ -111,8 +111,8 @@ def motions(
             rise = add(rise, add(scaled(2.0, cross(spin, own)), gain))
         else:
             turns, spin = add(turns, add(cross(spin, own), gain)), add(spin, own)
-        found.insert(-1, Motion(spin, turns, rise))
-    return found
+        chain.insert(-1, Motion(spin, turns, rise))
+    return chain
 
 
 def newton_euler(

@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 
-from ..data.machine import Sense
+from ..data.machine import Sensor
 from .frames import Layout, Mount
 from .recursion import Motion, Pose
 from .spatial import Scalar, Three, add, apply, cross, product, transposed
@@ -13,17 +13,17 @@ from .spatial import Scalar, Three, add, apply, cross, product, transposed
 _BASE = Mount(-1, (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
 
-def seen(sense: Sense, layout: Layout, poses: Sequence[Pose], moving: Sequence[Motion]) -> Scalar:
+def seen(sensor: Sensor, layout: Layout, poses: Sequence[Pose], moving: Sequence[Motion]) -> Scalar:
     """The reading of a component [rad/s, m/s^2 or m]; `moving` as `motions` gives them."""
-    mount = layout.mounts[sense.body] if sense.body >= 0 else _BASE
-    place = add(mount.place, apply(mount.turn, sense.place))
-    if sense.kind == "framepos":
-        return _outward(layout, poses, mount.joint, place)[sense.axis]
+    mount = layout.mounts[sensor.body] if sensor.body >= 0 else _BASE
+    place = add(mount.place, apply(mount.turn, sensor.place))
+    if sensor.kind == "framepos":
+        return _outward(layout, poses, mount.joint, place)[sensor.axis]
     spin, turns, rise = moving[mount.joint]
     value = spin
-    if sense.kind == "accelerometer":
+    if sensor.kind == "accelerometer":
         value = add(rise, add(cross(turns, place), cross(spin, cross(spin, place))))
-    return apply(transposed(product(mount.turn, sense.turn)), value)[sense.axis]
+    return apply(transposed(product(mount.turn, sensor.turn)), value)[sensor.axis]
 
 
 def _outward(layout: Layout, poses: Sequence[Pose], joint: int, place: Three) -> Three:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, unpacked
 from ..data.units import quantities
 from .base import AbstractSystem
-from .bodies import Spot, carried_by, kept_physical, load, numbers, spots, with_load
+from .bodies import LoadPoint, carried_by, kept_physical, load, numbers, spots, with_load
 from .frames import laid
 from .recursion import Inertia, composite, motions, newton_euler, posed, solved, united
 from .sensing import seen
@@ -40,12 +40,12 @@ class Tree(AbstractSystem):
 
     @classmethod
     def declared(cls, parameters, joints, machine):
-        told = unpacked(machine)
-        dof = len(told.joints)
-        angles = tuple(not joint.slide for joint in told.joints)
+        compiled = unpacked(machine)
+        dof = len(compiled.joints)
+        angles = tuple(not joint.slide for joint in compiled.joints)
         return cls(
-            coordinates=told.states[:dof],
-            rates=told.states[dof:],
+            coordinates=compiled.states[:dof],
+            rates=compiled.states[dof:],
             angles=angles,
             text=machine,
             values=dict(parameters),
@@ -69,7 +69,7 @@ class Tree(AbstractSystem):
     @property
     def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Measured sensors of the file."""
-        return {sense.name: SENSE_UNITS[sense.kind] for sense in self.machine.senses}
+        return {sensor.name: SENSE_UNITS[sensor.kind] for sensor in self.machine.sensors}
 
     @property
     def gears(self):
@@ -92,7 +92,7 @@ class Tree(AbstractSystem):
         }
 
     @property
-    def spots(self) -> dict[int, Spot]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def spots(self) -> dict[int, LoadPoint]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Places of candidate loads, by the joint that carries it."""
         return spots(self.machine, laid(self.text))
 
@@ -109,9 +109,9 @@ class Tree(AbstractSystem):
 
     def __str__(self) -> str:
         numbers = {name: float(value) for name, value in self.values.items()}
-        told = quantities(numbers, lambda name: machine_unit(self.text, name)) or "all as in the file"
+        shown = quantities(numbers, lambda name: machine_unit(self.text, name)) or "all as in the file"
         driven = ", ".join(map(str, self.joints)) or "none"
-        return f"Tree of {self.machine.file}, joints {', '.join(self.coordinates)}: {told}; driven joints: {driven}"
+        return f"Tree of {self.machine.file}, joints {', '.join(self.coordinates)}: {shown}; driven joints: {driven}"
 
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         return jnp.stack([_stacked(row, q) for row in self._mass(self._poses(q))])
@@ -126,7 +126,7 @@ class Tree(AbstractSystem):
         layout, rates = laid(self.text), [v[i] for i in range(len(self.coordinates))]
         poses = self._poses(q)
         moving = motions(layout.frames, poses, rates, a, self.machine.gravity)
-        return [jnp.zeros_like(q[0]) + seen(sense, layout, poses, moving) for sense in self.machine.senses]
+        return [jnp.zeros_like(q[0]) + seen(sensor, layout, poses, moving) for sensor in self.machine.sensors]
 
     def needed(self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Scalar]) -> list[Scalar]:
         """Generalised force that gives an acceleration [N m, or N]: inverse dynamics, M(q) a + c(q, v)."""

@@ -41,8 +41,8 @@ def choose(
             return _single(stamp[order], order, "header stamp", ())
         notes.append(f"header stamps {odd}: log times are taken")
     if log.size > 1 and log.min() == log.max():
-        mend = "record with stamps, or write the topic with a header"
-        refuse(path, where, f"has no stamps: all {log.size} messages are at {log[0] * 1e-9:g} s", mend)
+        hint = "record with stamps, or write the topic with a header"
+        refuse(path, where, f"has no stamps: all {log.size} messages are at {log[0] * 1e-9:g} s", hint)
     steps = np.diff(log)
     back = steps < 0
     if back.any():
@@ -66,8 +66,8 @@ def rising(path: Path, where: str, t: Int[np.ndarray, " row"], name: str) -> Clo
 
 
 def _backwards(row: str, amount: float) -> tuple[str, str]:
-    mend = "the clock was set back there: cut the file at that place"
-    return f"time runs backwards at {row}, by {amount:.6g} s", mend
+    hint = "the clock was set back there: cut the file at that place"
+    return f"time runs backwards at {row}, by {amount:.6g} s", hint
 
 
 def _single(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " m"], name: str, notes: tuple[str, ...]) -> Clock:

@@ -109,9 +109,9 @@ class Ros2:
         except UnknownLayout:
             return None
         data, first = np.frombuffer(message, np.uint8), np.zeros(1, int)
-        found = np.array([form.read(data, first, path)[0] for path in paths])
-        told = self.slow.read(data, first, np.array([len(message)]), paths)[0]
-        return form if np.array_equal(found, told, equal_nan=True) else None
+        values = np.array([form.read(data, first, path)[0] for path in paths])
+        decoded = self.slow.read(data, first, np.array([len(message)]), paths)[0]
+        return form if np.array_equal(values, decoded, equal_nan=True) else None
 
 
 FORMS = 64

@@ -29,26 +29,26 @@ def declared_at(path: Path, topics: Sequence[Topic], given: Address, column: str
     where = f"column {column!r} from {str(given)!r}"
     topic = next((topic for topic in topics if topic.name == given.topic), None)
     if topic is None:
-        mend = near(given.topic, [topic.name for topic in topics])
-        raise DataError(f"{path}: {where}: there is no topic {given.topic!r}; {mend}")
+        hint = near(given.topic, [topic.name for topic in topics])
+        raise DataError(f"{path}: {where}: there is no topic {given.topic!r}; {hint}")
     return given._replace(path=field_of(path, topic, given.path, where))
 
 
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
     wanted = set(_names(column, is_input))
-    found = [Address(topic.name, field) for topic in topics for field in topic.fields if field in wanted]
-    found = found or [
+    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in wanted]
+    addresses = addresses or [
         Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in wanted
     ]
-    mend = f'write [import.columns] {column} = "topic:field" in rig.toml'
-    if not found:
+    hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
+    if not addresses:
         every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
-        raise DataError(f"{path}: column {column!r}: nothing is called so; {mend}; {_nearest(column, every)}")
-    if len(found) > 1:
-        places = " and ".join(repr(str(each)) for each in found[:4])
-        raise DataError(f"{path}: column {column!r}: may be {places}; {mend}")
-    return found[0]
+        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {_nearest(column, every)}")
+    if len(addresses) > 1:
+        places = " and ".join(repr(str(each)) for each in addresses[:4])
+        raise DataError(f"{path}: column {column!r}: may be {places}; {hint}")
+    return addresses[0]
 
 
 def _names(column: str, is_input: bool) -> list[str]:

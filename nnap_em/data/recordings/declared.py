@@ -69,11 +69,11 @@ def _addresses(path: Path, table: Mapping[str, Any], key: str, columns: tuple[st
 
 
 def _address(path: Path, where: str, value: Any) -> Address:
-    mend = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.0174533 }'
+    hint = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.0174533 }'
     entry = value if isinstance(value, dict) else {"from": value}
     text, scale = entry.get("from"), entry.get("scale", 1.0)
     if not isinstance(text, str) or not address(text)[1] or set(entry) - {"from", "scale"}:
-        _refuse(path, where, f"found {value!r}", mend)
+        _refuse(path, where, f"found {value!r}", hint)
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0:
         _refuse(path, where, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
     return Address(*address(text), float(scale))
@@ -88,5 +88,5 @@ def _seconds(path: Path, table: Mapping[str, Any], key: str, absent: float | Non
     return float(value)
 
 
-def _refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
-    raise RigError(f"{path}: {where}: {found}; {mend}")
+def _refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
+    raise RigError(f"{path}: {where}: {problem}; {hint}")

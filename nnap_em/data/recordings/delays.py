@@ -60,17 +60,17 @@ def pairs(
     `inputs` are columns and their joints, from 1; `states` coordinates, then rates; a duplicate of a column is called
     as it is, with a '.
     """
-    dof, found = len(states) // 2, []
+    dof, out = len(states) // 2, []
 
     def apart(one: str, two: str) -> bool:
         return one in signals and two in signals and signals[one].topic != signals[two].topic
 
     for name, joint in inputs.items():
         moved = ((states[dof + joint - 1], 1), (states[joint - 1], 2)) if joint <= dof else ()
-        found += [Pair(name, state, order, True) for state, order in moved if apart(name, state)][:1]
+        out += [Pair(name, state, order, True) for state, order in moved if apart(name, state)][:1]
     for q, v in zip(states[:dof], states[dof:], strict=True):
-        found += [Pair(v, q, 1, False)] if apart(v, q) else []
-    return found + [Pair(name, f"{name}'", 0, False) for name in duplicates if apart(name, f"{name}'")]
+        out += [Pair(v, q, 1, False)] if apart(v, q) else []
+    return out + [Pair(name, f"{name}'", 0, False) for name in duplicates if apart(name, f"{name}'")]
 
 
 def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> Delay:
@@ -83,11 +83,11 @@ def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> D
     cause, effect = signals[pair.cause], signals[pair.effect]
     regressors = [signals[name] for name in around if name in signals]
     least = max(round(max(2 * cause.interval, 4 * effect.interval) / effect.interval), 1)
-    found = [
+    estimates = [
         _over(pair, cause, effect, regressors, least * times) for times in WIDTHS[: 1 if pair.order == 0 else None]
     ]
-    sure = [each for each in found if each.std > 0]
-    best = min(sure, key=lambda each: each.std) if sure else max(found, key=lambda each: each.correlation)
+    sure = [each for each in estimates if each.std > 0]
+    best = min(sure, key=lambda each: each.std) if sure else max(estimates, key=lambda each: each.correlation)
     return Delay(pair.cause, cause.topic, pair.effect, effect.topic, *best)
 
 
@@ -105,8 +105,8 @@ def _over(pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], w
     It is the mean of those of parts of the readings, and known as well as they agree.
     """
     every = _liveliest(cause, effect)
-    found = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, PARTS)]
-    shifts, like = np.array([shift for shift, _ in found]), float(np.mean([r for _, r in found]))
+    parts = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, PARTS)]
+    shifts, like = np.array([shift for shift, _ in parts]), float(np.mean([r for _, r in parts]))
     if np.isnan(shifts).any() or np.ptp(shifts) > SPREAD:
         return _Best(math.nan, math.nan, like)
     std = math.hypot(float(np.std(shifts, ddof=1)) / math.sqrt(PARTS), BIAS * effect.interval)
@@ -127,15 +127,15 @@ def _part(
     size = math.sqrt(target @ target)
 
     def likeness(shift: float) -> float:
-        told = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
-        return float(told @ target) / max(math.sqrt(told @ told) * size, 1e-300)
+        predicted = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
+        return float(predicted @ target) / max(math.sqrt(predicted @ predicted) * size, 1e-300)
 
     coarse = max(min(effect.interval, 0.005), REACH / 50)
     shifts = np.arange(-REACH, REACH + coarse / 2, coarse)
-    found = np.array([likeness(shift) for shift in shifts])
-    k = int(np.argmax(found))
-    if found[k] < SURE or k in (0, shifts.size - 1):
-        return math.nan, float(found[k])
+    correlations = np.array([likeness(shift) for shift in shifts])
+    k = int(np.argmax(correlations))
+    if correlations[k] < SURE or k in (0, shifts.size - 1):
+        return math.nan, float(correlations[k])
     best, fine = float(shifts[k]), coarse
     for _ in range(4):
         fine /= 3

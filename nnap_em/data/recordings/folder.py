@@ -11,11 +11,11 @@ import numpy as np
 from ..dataset import DataError
 from ..formats import write_csv
 from ..rig import Rig, toml_text
-from .bring import Brought
 from .recording import Address
+from .resample import Resampled
 
 
-def places(logs: Sequence[Brought], test: float) -> list[str]:
+def places(logs: Sequence[Resampled], test: float) -> list[str]:
     """The files of all sequences that are used, in the order of the logs: the last ones are for the test.
 
     `test` from 1 on is how many, below 1 their share; one sequence is left to train on.
@@ -23,15 +23,15 @@ def places(logs: Sequence[Brought], test: float) -> list[str]:
     count = sum(len(log.values) for log in logs)
     wanted = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
     if wanted >= count:
-        mend = "give fewer, or set [import] longest lower in rig.toml"
-        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {mend}")
+        hint = "give fewer, or set [import] longest lower in rig.toml"
+        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {hint}")
     digits = max(len(str(count - 1)), 3)
     return [f"train/{i:0{digits}d}.csv" for i in range(count - wanted)] + [
         f"test/{i:0{digits}d}.csv" for i in range(wanted)
     ]
 
 
-def write_sequences(folder: Path, logs: Sequence[Brought], files: Sequence[str], rig: Rig) -> None:
+def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str], rig: Rig) -> None:
     """One CSV file a sequence; the clock begins at 0 in each, or runs on from the first log's, as the rig declares."""
     rest = iter(files)
     for log in logs:

@@ -114,10 +114,10 @@ class Frames:
     def _piece(self, data: UInt8[np.ndarray, " byte"], index: Mapping[int, np.ndarray], wanted) -> Iterator[Batch]:
         batches = [_batch(channel, data, entries) for channel, entries in index.items() if channel in wanted()]
         if not index or None in batches:
-            found = walk(data)
-            self.schemas |= found.schemas
-            self.channels |= found.channels
-            batches = [_batch(channel, data, rows) for channel, rows in found.messages.items() if channel in wanted()]
+            walked = walk(data)
+            self.schemas |= walked.schemas
+            self.channels |= walked.channels
+            batches = [_batch(channel, data, rows) for channel, rows in walked.messages.items() if channel in wanted()]
         yield from (batch for batch in batches if batch is not None and batch.t.size)
 
 
@@ -163,7 +163,7 @@ def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:
     from mcap.data_stream import ReadDataStream
     from mcap.records import Channel, Schema
 
-    found, text, at = Walked({}, {}, {}), data.tobytes(), 0
+    walked, text, at = Walked({}, {}, {}), data.tobytes(), 0
     rows: dict[int, list[tuple[int, int]]] = {}
     while at + 9 <= len(text):
         code, size = struct.unpack_from("<BQ", text, at)
@@ -174,12 +174,12 @@ def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:
             rows.setdefault(channel, []).append((t, at))
         elif code == SCHEMA:
             schema = Schema.read(ReadDataStream(io.BytesIO(text[at + 9 : at + 9 + size])))
-            found.schemas[schema.id] = schema
+            walked.schemas[schema.id] = schema
         elif code == CHANNEL:
             channel = Channel.read(ReadDataStream(io.BytesIO(text[at + 9 : at + 9 + size])))
-            found.channels[channel.id] = channel
+            walked.channels[channel.id] = channel
         at += 9 + size
-    return found._replace(messages={channel: np.array(each, np.int64) for channel, each in rows.items()})
+    return walked._replace(messages={channel: np.array(each, np.int64) for channel, each in rows.items()})
 
 
 def _index(record: bytes) -> tuple[int, Int[np.ndarray, "message two"]]:

@@ -25,8 +25,8 @@ _BLOCK = 2**18
 def topics(path: Path) -> tuple[Topic, ...]:
     """Every group that holds numbers, with a time axis of its own or of a group above."""
     with _opened(path) as file:
-        found = [_topic(group) for group in _groups(file)]
-        return tuple(topic for topic in found if topic.fields)
+        every = [_topic(group) for group in _groups(file)]
+        return tuple(topic for topic in every if topic.fields)
 
 
 def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
@@ -52,8 +52,8 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
     axis, where = _axis(group), f"group {group.name!r}"
     if axis is None:
         names = ", ".join(group) or "nothing"
-        mend = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
-        refuse(path, where, f"has no time axis (holds {names})", mend)
+        hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
+        refuse(path, where, f"has no time axis (holds {names})", hint)
     if axis.dtype.kind == "f" and not np.isfinite(axis[:]).all():
         refuse(path, f"data set {axis.name!r}", "holds times that are no numbers", "cut the rows without a time")
     clock = rising(path, f"data set {axis.name!r}", _nanoseconds(axis), axis.name.rpartition("/")[2])
@@ -127,11 +127,11 @@ def _opened(path: Path) -> Iterator[Any]:
     except OSError as error:
         if error.errno:
             raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights") from None
-        mend = "use another copy, or write it again"
-        raise DataError(f"{path}: no HDF5 file, or damaged or cut short; {mend}") from None
+        hint = "use another copy, or write it again"
+        raise DataError(f"{path}: no HDF5 file, or damaged or cut short; {hint}") from None
     with file:
         try:
             yield file
         except (OSError, RuntimeError) as error:
-            mend = "use another copy, or write it again"
-            raise DataError(f"{path}: the file is damaged ({' '.join(str(error).split())}); {mend}") from None
+            hint = "use another copy, or write it again"
+            raise DataError(f"{path}: the file is damaged ({' '.join(str(error).split())}); {hint}") from None

@@ -39,7 +39,7 @@ def topics(path: Path) -> tuple[Topic, ...]:
     """Topics of the file; whole chunks are read only for the first messages of each channel."""
     with _opened(path) as log:
         samples = _samples(log)
-        found: dict[str, Topic] = {}
+        by_name: dict[str, Topic] = {}
         for number, channel in sorted(log.frames.channels.items()):
             count = None if log.counts is None else log.counts.get(number, 0)
             schema = log.frames.schemas.get(channel.schema_id)
@@ -51,10 +51,10 @@ def topics(path: Path) -> tuple[Topic, ...]:
                 kind, fields = f"{kind}: {unread}", []
             except Exception as error:
                 kind, fields = f"{kind}: its messages do not fit their schema ({type(error).__name__})", []
-            before = found.get(channel.topic, Topic(channel.topic, kind, 0, ()))
+            before = by_name.get(channel.topic, Topic(channel.topic, kind, 0, ()))
             total = None if count is None or before.messages is None else before.messages + count
-            found[channel.topic] = Topic(channel.topic, kind, total, tuple(dict.fromkeys([*before.fields, *fields])))
-        return tuple(found.values())
+            by_name[channel.topic] = Topic(channel.topic, kind, total, tuple(dict.fromkeys([*before.fields, *fields])))
+        return tuple(by_name.values())
 
 
 def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
@@ -92,9 +92,9 @@ def _decoded(
         fields = stamps[batch.channel]
         values = reader.read(batch.data, batch.start, batch.size, (*paths, *fields))
     except Exception as error:  # what the decoders raise on damaged bytes is open-ended
-        found = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
-        mend = "the recorder wrote another type than it said: record again, or name another topic"
-        refuse(log.path, f"topic {log.frames.channels[batch.channel].topic!r}", found, mend)
+        problem = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
+        hint = "the recorder wrote another type than it said: record again, or name another topic"
+        refuse(log.path, f"topic {log.frames.channels[batch.channel].topic!r}", problem, hint)
     stamp = _nanoseconds(values[:, len(paths) :]) if fields else None
     return np.ascontiguousarray(values[:, : len(paths)].T), stamp
 
@@ -159,32 +159,32 @@ def _opened(path: Path) -> Iterator[_Open]:
             yield _Open(path, frames, counts, firsts)
         except Broken as broken:
             text = str(broken)
-            mend = "" if ";" in text else "; use another copy, or `mcap recover` it"
-            mend = text.endswith("pip install") * f" {EXTRA.removeprefix('pip install ')}" or mend
-            raise DataError(f"{path}: {text}{mend}") from None
+            hint = "" if ";" in text else "; use another copy, or `mcap recover` it"
+            hint = text.endswith("pip install") * f" {EXTRA.removeprefix('pip install ')}" or hint
+            raise DataError(f"{path}: {text}{hint}") from None
 
 
 def _samples(log: _Open) -> dict[int, list[bytes]]:
     """The first messages of each channel."""
-    found: dict[int, list[bytes]] = {}
+    samples: dict[int, list[bytes]] = {}
 
     def lacking() -> set[int]:
         every = log.frames.channels
-        return {n for n in every if len(found.get(n, ())) < SAMPLES and (log.counts is None or log.counts.get(n))}
+        return {n for n in every if len(samples.get(n, ())) < SAMPLES and (log.counts is None or log.counts.get(n))}
 
     def take(batches: Iterator[Batch]) -> None:
         for batch in batches:
             rows = zip(batch.start[:SAMPLES].tolist(), batch.size[:SAMPLES].tolist(), strict=True)
-            found.setdefault(batch.channel, []).extend(batch.data[at : at + size].tobytes() for at, size in rows)
+            samples.setdefault(batch.channel, []).extend(batch.data[at : at + size].tobytes() for at, size in rows)
             if log.counts is not None and not lacking():
                 return
 
     if log.firsts:
         for offset in sorted(set(log.firsts.values())):
             take(log.frames.batches(lacking, offset))
-    if not lacking() <= found.keys() or not log.frames.channels:  # not all are in chunks with an index
+    if not lacking() <= samples.keys() or not log.frames.channels:  # not all are in chunks with an index
         take(log.frames.batches(lacking))
-    return found
+    return samples
 
 
 def _codec(log: _Open, number: int) -> Codec:

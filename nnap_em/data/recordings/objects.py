@@ -57,9 +57,9 @@ def _is_list(value: Any) -> bool:
 def _names(parent: Any) -> Sequence[str]:
     """The names of the entries, different texts all."""
     for field in NAMES:
-        found = _get(parent, field, None)
-        if found and _is_list(found) and all(isinstance(n, str) and n for n in found) and len(set(found)) == len(found):
-            return list(found)
+        names = _get(parent, field, None)
+        if names and _is_list(names) and all(isinstance(n, str) and n for n in names) and len(set(names)) == len(names):
+            return list(names)
     return []
 
 

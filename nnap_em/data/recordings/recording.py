@@ -73,9 +73,9 @@ class Address(NamedTuple):
         return f"{self.topic}:{self.path}" if self.topic else self.path
 
 
-def refuse(path: Path, where: str, found: str, mend: str) -> NoReturn:
+def refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
     """Raise the DataError."""
-    raise DataError(f"{path}: {where}: {found}; {mend}")
+    raise DataError(f"{path}: {where}: {problem}; {hint}")
 
 
 def address(text: str) -> tuple[str, str]:

@@ -84,8 +84,8 @@ def _place(run: Run, index: str | None) -> int | None:
 
 def definitions(name: str, text: str) -> Types:
     """The messages of a concatenated definition; UnknownLayout where a line is of no known form."""
-    found: dict[str, list[Field]] = {"builtin_interfaces/Time": _TIME}
-    found["builtin_interfaces/Duration"] = _TIME
+    types: dict[str, list[Field]] = {"builtin_interfaces/Time": _TIME}
+    types["builtin_interfaces/Duration"] = _TIME
     for i, part in enumerate(re.split(r"(?m)^=+\s*$", text)):
         head = re.match(r"\s*MSG:\s*(\S+)", part)
         own = (name if i == 0 else head[1] if head else "").replace("/msg/", "/")
@@ -99,8 +99,8 @@ def definitions(name: str, text: str) -> Types:
                 raise UnknownLayout(line)
             if not match[4]:  # else a constant
                 fields.append((_full(match[1], own), match[2], match[3]))
-        found[own] = fields or [("uint8", None, "structure_needs_at_least_one_member")]
-    return found
+        types[own] = fields or [("uint8", None, "structure_needs_at_least_one_member")]
+    return types
 
 
 def _full(kind: str, own: str) -> str:

@@ -31,7 +31,7 @@ def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
 
 def _clock(path: Path, names: Sequence[str]) -> str:
     """The column that is the time."""
-    found = next((name for name in names if TIME.match(name)), None)
-    if found is None:
+    column = next((name for name in names if TIME.match(name)), None)
+    if column is None:
         refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", "name it 'time' [s]")
-    return found
+    return column

@@ -1,4 +1,4 @@
-"""A folder of things under keys, shared by all processes; to keep them is a favour, never a need."""
+"""A cache: a folder of entries under keys, shared by all processes; an entry may be lost at any time."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from .files import replace_bytes, sweep
 
 
-class Shelf:
+class Cache:
     """One file for each key; each is there whole or not at all.  What killed processes left half written goes."""
 
     def __init__(self, folder: Path):

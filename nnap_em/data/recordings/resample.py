@@ -14,8 +14,8 @@ from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
 from .files import reader
-from .pieces import LEAST, Gap, Piece, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .recording import Address, Recording, Topic, Track, refuse
+from .segments import LEAST, Gap, Segment, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .signals import SLOW, Signal, averaged, held, interpolated
 
 COARSE = 4.0
@@ -56,7 +56,7 @@ class Stretch(NamedTuple):
     """Reason why it is dropped."""
 
 
-class Brought(NamedTuple):
+class Resampled(NamedTuple):
     """One log on the grid."""
 
     path: Path
@@ -73,7 +73,7 @@ class Brought(NamedTuple):
     notes: tuple[str, ...]
 
 
-def bring(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Brought:
+def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 
     Raises DataError where a column cannot be had.
@@ -103,9 +103,11 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
     y = recording.tracks[at.topic].values[at.path]
     there = np.isfinite(y)
     if np.count_nonzero(there) < 2:
-        found = f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
-        mend = "name a field that holds numbers in [import.columns], or take the log out"
-        refuse(recording.path, f"column {name!r}", found, mend)
+        problem = (
+            f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
+        )
+        hint = "name a field that holds numbers in [import.columns], or take the log out"
+        refuse(recording.path, f"column {name!r}", problem, hint)
     if there.all():
         return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
     return Signal(at.topic, t[there], y[there] * at.scale)
@@ -120,7 +122,7 @@ def _gridded(
     addresses: Mapping[str, Address],
     signals: Mapping[str, Signal],
     facts: tuple[TopicFacts, ...],
-) -> Brought:
+) -> Resampled:
     inputs = {name: signals[name] for name in rig.input_columns}
     readings = {name: signals[name] for name in rig.measured}
     start, end = _common(recording.path, inputs, readings, rig.dt)
@@ -131,42 +133,42 @@ def _gridded(
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
     columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
-    found = [
-        _checked(piece, columns, rig.measured) for piece in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
+    segments = [
+        _checked(segment, columns, rig.measured)
+        for segment in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
     ]
-    used = [piece for piece in found if not piece.why]
+    used = [segment for segment in segments if not segment.why]
     if not used:
-        silences = (
-            f"the longest stretch in which all topics speak has {max((p.end - p.first for p in found), default=0)} rows"
-        )
-        mend = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
-        refuse(recording.path, "the log", silences, mend)
+        most = max((segment.end - segment.first for segment in segments), default=0)
+        problem = f"the longest stretch in which all topics have messages has {most} rows"
+        hint = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
+        refuse(recording.path, "the log", problem, hint)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
-    told = pairs(joints, states, signals, tuple(plan.duplicates))
-    return Brought(
+    causes = pairs(joints, states, signals, tuple(plan.duplicates))
+    return Resampled(
         recording.path,
         origin,
         addresses,
         facts,
-        tuple(delay(pair, signals, around if pair.held else ()) for pair in told),
+        tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
         at.size,
-        tuple(_sequence(piece, columns, rig, at) for piece in found),
-        tuple({name: y[piece.first : piece.end] for name, y in columns.items()} for piece in used),
+        tuple(_sequence(segment, columns, rig, at) for segment in segments),
+        tuple({name: y[segment.first : segment.end] for name, y in columns.items()} for segment in used),
         (*recording.notes, *_notes(rig, signals)),
     )
 
 
 def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> tuple[float, float]:
     """Interval in which all topics are present [s]; DataError where there is none."""
-    found = spans(inputs, readings, dt)
-    start, end = max(first for first, _ in found.values()), min(last for _, last in found.values())
+    intervals = spans(inputs, readings, dt)
+    start, end = max(first for first, _ in intervals.values()), min(last for _, last in intervals.values())
     if end <= start:
-        late = max(found, key=lambda topic: found[topic][0])
-        early = min(found, key=lambda topic: found[topic][1])
-        said = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in found.items())
-        mend = f"--shift {late}=SECONDS where their clocks differ, or record them together"
-        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({said})", mend)
+        late = max(intervals, key=lambda topic: intervals[topic][0])
+        early = min(intervals, key=lambda topic: intervals[topic][1])
+        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in intervals.items())
+        hint = f"--shift {late}=SECONDS where their clocks differ, or record them together"
+        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", hint)
     return start, end
 
 
@@ -174,8 +176,10 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
     if best.interval > COARSE * dt:
-        found = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart in {best.topic!r} ({name})"
-        refuse(path, "[sampling] dt", found, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
+        problem = (
+            f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart in {best.topic!r} ({name})"
+        )
+        refuse(path, "[sampling] dt", problem, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
 
 
 def _there(
@@ -205,18 +209,18 @@ def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
             yield name, s
 
 
-def _checked(piece: Piece, columns: Mapping[str, Float[np.ndarray, " row"]], measured: Sequence[str]) -> Piece:
-    """A piece in which a column of readings is empty is dropped: no other command takes it."""
+def _checked(segment: Segment, columns: Mapping[str, Float[np.ndarray, " row"]], measured: Sequence[str]) -> Segment:
+    """A segment in which a column of readings is empty is dropped: no other command takes it."""
     for name in measured:
-        if not piece.why and np.count_nonzero(np.isfinite(columns[name][piece.first : piece.end])) < 2:
-            return piece._replace(why=f"{name} has no reading there")
-    return piece
+        if not segment.why and np.count_nonzero(np.isfinite(columns[name][segment.first : segment.end])) < 2:
+            return segment._replace(why=f"{name} has no reading there")
+    return segment
 
 
-def _sequence(piece: Piece, columns: Mapping[str, np.ndarray], rig: Rig, at: Float[np.ndarray, " row"]) -> Stretch:
-    rows = slice(piece.first, piece.end)
+def _sequence(segment: Segment, columns: Mapping[str, np.ndarray], rig: Rig, at: Float[np.ndarray, " row"]) -> Stretch:
+    rows = slice(segment.first, segment.end)
     missing = {name: int(np.isnan(columns[name][rows]).sum()) for name in rig.measured}
-    return Stretch(float(at[piece.first]), piece.end - piece.first, missing, piece.why)
+    return Stretch(float(at[segment.first]), segment.end - segment.first, missing, segment.why)
 
 
 def _facts(
@@ -251,13 +255,13 @@ def _facts(
 
 def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
     """Messages about readings lost or interpolated between topics and rows."""
-    told = set()
+    reported = set()
     for name in rig.measured:
         s = signals[name]
         rate = s.interval / rig.dt
-        if s.topic in told or (0.6 < rate <= SLOW):
+        if s.topic in reported or (0.6 < rate <= SLOW):
             continue
-        told.add(s.topic)
+        reported.add(s.topic)
         if rate > SLOW:
             yield f"readings of {s.topic or 'the table'} come every {rate:.3g} rows: the rows between are empty"
         else:

@@ -25,7 +25,7 @@ class Gap(NamedTuple):
     end: float
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """Rows of the grid that follow each other."""
 
     first: int
@@ -53,13 +53,13 @@ def gaps(signal: Signal, longest: float) -> list[Gap]:
 
 def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> dict[str, tuple[float, float]]:
     """Intervals in which each topic is present [s]; a command is held for one more of its intervals, not to its end."""
-    found: dict[str, tuple[float, float]] = {}
+    intervals: dict[str, tuple[float, float]] = {}
     for signals, hold in ((inputs, True), (readings, False)):
         for s in signals.values():
             span = (float(s.t[0]), float(s.t[-1]) + (s.interval - 2 * SAME * dt if hold else 0.0))
-            first, last = found.get(s.topic, span)
-            found[s.topic] = (max(first, span[0]), min(last, span[1]))
-    return found
+            first, last = intervals.get(s.topic, span)
+            intervals[s.topic] = (max(first, span[0]), min(last, span[1]))
+    return intervals
 
 
 def grid(readings: Mapping[str, Signal], start: float, end: float, dt: float) -> Float[np.ndarray, " row"]:
@@ -86,13 +86,13 @@ def watched(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: f
     return there
 
 
-def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Piece]:
+def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Segment]:
     """The stretches of rows that are there, the long ones in equal parts, the short ones marked as dropped."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
-    found = []
+    segments = []
     for first, end in edges.tolist():
         parts = -(-(end - first) // longest)
         places = np.round(np.linspace(first, end, parts + 1)).astype(int).tolist()
         why = "" if end - first >= shortest else f"shorter than {shortest} rows"
-        found += [Piece(a, b, why) for a, b in pairwise(places)]
-    return found
+        segments += [Segment(a, b, why) for a, b in pairwise(places)]
+    return segments

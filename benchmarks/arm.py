@@ -132,7 +132,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
     inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
     t = DT * np.arange(ROWS)
     u, x = np.zeros((SEQUENCES, ROWS, dof)), np.zeros((SEQUENCES, ROWS, 2 * dof))
-    felt = np.zeros((SEQUENCES, ROWS, model.nsensordata))
+    sensed = np.zeros((SEQUENCES, ROWS, model.nsensordata))
     for s in range(SEQUENCES):
         tones, phases = rng.uniform(0.15, 1.2, (dof, 4)), rng.uniform(0, 2 * np.pi, (dof, 4))
         turn = 2 * np.pi * tones[None] * t[:, None, None] + phases[None]
@@ -150,7 +150,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
             u[s, k] = known.qfrc_bias + (_mass(model, known) @ wish if any(lack.away) else inertia * wish)
             data.ctrl[:], data.qfrc_applied[:] = u[s, k], law(data.qvel)
             mujoco.mj_forward(model_true, data)
-            felt[s, k] = data.sensordata
+            sensed[s, k] = data.sensordata
             for _ in range(FINE):
                 sent = [*sent[1:], u[s, k]]
                 data.ctrl[:] = u[s, k]
@@ -162,7 +162,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
                 mujoco.mj_step(model_true, data)
     read = dof - bool(model.nsensor)
     std = np.repeat([NOISE, *IMU.values()][: 1 + model.nsensor], [read, *model.sensor_dim])
-    y = np.concatenate([x[..., :read], felt], axis=-1)
+    y = np.concatenate([x[..., :read], sensed], axis=-1)
     y = y + std * rng.normal(size=y.shape)
     return Dataset(np.tile(t, (SEQUENCES, 1)), u, y, np.ones((SEQUENCES, ROWS), bool)), x
 

@@ -99,7 +99,7 @@ def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
         tried.append(float(model.log_q[0]))
         return SimpleNamespace(loglik=np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)]))
 
-    monkeypatch.setattr(loop, "e_step", e_step)
+    monkeypatch.setattr(loop, "_alone", e_step)
     monkeypatch.setattr(loop, "kept", lambda *_: np.array([True, False]))
     settled = loop._settle_noise(MODEL, DATA, None, jax.random.key(0))
     np.testing.assert_allclose(tried, 2 * np.log([1.0, 0.3, 0.1, 0.03, 0.01]))

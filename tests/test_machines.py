@@ -23,7 +23,7 @@ from nnap_em.design.information import Fit
 from nnap_em.design.questions import Information
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build, build_system
-from nnap_em.em.felt import felt, sentences
+from nnap_em.em.identifiability import identifiability, sentences
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
@@ -370,13 +370,13 @@ def test_what_no_motion_feels_is_told(tmp_path):
         "[model.uncertain]\nlink1.mass = {std = 0.1}\nlink1.inertia.zz = {std = 0.1}\njoint1.armature = {std=1.0}"
     )
     rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
-    found = felt(rig, build_system(rig))
+    found = identifiability(rig, build_system(rig))
     assert found.never == ()
     assert found.together == (("link1.mass", "link1.inertia.zz", "joint1.armature"),)  # one axis, upright
     uncertain = "[model.uncertain]\nlink1.com.z = {std=0.1}\nlink2.mass = {std=0.1}"
     rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
-    assert felt(rig, build_system(rig)) == (("link1.com.z",), (), ())
-    assert "no motion feels link1.com.z" in sentences(felt(rig, build_system(rig)))[0]
+    assert identifiability(rig, build_system(rig)) == (("link1.com.z",), (), ())
+    assert "no motion feels link1.com.z" in sentences(identifiability(rig, build_system(rig)))[0]
 
 
 def test_neighbours_share_a_body():

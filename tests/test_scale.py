@@ -13,7 +13,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.em.check import torques
 from nnap_em.em.identify import identify
-from nnap_em.em.scale import holding, untold
+from nnap_em.em.scale import holding, not_identifiable
 
 BODY = {"m": Declared(1.3, 0.3), "lc": Declared(0.3, 0.0), "I": Declared(0.02, 0.01), "g": Declared(9.81, 0.0)}
 SWING = Rig("swing", "pendulum", BODY, True, ("u",), (1,), 0.02, "sequence", ("theta1",), {"theta1": 0.002}, {})
@@ -41,22 +41,22 @@ def _swinging(rig: Rig, scale: float = 1.0, torque: float = 0.0) -> Dataset:
 
 def test_the_most_closely_declared_mass_carries_the_scale():
     still = _swinging(SWING)
-    assert untold(SWING, build_system(SWING), still) == ("m",)  # 23 % against 50 %
-    assert untold(SWING, build_system(SWING), still._replace(u=still.u + 0.1)) == ()
+    assert not_identifiable(SWING, build_system(SWING), still) == ("m",)  # 23 % against 50 %
+    assert not_identifiable(SWING, build_system(SWING), still._replace(u=still.u + 0.1)) == ()
     for known in ("m", "I"):  # what is trusted tells the scale
         held = holding(SWING, (known,))
         assert held.parameters[known] == Declared(BODY[known].mean, 0.0)
-        assert untold(held, build_system(held), still) == ()
+        assert not_identifiable(held, build_system(held), still) == ()
 
 
 def test_nothing_scales_the_machine_once_all_is_held_that_could():
     """Where a length is uncertain too, mass and length together scale what is left."""
     rig = dataclasses.replace(SWING, parameters={**BODY, "lc": Declared(0.3, 0.05)})
     still = _swinging(SWING)
-    names = untold(rig, build_system(rig), still)
+    names = not_identifiable(rig, build_system(rig), still)
     assert len(names) == 2 and "I" not in names[:1]
     held = holding(rig, names)
-    assert untold(held, build_system(held), still) == ()
+    assert not_identifiable(held, build_system(held), still) == ()
 
 
 @pytest.mark.parametrize(("joints", "columns"), [((2,), ("u",)), ((), ())])
@@ -64,7 +64,7 @@ def test_an_arm_with_an_idle_motor_or_none(joints, columns):
     rig = Rig("arm", "acrobot", ARM, True, columns, joints, 0.02, "sequence", ("theta1", "theta2"), {}, {})
     still = Dataset(np.zeros((2, 9)), np.zeros((2, 9, len(columns))), np.zeros((2, 9, 2)), np.ones((2, 9), bool))
     system = build_system(rig)
-    names = untold(rig, system, still)
+    names = not_identifiable(rig, system, still)
     assert names and names[0][0] in "mI"
     told = [f for f in torques(rig, system, still, measure_scales(rig, system, still)) if f.subject == "scale"]
     assert len(told) == 1 and names[0] in told[0].text and "cannot tell the scale" in told[0].text

@@ -19,7 +19,7 @@ from nnap_em.effects import Candidate
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.check import BAD, LOOK, OK, check
-from nnap_em.em.felt import felt, sentences
+from nnap_em.em.identifiability import identifiability, sentences
 from nnap_em.em.identify import identify, parameter_table
 from nnap_em.em.predict import horizon_errors, predict
 from nnap_em.em.servos import build_servos
@@ -323,14 +323,14 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     free = free.replace("I = 0.002", "I = { mean = 0.002, std = 0.001 }")
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 3.0 }\nkd = { mean = 0.2, std = 0.1 }\n'
     rig = _servo(tmp_path, lines + "delay = { mean = 0.01, std = 0.01 }\nlimit = { mean = 3.0, std = 1.0 }", model=free)
-    found = felt(rig, build_system(rig), build_servos(rig))
+    found = identifiability(rig, build_system(rig), build_servos(rig))
     assert found.rubbed == ("goal.kd",)
     assert [set(group) for group in found.together] == [{"m", "I", "goal.kp"}]
     assert "cannot tell goal.kd from the learned friction of the joint" in " ".join(sentences(found))
     known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
-    assert felt(known, build_system(known), build_servos(known)) == ((), (), ("goal.kd",))
+    assert identifiability(known, build_system(known), build_servos(known)) == ((), (), ("goal.kd",))
     bare = dataclasses.replace(known, friction=False)
-    assert felt(bare, build_system(bare), build_servos(bare)) == ((), (), ())
+    assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), (), ())
 
 
 @pytest.mark.parametrize(

@@ -196,8 +196,8 @@ def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " reada
     still, out = jnp.zeros(dof), np.zeros(len(system.readable))
     if system.sensors:
         q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
-        felt = lambda a, q: jnp.stack(system.senses(q, still, tuple(a)))  # noqa: E731
-        slope = np.asarray(jax.jit(jax.vmap(jax.jacfwd(felt), (None, 0)))(still, q))
+        sensed = lambda a, q: jnp.stack(system.senses(q, still, tuple(a)))  # noqa: E731
+        slope = np.asarray(jax.jit(jax.vmap(jax.jacfwd(sensed), (None, 0)))(still, q))
         out[2 * dof :] = np.sqrt(np.mean(np.sum((slope * scales.acceleration) ** 2, axis=-1), axis=0))
     return out
 
@@ -225,9 +225,9 @@ def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system
     for i, name in enumerate(states):
         wide = spread[i] * (0.2 if i >= dof else 1.0) > 0.1
         counts.append((5 if i >= dof else 13) if wide and name not in rig.measured and system.angles[i % dof] else 1)
-    told = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
-    if math.prod(counts[i] for i in told) > FEW or math.prod(counts) > MOST:
-        counts = [1 if i in told else count for i, count in enumerate(counts)]
+    read = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
+    if math.prod(counts[i] for i in read) > FEW or math.prod(counts) > MOST:
+        counts = [1 if i in read else count for i, count in enumerate(counts)]
     angles = tuple(j for j, is_angle in enumerate(system.angles) if is_angle)
     unread = any(system.coordinates[j] not in rig.measured for j in angles)
     return StartBank(tuple(counts), angles if unread else ())

@@ -20,9 +20,9 @@ from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
-from .felt import felt, sentences
+from .identifiability import identifiability, sentences
 from .identify import begin
-from .scale import untold
+from .scale import not_identifiable
 from .servos import MOST_STEPS, build_servos, steps_of_sample
 from .stops import at_stops
 
@@ -107,8 +107,8 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     long = "cut them into sequences of some seconds" if rows.max() * rig.dt > 20 else ""
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, few)
-    said = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield CheckResult(mark, "length", "; ".join(filter(None, (said, few or little, short, long))))
+    amount = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
+    yield CheckResult(mark, "length", "; ".join(filter(None, (amount, few or little, short, long))))
     if test is None:
         yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
     else:
@@ -147,11 +147,11 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
     turn = float(np.max(scales.acceleration * rig.dt / scales.speed))
     period = 2 * np.pi / max(float(fastest), 1e-9)
     per = period / rig.dt
-    said = f"the fastest motion of the declared model takes {period:.2g} s, {per:.0f} samples; " if period < 1e6 else ""
-    said += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
+    text = f"the fastest motion of the declared model takes {period:.2g} s, {per:.0f} samples; " if period < 1e6 else ""
+    text += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
     mark = _mark(per < 10 or turn > 0.1, per < 5 or turn > 0.3)
-    mend = "" if mark == OK else "; sample faster, or look at the units of dt and of the parameters"
-    yield CheckResult(mark, "sampling", said + mend)
+    hint = "" if mark == OK else "; sample faster, or look at the units of dt and of the parameters"
+    yield CheckResult(mark, "sampling", text + hint)
 
 
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
@@ -193,14 +193,14 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     for text in at_stops(rig, data):
         yield CheckResult(LOOK, "range", text)
-    for text in sentences(felt(rig, system, servos)):
+    for text in sentences(identifiability(rig, system, servos)):
         yield CheckResult(LOOK, "untold", text)
-    kept = untold(rig, system, data)
+    kept = not_identifiable(rig, system, data)
     if kept:
-        told = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
+        values = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
         text = (
             "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
-            f"kept as declared is {told}, and all else is relative to that"
+            f"kept as declared is {values}, and all else is relative to that"
         )
         yield CheckResult(_mark(True, False), "scale", text)
 
@@ -290,14 +290,14 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         turns = int(sum(_turns(row, 0.05 * top) for row in v))
         text = f"joint {joint + 1}{seen}: {low:.3g} to {high:.3g} {unit}, {100 * covered:.0f} % of that range covered, "
         text += f"{100 * rest:.0f} % of the time near rest, {turns} changes of direction"
-        mends = [
+        hints = [
             (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
             (turns < 4, "too few turns to tell Coulomb friction"),
             (rest > 0.8, "it rests most of the time"),
             (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
         ]
-        said = [mend for holds, mend in mends if holds]
-        yield CheckResult(_mark(said and rig.friction), "motion", "; ".join([text, *said]))
+        given = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(given and rig.friction), "motion", "; ".join([text, *given]))
 
 
 def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales: Scales) -> Iterator[CheckResult]:
@@ -317,15 +317,15 @@ def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales
             f"joint {joint + 1}{hidden}: {turns} reversals; a presliding distance below {least:.2g} {unit}, {cause}, "
         )
         text += "looks like a static map"
-        said = [
+        hints = [
             (
                 turns < REVERSALS,
                 f"fewer than {REVERSALS} reversals: move it to and fro, slowly and with small amplitudes",
             ),
             (least > 0.1 * (high - low), "that is more than a tenth of its range: sample faster, or move more gently"),
         ]
-        mends = [mend for holds, mend in said if holds]
-        yield CheckResult(_mark(mends), "memory", "; ".join([text, *mends]))
+        given = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(given), "memory", "; ".join([text, *given]))
 
 
 def _velocity(

@@ -23,7 +23,7 @@ from .memory import remember
 from .mstep import ScoringMStep, kept
 from .multistep import FALLS, JUDGED, errors, finish, followed, ratio
 from .noise import white_readings
-from .scale import holding, untold
+from .scale import holding, not_identifiable
 from .stated import widened
 from .weights import Weights
 
@@ -116,7 +116,7 @@ def identify(
     Raises FitError when no sequence can be followed.
     """
     if start is None:
-        rig = holding(rig, untold(rig, build_system(rig), data))
+        rig = holding(rig, not_identifiable(rig, build_system(rig), data))
     now = begin(rig, data, key=key) if start is None else start
     now = now if smoother is None else now._replace(smoother=smoother(now.bank))
     state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)
@@ -155,8 +155,8 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
     now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    told = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
-    return fitted._replace(state=fitted.state._replace(hessian=told.hessian), unsaid=told.unsaid)
+    stated = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
+    return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), unsaid=stated.unsaid)
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

@@ -116,9 +116,9 @@ def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " ob
     assert here.reading_by_force is not None
     dof = here.by_force.shape[-1]
     kick = jnp.swapaxes(here.by_force[..., dof : 2 * dof, :], -1, -2)  # of a unit force on every joint
-    felt = jnp.linalg.solve(kick, jnp.swapaxes(here.reading_by_force, -1, -2))  # dof obs: of a unit kick
-    known = here.seq.active[..., None] & jnp.all(jnp.isfinite(felt), axis=-2)
-    square = jnp.einsum("stdo,d->sto", felt**2, jnp.exp(log_q[dof : 2 * dof]))
+    response = jnp.linalg.solve(kick, jnp.swapaxes(here.reading_by_force, -1, -2))  # dof obs: of a unit kick
+    known = here.seq.active[..., None] & jnp.all(jnp.isfinite(response), axis=-2)
+    square = jnp.einsum("stdo,d->sto", response**2, jnp.exp(log_q[dof : 2 * dof]))
     count = jnp.sum(known, axis=(0, 1), dtype=square.dtype)
     mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(count, 1.0)
     return jnp.maximum(log_r, jnp.log(mean))
@@ -223,8 +223,8 @@ class ScoringMStep(AbstractMStep):
         here = here._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (here, posterior, read))
-        asked = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
-        core, hessian, used = _advance(*asked)
+        inputs = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
+        core, hessian, used = _advance(*inputs)
         if here.reading_by_force is not None:
             core = core._replace(log_r=_shaken(here, core.log_q, core.log_r))
         return *_narrowed(core, hessian, pad), used

@@ -36,8 +36,8 @@ class Prediction(NamedTuple):
     def __str__(self) -> str:
         ahead = np.asarray(self.ahead)
         std = ", ".join(f"{x:.2g}" for x in np.sqrt(np.nanmean(np.asarray(self.std)[ahead] ** 2, axis=0)))
-        said = f"{len(ahead)} sequences, {ahead.sum()} rows ahead"
-        return f"Prediction: {said}; std of the states there [rad and rad/s, or m and m/s]: {std}"
+        amount = f"{len(ahead)} sequences, {ahead.sum()} rows ahead"
+        return f"Prediction: {amount}; std of the states there [rad and rad/s, or m and m/s]: {std}"
 
 
 def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:

@@ -14,7 +14,7 @@ EXACT = 1e-4
 """Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too."""
 
 
-def untold(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
+def not_identifiable(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
     """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
 
     Without a torque the motion is the same when M(q) and c(q, v) are multiplied by one number, and the learned friction
@@ -22,7 +22,7 @@ def untold(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
     that is the least in declared standard deviations, the parameter that moves by the most of them is held; and so on.
     """
     if rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
-        return ()  # the gains of servos are numbers of the machine, and `felt` looks at these
+        return ()  # the gains of servos are numbers of the machine, and `identifiability` looks at these
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v = (jnp.asarray(rng.uniform(-3.0, 3.0, (16, dof))) for _ in range(2))
     names = [name for name, declared in rig.bodies.items() if declared.std > 0]

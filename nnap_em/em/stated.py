@@ -86,8 +86,8 @@ def widened(
     force = size(here._replace(own=own), information)
     shared = force * own.T @ (here.weight[:, None] * here.other)
     sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
-    told, turn = np.linalg.eigh(np.asarray(hessian) - prior)
-    half = turn * np.sqrt(np.maximum(told, 0.0))  # L = half half'
+    strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
+    half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
     across = half.T @ np.linalg.solve(information, sources)
     hessian = jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
     return Stated(hessian, force)
@@ -172,13 +172,13 @@ def size(here: Errors, information: Float[np.ndarray, "own own"]) -> float:
     root = np.sqrt(here.weight)[:, None]
     own, other, error = root * here.own, root * here.other, root[:, 0] * here.error
     other, error = (a - own @ np.linalg.solve(information, own.T @ a) for a in (other, error))
-    told, turn = np.linalg.eigh(other.T @ other)
-    told, along, whole = np.maximum(told, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
-    if whole == 0.0 or not told.any():
+    strength, turn = np.linalg.eigh(other.T @ other)
+    strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
+    if whole == 0.0 or not strength.any():
         return 0.0
-    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST, LARGEST, SIZES)])[:, None] / told[-1]
-    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * told), axis=1), 1e-12 * whole) / here.rows
-    best = np.argmin(0.5 * here.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * told), axis=1))
+    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST, LARGEST, SIZES)])[:, None] / strength[-1]
+    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / here.rows
+    best = np.argmin(0.5 * here.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
     return math.sqrt(float(ratios[best, 0] * noise[best]))
 
 

@@ -241,14 +241,16 @@ def _drawn(path: Path, sketch: Mapping[str, Any], noun: str, known: Mapping[str,
     return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else tuples(sketch["plain"])
 
 
-def _rig(told: Mapping[str, Any]) -> Rig:
+def _rig(entries: Mapping[str, Any]) -> Rig:
     def declared(table: Mapping[str, Any]) -> dict[str, Declared]:
         return {name: Declared(**pair) for name, pair in table.items()}
 
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in told.items()}
-    values["parameters"], values["start"] = declared(told["parameters"]), declared(told["start"])
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
+    }
+    values["parameters"], values["start"] = declared(entries["parameters"]), declared(entries["start"])
     pairs = {
-        part: {name: tuple(pair) for name, pair in table.items()} for part, table in told.get("limits", {}).items()
+        part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries.get("limits", {}).items()
     }
     values["limits"] = Bounds(**pairs)
     return Rig(**values)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.logs import Logs
 from ..data.servo import TORQUE
-from ..em.felt import felt, sentences
+from ..em.identifiability import identifiability, sentences
 from ..em.identify import FrictionTable, Identified, parameter_table
 from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
@@ -32,7 +32,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
-        "untold": sentences(felt(fitted.rig, system, fitted.model.servos or ())),
+        "untold": sentences(identifiability(fitted.rig, system, fitted.model.servos or ())),
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),

@@ -18,7 +18,7 @@ _MOMENTS = ("delay", "limit")
 """Numbers of a servo that the slopes of its torque do not know."""
 
 
-class Felt(NamedTuple):
+class Identifiability(NamedTuple):
     """Uncertain parameters that keep, alone or along a combination, what was declared."""
 
     never: tuple[str, ...]
@@ -29,7 +29,7 @@ class Felt(NamedTuple):
     """Numbers of servos that the learned friction of their joint can take the place of."""
 
 
-def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Felt:
+def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Identifiability:
     """Base parameters: combinations of uncertain parameters that the inverse dynamics M(q) a + c(q, v) depends on.
 
     [Gautier & Khalil 1990, IEEE Trans. Robotics and Automation 6(3): base parameters]  By the null space of its
@@ -40,7 +40,7 @@ def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Fe
     names = [name for name, declared in rig.parameters.items() if declared.std > 0]
     names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]
     if not names:
-        return Felt((), ())
+        return Identifiability((), ())
     columns, friction = _columns(system, servos, names)
     columns = columns * np.asarray([rig.parameters[name].std for name in names])[None, :]
     size = np.linalg.norm(columns, axis=0)
@@ -55,7 +55,7 @@ def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Fe
     never = [i for i in gone if i not in rubbed]
     left = [i for i in range(len(names)) if i not in gone]
     if not left:
-        return Felt(tuple(names[i] for i in never), (), tuple(names[i] for i in rubbed))
+        return Identifiability(tuple(names[i] for i in never), (), tuple(names[i] for i in rubbed))
     _, values, rows = np.linalg.svd(columns[:, left] / size[left], full_matrices=True)
     rank = int(np.sum(values > LEAST * values.max(initial=1e-300)))
     shared = np.abs(rows[rank:].T @ rows[rank:])
@@ -67,7 +67,7 @@ def felt(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Fe
             group |= other
         groups.append(group)
     together = tuple(tuple(names[left[i]] for i in sorted(group)) for group in groups)
-    return Felt(tuple(names[i] for i in never), together, tuple(names[i] for i in rubbed))
+    return Identifiability(tuple(names[i] for i in never), together, tuple(names[i] for i in rubbed))
 
 
 def _columns(
@@ -87,9 +87,9 @@ def _columns(
         return system.drive(hooks.driven((), servos, system, fed, q, v))
 
     def force(values, a):
-        told = dict(zip(names, values, strict=True))
-        changed = system.with_parameters({name: value for name, value in told.items() if name not in own})
-        now = tuple(servo.with_values({name: told[name] for name in own}) for servo in servos)
+        numbers = dict(zip(names, values, strict=True))
+        changed = system.with_parameters({name: value for name, value in numbers.items() if name not in own})
+        now = tuple(servo.with_values({name: numbers[name] for name in own}) for servo in servos)
         needed = lambda q, v, a, u: changed.mass(q) @ a + changed.bias(q, v) - driven(changed, now, q, v, u)  # noqa: E731
         return jax.vmap(needed)(q, v, a, u).ravel()
 
@@ -104,7 +104,7 @@ def _columns(
     return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves
 
 
-def sentences(found: Felt) -> list[str]:
+def sentences(found: Identifiability) -> list[str]:
     """Sentences of a report on parameters that are not identifiable."""
     out = []
     if found.never:

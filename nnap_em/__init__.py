@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .diagnose.findings import Finding, findings
     from .diagnose.outcome import Closed
     from .diagnose.search import close_the_loop
+    from .em.branches import Branch, branches
     from .em.check import CheckResult, check
     from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from .portable.mjcf import write_mjcf
     from .portable.urdf import write_urdf
     from .smoother.gaussian import ExtendedKalmanSmoother
+    from .smoother.mixture import MixtureSmoother
     from .smoother.particle import ParticleSmoother
     from .smoother.posterior import Posterior
     from .storage.files import StoreError
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AbstractSystem",
+    "Branch",
     "CheckResult",
     "Closed",
     "CompareError",
@@ -58,6 +61,7 @@ __all__ = [
     "FrictionNetwork",
     "Identified",
     "Logs",
+    "MixtureSmoother",
     "ParticleSmoother",
     "Posterior",
     "Prediction",
@@ -69,6 +73,7 @@ __all__ = [
     "StoreError",
     "__version__",
     "all_devices",
+    "branches",
     "check",
     "close_the_loop",
     "compare",
@@ -115,6 +120,7 @@ _homes = {
     "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
+    "em.branches": ("Branch", "branches"),
     "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
@@ -125,6 +131,7 @@ _homes = {
     "data.rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
     "model.simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother.gaussian": ("ExtendedKalmanSmoother",),
+    "smoother.mixture": ("MixtureSmoother",),
     "smoother.posterior": ("Posterior",),
     "em.store": ("load", "save"),
     "systems": ("AbstractSystem", "register", "specs"),

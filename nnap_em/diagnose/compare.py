@@ -410,8 +410,8 @@ def _warnings(fits: Sequence[Fit]) -> Iterator[str]:
             ranges = " and ".join(
                 f"{fit.name} {getattr(fit, kind)[j][0]:.3g} to {getattr(fit, kind)[j][1]:.3g}" for fit in (one, two)
             )
-            apart = kind == "velocity" and share == 0
-            means = "its friction is not compared" if apart else MEANINGLESS
+            unmeasured = kind == "velocity" and share == 0
+            means = "its friction is not compared" if unmeasured else MEANINGLESS
             yield f"joint {j + 1}: the {kind} ranges of {ranges} {units[kind][j]} share {share:.0%}; {means}"
 
 

@@ -40,8 +40,8 @@ class Effort(NamedTuple):
     """Passes of a refit."""
     most: int = 4
     """Effects at most."""
-    loud: float = 5.0
-    """Standard deviations of a kick with which a track begins to diverge."""
+    large_kick: float = 5.0
+    """Kick [its standard deviations] from which on a sequence counts as diverged."""
     later: tuple[int, ...] = (8, 3, 1)
     """Rows after that which still count; the fewer where the many are too much."""
 
@@ -95,8 +95,8 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
         return fit, whole
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
-    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.loud)
-    first = np.where(loud.any(axis=1), loud.argmax(axis=1), every.t.shape[1])
+    large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.large_kick)
+    first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
     row, used, cut = np.arange(every.t.shape[1]), whole, every
     for later in context.effort.later:
         early = every.valid & jnp.asarray(row < first[:, None] + later)

@@ -15,7 +15,7 @@ from ..em.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_text
 from .export import ExportError, unrolled
-from .homes import of_command
+from .placement import of_command
 from .unroll import Source
 
 CALLS: dict[str, str] = {

@@ -21,7 +21,7 @@ from ..report.tables import write_json
 from ..storage.files import replace_bytes, replace_text
 from ..systems import AbstractSystem
 from . import program as portable
-from .homes import of_command
+from .placement import of_command
 from .unroll import Source, UnrollError, unroll
 
 PARAMETERS, PREDICTOR, STEP = "parameters.json", "predictor.py", "model.stablehlo"

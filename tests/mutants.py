@@ -525,8 +525,8 @@ MUTANTS = (
     Mutant(
         "columns of a stack in the wrong places",
         "diagnose/columns.py",
-        "whole[:, stack.places] =",
-        "whole[:, stack.places[::-1]] =",
+        "full[:, stack.places] =",
+        "full[:, stack.places[::-1]] =",
         "test_forks.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone",
     ),
     Mutant(

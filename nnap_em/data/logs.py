@@ -93,9 +93,9 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
     """
     parts = {f"train file {file}": rows for file, rows in _contents(train)}
     parts |= {f"test file {file}": rows for file, rows in (_contents(test) if test else ())}
-    for name, row, other, there, whole in repeats(parts):
+    for name, row, other, there, copy in repeats(parts):
         leaks = name.startswith("test") and other.startswith("train")
-        if whole:
+        if copy:
             raise DataError(f"{name}: the same content as {other}; remove one of the two")
         problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
         if leaks:
@@ -157,12 +157,12 @@ def _read_table(path: Path, rig: Rig) -> _Table:
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
 
 
-def _sequence(whole: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
+def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     """One file, checked against the rig, without what was found in it."""
-    path, table, masked = whole.path, whole.table, list(whole.masked)
+    path, table, masked = source.path, source.table, list(source.masked)
     first = 1 + len(rig.input_columns)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
-    line = np.searchsorted(whole.rows, np.arange(len(t)))  # of each row of the table, in the file
+    line = np.searchsorted(source.rows, np.arange(len(t)))  # of each row of the table, in the file
     y = read.copy()
     for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
@@ -189,11 +189,11 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
         thousand = 0.99 < typical / 1000 < 1.01 or 0.99 < typical * 1000 < 1.01
         hint = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
         refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
-    whole = np.maximum(np.round(steps), 1)
-    wrong = np.abs(steps - whole) > TOLERANCE
-    missing = int(np.sum(whole[~wrong] - 1))
+    intervals = np.maximum(np.round(steps), 1)
+    wrong = np.abs(steps - intervals) > TOLERANCE
+    missing = int(np.sum(intervals[~wrong] - 1))
     if not wrong.any() and missing > LOST * (t.size + missing):
-        wrong = whole > 1
+        wrong = intervals > 1
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
@@ -203,7 +203,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
         hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
         refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", hint)
-    return np.append(0, np.cumsum(whole)).astype(int)
+    return np.append(0, np.cumsum(intervals)).astype(int)
 
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:

@@ -84,19 +84,19 @@ def implausible(
 def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]]) -> Iterator[Repeat]:
     """The first stretch of each sequence that an earlier one holds too; standstill is no copy."""
     seen: dict[bytes, tuple[str, int]] = {}
-    wholes: dict[bytes, str] = {}
+    sequences_seen: dict[bytes, str] = {}
     for name, rows in sequences.items():
         rows = np.asarray(rows) + 0.0  # no -0
         own = dict(_stretches(rows))
-        whole = rows.tobytes() if own else None
-        if whole in wholes:
-            yield Repeat(name, 0, wholes[whole], 0, True)
+        everything = rows.tobytes() if own else None
+        if everything in sequences_seen:
+            yield Repeat(name, 0, sequences_seen[everything], 0, True)
         elif same := next((content for content in own if content in seen), None):
             yield Repeat(name, own[same], *seen[same], False)
         for content, row in own.items():
             seen.setdefault(content, (name, row))
-        if whole:
-            wholes.setdefault(whole, name)
+        if everything:
+            sequences_seen.setdefault(everything, name)
 
 
 def bridge(values: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
@@ -167,8 +167,8 @@ def _follows(position: np.ndarray, rate: np.ndarray, dt: float) -> tuple[float, 
     if np.isnan(position).all() or np.isnan(rate).all():
         return 0.0, 0.0
     moved, expected = _advance(position, dt), _advance(np.cumsum(bridge(rate)) * dt, dt)
-    size, wanted = math.sqrt(moved @ moved), math.sqrt(expected @ expected)
-    return float(moved @ expected) / max(size * wanted, 1e-300), size / max(wanted, 1e-300)
+    size, expected_size = math.sqrt(moved @ moved), math.sqrt(expected @ expected)
+    return float(moved @ expected) / max(size * expected_size, 1e-300), size / max(expected_size, 1e-300)
 
 
 def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " way"]:

@@ -37,9 +37,9 @@ from .verdict import Rejection, explains, needed
 def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
     """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
     release_programs()
-    fit, whole = smooth(context, now, length)
+    fit, followed = smooth(context, now, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
-    context.log(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
+    context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
     added = sum(not effect.read_off for effect in now.model.effects)
     if not fit.used.any() or added >= context.effort.most:
         return now

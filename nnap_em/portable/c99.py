@@ -106,10 +106,10 @@ def function(source: Source) -> str:
     (results,) = source.results
     arrays = [f"const double {name}[{size}]" for name, size in source.sizes.items()]
     lines = [f"void {source.name}({', '.join(arrays)}, double tau[{len(results)}])", "{"]
-    whole = "\n".join((*source.lines, *results))
+    code = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
         lines += [
-            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", whole)
+            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", code)
         ]
         lines += [f"    (void){name};"]
     whole_numbers: set[str] = set()

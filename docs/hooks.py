@@ -14,7 +14,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
-from nnap_em.portable.homes import HOMES, REASONS
+from nnap_em.portable.placement import PLACES, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -77,8 +77,8 @@ def effects() -> str:
 
 def _place(name: str) -> str:
     """Place of a law in MuJoCo, or the reason why it has none."""
-    if name in HOMES:
-        return (HOMES[name].__doc__ or "").partition("\n")[0]
+    if name in PLACES:
+        return (PLACES[name].__doc__ or "").partition("\n")[0]
     return f"None: {REASONS.get(name, 'no element of MuJoCo has this form')}."
 
 

@@ -140,7 +140,7 @@ def missing_torque(title: str, done: Diagnosis, law: str, *, planted: bool) -> M
     left = residual(done.after, read_logs(done.folder / "train", done.after.rig).data).followed()
     seen = np.isfinite(left.force[..., joint])
     q, v = (left.state[..., column][seen] for column in (joint, joint + 2))
-    lacked, rest = left.lacked[..., joint][seen], left.force[..., joint][seen]
+    lacked, rest = left.partial_force[..., joint][seen], left.force[..., joint][seen]
     true = torque(law, q, v) if planted else None
     return MissingTorque(title, q, lacked, lacked - rest if done.report["effects"] else None, true)
 

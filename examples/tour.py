@@ -94,7 +94,7 @@ for finding in found:
 left = residual(closed.after, train.data)
 figure = Figure(figsize=(5, 3), layout="constrained")
 axes = figure.subplots()
-axes.plot(left.state[..., 0].ravel(), left.lacked[..., 0].ravel(), ".", color="#8A8A8A", ms=2)
+axes.plot(left.state[..., 0].ravel(), left.partial_force[..., 0].ravel(), ".", color="#8A8A8A", ms=2)
 x = np.linspace(*np.nanpercentile(left.state[..., 0], (1, 99)), 50)
 axes.plot(x, -cable["k"] * (x - cable["theta0"]), "k--", label="true cable")
 axes.set(xlabel="x [m]", ylabel="missing force [N]")

@@ -546,8 +546,8 @@ MUTANTS = (
     Mutant(
         "columns of a stack in the wrong places",
         "diagnose/columns.py",
-        "whole[:, stack.places] =",
-        "whole[:, stack.places[::-1]] =",
+        "full[:, stack.places] =",
+        "full[:, stack.places[::-1]] =",
         "test_forks.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone",
     ),
     Mutant(
@@ -904,8 +904,8 @@ MUTANTS = (
     Mutant(
         "a refit that removes next to nothing",
         "diagnose/verdict.py",
-        "return lost >= KEEP * floor",
-        "return lost >= 0",
+        "return share >= KEEP * floor",
+        "return share >= 0",
         "test_verdict.py::test_a_refit_vetoes_what_is_impossible_uncertain_or_small",
     ),
     Mutant(
@@ -967,7 +967,7 @@ MUTANTS = (
     Mutant(
         "a bump is a ripple",
         "diagnose/rounds.py",
-        "other >= EVEN * value for",
+        "other >= EQUIVALENT * value for",
         "other >= 0.6 * value for",
         "test_rounds.py::test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reaches_nine_tenths",
     ),
@@ -1002,8 +1002,8 @@ MUTANTS = (
     Mutant(
         "the most needed law is tried without",
         "diagnose/search.py",
-        "least = int(np.argmin(lost))",
-        "least = int(np.argmax(lost))",
+        "least = int(np.argmin(losses))",
+        "least = int(np.argmax(losses))",
         "test_search.py::test_a_law_goes_without_which_too_little_is_lost",
     ),
     Mutant(

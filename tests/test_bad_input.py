@@ -335,7 +335,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         _log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
         "line 7, column 'time'",
         "a gap: 0.04 s, then 0.06 s (1 rows are missing in all)",
-        "inputs there are told from the rows around",
+        "inputs there are interpolated from the rows around",
     ),
     "gap in noisy inputs": (
         _log_file(
@@ -345,7 +345,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         ),
         "line 102, column 'time'",
         "a gap: 0.99 s, then 1.1 s (91 rows follow in all)",
-        "cannot be told: not used",
+        "cannot be interpolated: not used",
     ),
     "spike": (
         _log_file(with_field(50, "theta1", "0.5")),

@@ -7,7 +7,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
-from nnap_em.report.diagnosis import _touch
+from nnap_em.report.diagnosis import _disturbance
 from nnap_em.report.page import page
 from nnap_em.report.tables import write_json
 from nnap_em.residual.interventions import Intervention, disturbances
@@ -102,7 +102,7 @@ def test_a_recording_is_cut_at_a_touch(restart):
 
 
 def test_report_and_page_name_the_file(tmp_path):
-    entry = _touch(TOUCH, ("a.csv", "b.csv"))
+    entry = _disturbance(TOUCH, ("a.csv", "b.csv"))
     write_json(tmp_path / "report.json", {"interventions": [entry]})
     (read,) = json.loads((tmp_path / "report.json").read_text())["interventions"]
     told = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}

@@ -26,7 +26,7 @@ from nnap_em.effects.sensor import SensorBias, SensorDelay, SensorScale
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.report.diagnosis import _touch
+from nnap_em.report.diagnosis import _disturbance
 from nnap_em.residual.interventions import Intervention
 from nnap_em.systems import specs
 from nnap_em.systems.arm import TwoLinkArm
@@ -349,7 +349,7 @@ def test_the_log_ratio_is_1_where_the_effect_is_gone_and_worse_is_told():
 def test_touches_are_held_against_the_truth():
     one = {"file": "a.csv", "joint": 1, "from": 1.0, "to": 1.4, "size": 0.7}
     shifted = one | {"from": 1.05, "to": 1.45, "size": 0.5}
-    assert set(_touch(Intervention(0, 1, 0, 9, 1.0, 1.4, 0.7, 0.1, "N m"), ("a.csv",))) >= set(
+    assert set(_disturbance(Intervention(0, 1, 0, 9, 1.0, 1.4, 0.7, 0.1, "N m"), ("a.csv",))) >= set(
         one
     )  # as a report has them
     record = _record([], [], interventions=[shifted, one | {"size": -0.7}, one | {"joint": 2}])

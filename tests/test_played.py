@@ -24,8 +24,8 @@ from nnap_em.em.identify import Identified, begin
 from nnap_em.portable.c99 import torques, write_c
 from nnap_em.portable.draws import write_draws
 from nnap_em.portable.export import ExportError
-from nnap_em.portable.homes import HOMES, REASONS
 from nnap_em.portable.mjcf import beside, write_mjcf
+from nnap_em.portable.placement import PLACES, REASONS
 from nnap_em.portable.urdf import write_urdf
 from nnap_em.systems import specs
 
@@ -178,7 +178,7 @@ def test_a_force_of_time_and_sensors_of_the_module_are_those_of_the_library(tmp_
 
 
 def test_every_law_of_the_catalogue_has_a_home_or_a_reason():
-    assert set(HOMES) | set(REASONS) == set(catalogue) and not set(HOMES) & set(REASONS)
+    assert set(PLACES) | set(REASONS) == set(catalogue) and not set(PLACES) & set(REASONS)
 
 
 def test_a_law_without_a_home_is_refused_where_the_file_stands_alone(tmp_path):

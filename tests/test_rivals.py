@@ -10,8 +10,8 @@ from nnap_em.data.rig import read_rig
 from nnap_em.diagnose.hypothesis import Found
 from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed
-from nnap_em.diagnose.rivals import apart, instead, possible
-from nnap_em.diagnose.verdict import EVEN_NATS
+from nnap_em.diagnose.rivals import compare_equivalents, instead, possible
+from nnap_em.diagnose.verdict import EQUIVALENT_NATS
 from nnap_em.em.identify import identify
 from nnap_em.systems import specs
 
@@ -49,10 +49,10 @@ def test_only_what_the_whole_length_cannot_tell_stays_equivalent(weak_drive):
     data, bare, full = weak_drive
     (own,) = map(key_of, full.model.effects)
     delay = next(key_of(effect) for effect in possible(bare, data) if effect.name == "input_delay")
-    told = apart(_closed(bare, full, delay, own), data)
+    told = compare_equivalents(_closed(bare, full, delay, own), data)
     assert told.found[0].equivalent == (own,)  # the same law in its own place is as likely
     untouched = _closed(bare, full)
-    assert apart(untouched, data) is untouched
+    assert compare_equivalents(untouched, data) is untouched
 
 
 def test_a_rival_that_is_clearly_likelier_takes_the_place(weak_drive):
@@ -60,8 +60,8 @@ def test_a_rival_that_is_clearly_likelier_takes_the_place(weak_drive):
     data, bare, full = weak_drive
     delay = instead(bare, data, None, lambda effect: effect.name == "input_delay")
     (gain,) = map(key_of, full.model.effects)
-    told = apart(_closed(bare, delay, gain), data)
+    told = compare_equivalents(_closed(bare, delay, gain), data)
     (effect,) = told.after.model.effects
     assert effect.name == "motor_gain" and abs(float(effect.values()["gain"]) - GAIN) < 0.05
-    assert told.found[0].gain > 1.0 + EVEN_NATS  # the lead over the law that it replaces is added
+    assert told.found[0].gain > 1.0 + EQUIVALENT_NATS  # the lead over the law that it replaces is added
     assert told.found[0].equivalent == ()

@@ -14,7 +14,7 @@ from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, spec
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, Logs
-from nnap_em.data.lost import interpolated
+from nnap_em.data.missing import interpolated
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
 from nnap_em.data.spikes import noise, spikes
@@ -95,7 +95,7 @@ def _resampled(way: np.ndarray, step: float, part: float = 0.37) -> np.ndarray:
 
 @pytest.mark.parametrize("step", [1.5e-3, 0.01])
 def test_the_turning_points_of_a_coarse_encoder_are_no_limit(step):
-    """Half of these 24 were saturated when a straight line told the way on; cut off, all but some are."""
+    """Half of these 24 were saturated when a straight line extrapolated them; cut off, all but some are."""
     angles = [_motion(seed, 0.0)["theta1"] for seed in range(24)]
     assert [_found({"theta1": _resampled(y, step)}) for y in angles] == [{}] * 24
     cut = [_resampled(np.minimum(y, np.percentile(y, 90)), step) for y in angles]
@@ -236,15 +236,15 @@ def test_an_input_of_sines_is_told_over_a_gap(length):
     t = DT * np.arange(ROWS)
     u = 0.2 * np.sin(7 * t) + 0.1 * np.sin(23 * t + 1)
     lost = (np.arange(ROWS) >= 200) & (np.arange(ROWS) < 200 + length)
-    told = interpolated(np.where(lost, np.nan, u), lost)
-    np.testing.assert_allclose(told.u, u, atol=1e-3)
-    assert (told.doubt[lost] < 0.01).all()
-    assert (told.doubt[~lost] == 0).all()
+    filled = interpolated(np.where(lost, np.nan, u), lost)
+    np.testing.assert_allclose(filled.u, u, atol=1e-3)
+    assert (filled.error[lost] < 0.01).all()
+    assert (filled.error[~lost] == 0).all()
 
 
 def test_an_input_of_noise_is_not_trusted_over_a_gap():
     u, lost = np.random.default_rng(0).standard_normal(ROWS), np.arange(ROWS) // 8 == 25
-    assert (interpolated(np.where(lost, np.nan, u), lost).doubt[lost] > 1).all()
+    assert (interpolated(np.where(lost, np.nan, u), lost).error[lost] > 1).all()
     assert interpolated(np.where(lost, np.nan, 0.0), lost).u.tolist() == [0.0] * ROWS
 
 
@@ -319,7 +319,7 @@ def test_a_log_ends_where_inputs_cannot_be_told(tmp_path):
     kept[120:125] = False
     _write(tmp_path, columns, kept)
     logs, (said,) = _read(tmp_path)
-    assert "inputs before these rows were lost and cannot be told" in said
+    assert "inputs before these rows cannot be interpolated" in said
     assert logs.data.valid.sum() == 120
     assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("cut", 121, 76)]
 
@@ -369,6 +369,6 @@ def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
         return horizon_errors(found, fitted, test.data, 1.0)["x"][3]
 
     assert error(spoilt) < 1.3 * error(train)
-    told = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
-    assert [f.mark for f in told] == ["look", "look"]
-    assert "x: spike: " in told[0].text
+    rows = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
+    assert [f.mark for f in rows] == ["look", "look"]
+    assert "x: spike: " in rows[0].text

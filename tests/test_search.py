@@ -17,7 +17,7 @@ from nnap_em.diagnose import context as context_of
 from nnap_em.diagnose import search
 from nnap_em.diagnose.context import EFFORT, SearchContext, ahead, trimmed
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
-from nnap_em.diagnose.keys import covered, key_of, replaced, rest_of
+from nnap_em.diagnose.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnose.losses import MultiStep, OneStep, readings
 from nnap_em.diagnose.outcome import Step
 from nnap_em.diagnose.propose import seeded
@@ -117,14 +117,14 @@ def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
 
 def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
     model = with_effects(MODEL, (_law("motor_gain"), _spring()))
-    assert rest_of(_function(), model) == 1
-    assert rest_of(_of_input(), model) == 0
-    assert rest_of(dataclasses.replace(_function(), joint=2), model) is None
-    assert rest_of(_spring(), model) is None
-    assert rest_of(_function(), with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
+    assert remainder_of(_function(), model) == 1
+    assert remainder_of(_of_input(), model) == 0
+    assert remainder_of(dataclasses.replace(_function(), joint=2), model) is None
+    assert remainder_of(_spring(), model) is None
+    assert remainder_of(_function(), with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
     free = with_effects(MODEL, (_function(),))
-    assert covered(_spring(), free) and not covered(_spring(), model) and not covered(_law("motor_gain"), free)
-    assert covered(_law("motor_gain"), with_effects(MODEL, (_of_input(),)))
+    assert completed(_spring(), free) and not completed(_spring(), model) and not completed(_law("motor_gain"), free)
+    assert completed(_law("motor_gain"), with_effects(MODEL, (_of_input(),)))
 
 
 def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_another():
@@ -362,7 +362,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
-    monkeypatch.setattr(search, "apart", lambda closed, data: closed)
+    monkeypatch.setattr(search, "compare_equivalents", lambda closed, data: closed)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     found = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert ran == losses and len(found.found) == (white and innovations)

@@ -7,7 +7,7 @@ import pytest
 from nnap_em.diagnose.verdict import (
     AGREE,
     CHANCE,
-    EVEN,
+    EQUIVALENT,
     HARM,
     KEEP,
     MULTI_STEP,
@@ -133,7 +133,7 @@ def test_what_is_lost_without_an_effect_is_most_of_the_floor():
 @pytest.mark.parametrize(("more", "stays"), [(0.1, True), (0.12, False)])
 def test_a_named_law_stays_beside_a_remainder_that_adds_a_tenth_at_most(more, stays):
     """Half of the error goes with the law, and `more` of the other half with its remainder."""
-    assert EVEN == 0.9
+    assert EQUIVALENT == 0.9
     assert explains(0.5, more) == stays
 
 

@@ -363,13 +363,13 @@ def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: s
 _N = TypeVar("_N", int, float)
 
 
-def _number(text: str, kind: type[_N], low: int | float, wanted: str) -> _N:
+def _number(text: str, kind: type[_N], low: int | float, form: str) -> _N:
     try:
         if low <= (value := kind(text)) < math.inf:
             return value
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"found {text!r}; give {wanted}")
+    raise argparse.ArgumentTypeError(f"found {text!r}; give {form}")
 
 
 def _count(text: str) -> int:

@@ -81,13 +81,13 @@ def set_up() -> None:
 
 
 @contextmanager
-def profiled(wanted: bool) -> Iterator[None]:
+def profiled(enabled: bool) -> Iterator[None]:
     """Print what was compiled inside, also of a run that was stopped."""
     with profiling() as profile:
         try:
             yield
         finally:
-            if wanted:
+            if enabled:
                 print(profile)
 
 

@@ -61,9 +61,9 @@ def _fields(topics: Sequence[Topic]) -> list[tuple[Address, str]]:
     return [(Address(t.name, field), field.rpartition(".")[2]) for t in topics for field in t.fields]
 
 
-def _first(fields: Sequence[tuple[Address, str]], wanted: Sequence[str]) -> Address | None:
+def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
     """Address of the first name that exists."""
-    return next((at for name in wanted for at, word in fields if word == name), None)
+    return next((at for name in names for at, word in fields if word == name), None)
 
 
 def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
@@ -114,15 +114,15 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
     """
     fields, order = _fields(topics), commands(topics)
     kinds, servos = _kinds(fields), {motor.name for motor in machine.motors if motor.kind != TORQUE}
-    wanted = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
-    wanted = wanted or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]
+    motors = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
+    motors = motors or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]
     out: dict[str, tuple[Address, str]] = {}
-    for i, (name, joint) in enumerate(wanted):
+    for i, (name, joint) in enumerate(motors):
         own = [name] if name in servos else [name, f"effort[{name}]"]
-        at = _first(fields, own) or (order[i] if len(order) == len(wanted) else None)
+        at = _first(fields, own) or (order[i] if len(order) == len(motors) else None)
         at = at or next((at for at, word in fields if joint in word and COMMAND.search(word)), None)
         if name not in servos:
-            at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(wanted) == 1 else None)
+            at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(motors) == 1 else None)
         if at is not None:
             out[name] = at, joint
     return out

@@ -56,9 +56,9 @@ def joints_of(topic: Topic) -> list[str]:
 
 def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Address]:
     """Angles and rates of joints, called as a machine calls them; `coordinates` are by the joints' names in the log."""
-    wanted = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
-    wanted += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
-    return {column: Address(topic.name, field) for column, field in wanted if field in topic.fields}
+    fields = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
+    fields += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
+    return {column: Address(topic.name, field) for column, field in fields if field in topic.fields}
 
 
 def commands(topics: Sequence[Topic]) -> list[Address]:
@@ -89,10 +89,10 @@ def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
-    wanted: dict[str, list[str]] = {}
+    fields: dict[str, list[str]] = {}
     for at in columns.values():
-        wanted.setdefault(at.topic, []).append(at.path)
-    tracks = reader(path).read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in wanted.items()}).tracks
+        fields.setdefault(at.topic, []).append(at.path)
+    tracks = reader(path).read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()}).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
     dt = min(float(f"{np.median(np.diff(track.t)) * 1e-9:.3g}") for track in tracks.values() if track.t.size > 1)
     end = min(int(track.t[-1]) for track in tracks.values())

@@ -41,9 +41,9 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
         raise DataError("pad: no sequence; give at least one (t, u, y)")
     inputs, obs = (np.shape(x)[-1] for x in sequences[0][1:])
     for i, (t, u, y) in enumerate(sequences):
-        wanted = (len(t),), (len(t), inputs), (len(t), obs)
-        if (shapes := (np.shape(t), np.shape(u), np.shape(y))) != wanted or not len(t):
-            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}; they must be {wanted}, time above 0")
+        expected = (len(t),), (len(t), inputs), (len(t), obs)
+        if (shapes := (np.shape(t), np.shape(u), np.shape(y))) != expected or not len(t):
+            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}; they must be {expected}, time above 0")
     lengths = [len(t) for t, _, _ in sequences]
     time = max(lengths)
     return Dataset(

@@ -218,10 +218,10 @@ def _rows(path: Path, text: str) -> list[list[str]]:
 
 
 def _check_names(
-    path: Path, names: Sequence[str], wanted: Sequence[str], line: str = "", hint: str | None = None
+    path: Path, names: Sequence[str], required: Sequence[str], line: str = "", hint: str | None = None
 ) -> None:
-    spare = [name for name in names if name not in wanted]
-    for name in wanted:
+    spare = [name for name in names if name not in required]
+    for name in required:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
             refuse(path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) if spare else alone))

@@ -77,9 +77,9 @@ def _warn_of_left_out(root: Any, machine: Machine) -> None:
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:
     """Every joint by its name, or by that of the sensor whose column is measured."""
     names, dof = list(states(machine.joints)), len(machine.joints)
-    wanted = root.table("measurement").items.get("columns")
+    columns = root.table("measurement").items.get("columns")
     for sensor in machine.joint_sensors:
-        if isinstance(wanted, list) and sensor.name in wanted:
+        if isinstance(columns, list) and sensor.name in columns:
             names[sensor.joint + dof * sensor.rate] = sensor.name
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -90,8 +90,8 @@ def _states(machine: Machine, root: Any) -> tuple[str, ...]:
 def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
     """The components of sensors that are measured."""
     table = root.table("measurement")
-    wanted = table.items.get("columns")
-    for column in wanted if isinstance(wanted, list) else ():
+    columns = table.items.get("columns")
+    for column in columns if isinstance(columns, list) else ():
         for sensor in machine.sensors:
             if sensor.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
                 continue

@@ -45,9 +45,11 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         body = machine.bodies[i]
         pose = within[body.parent].of(poses[i])
         parts = [(machine.bodies[k], within[k]) for k in carrier if k >= 0 and carrier[k] == i]
-        whole = _together(parts) if len(parts) > 1 else body
+        merged = _together(parts) if len(parts) > 1 else body
         parent = number[carrier[body.parent]]
-        bodies.append(whole._replace(name=body.name, parent=parent, place=_vector(pose.place), turn=_matrix(pose.turn)))
+        bodies.append(
+            merged._replace(name=body.name, parent=parent, place=_vector(pose.place), turn=_matrix(pose.turn))
+        )
     order = {joint.name: k for k, joint in enumerate(joints)}
     names = [joint.name for joint in machine.joints]
 

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from .constant import FULL
 from .dataset import DataError, Dataset, pad
 from .formats import log_files, place, read_table, refuse
-from .frozen import FULL
-from .lost import interpolated
-from .plausible import Columns, doubts, repeats
+from .missing import interpolated
+from .plausible import Columns, implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
 
@@ -93,9 +93,9 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
     """
     parts = {f"train file {file}": rows for file, rows in _contents(train)}
     parts |= {f"test file {file}": rows for file, rows in (_contents(test) if test else ())}
-    for name, row, other, there, whole in repeats(parts):
+    for name, row, other, there, copy in repeats(parts):
         leaks = name.startswith("test") and other.startswith("train")
-        if whole:
+        if copy:
             raise DataError(f"{name}: the same content as {other}; remove one of the two")
         problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
         if leaks:
@@ -157,21 +157,21 @@ def _read_table(path: Path, rig: Rig) -> _Table:
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
 
 
-def _sequence(whole: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
+def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     """One file, checked against the rig, without what was found in it."""
-    path, table, masked = whole.path, whole.table, list(whole.masked)
+    path, table, masked = source.path, source.table, list(source.masked)
     first = 1 + len(rig.input_columns)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
-    line = np.searchsorted(whole.rows, np.arange(len(t)))  # of each row of the table, in the file
+    line = np.searchsorted(source.rows, np.arange(len(t)))  # of each row of the table, in the file
     y = read.copy()
     for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
     inputs, readings = dict(zip(rig.input_columns, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
-    for doubt in doubts(inputs, readings, rig.dt, rig.unit, rig.pairs()):
-        where = place(path, doubt.column, None if doubt.row is None else int(line[doubt.row]))
-        if doubt.ruins:
-            refuse(path, where, doubt.problem, doubt.hint)
-        warnings.warn(f"{path}: {where}: {doubt.problem}; {doubt.hint}", DataWarning, 2)
+    for finding in implausible(inputs, readings, rig.dt, rig.unit, rig.pairs()):
+        where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
+        if finding.ruins:
+            refuse(path, where, finding.problem, finding.hint)
+        warnings.warn(f"{path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
     for entry in entries:
         k, count = int(entry.rows[0]), entry.rows.size
         masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
@@ -189,11 +189,11 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
         thousand = 0.99 < typical / 1000 < 1.01 or 0.99 < typical * 1000 < 1.01
         hint = "one of the two is in ms: write s" if thousand else "correct [sampling] dt of rig.toml, or resample"
         refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
-    whole = np.maximum(np.round(steps), 1)
-    wrong = np.abs(steps - whole) > TOLERANCE
-    lost = int(np.sum(whole[~wrong] - 1))
-    if not wrong.any() and lost > LOST * (t.size + lost):
-        wrong = whole > 1
+    intervals = np.maximum(np.round(steps), 1)
+    wrong = np.abs(steps - intervals) > TOLERANCE
+    missing = int(np.sum(intervals[~wrong] - 1))
+    if not wrong.any() and missing > LOST * (t.size + missing):
+        wrong = intervals > 1
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
@@ -203,7 +203,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
         hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
         refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", hint)
-    return np.append(0, np.cumsum(whole)).astype(int)
+    return np.append(0, np.cumsum(intervals)).astype(int)
 
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
@@ -213,16 +213,21 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
         return _Table(path, table, rows, [])
     full = np.full((size, table.shape[1]), np.nan)
     full[rows] = table
-    lost = np.isnan(full[:, 0])
+    missing = np.isnan(full[:, 0])
     full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
-    filled = [interpolated(u, lost) for u in full[:, inputs].T]
+    filled = [interpolated(u, missing) for u in full[:, inputs].T]
     full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
-    dark = np.any([doubt > INTERPOLATION_ERROR for _, doubt in filled], axis=0) if filled else np.zeros(size, bool)
+    dark = np.any([error > INTERPOLATION_ERROR for _, error in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
     here, masked = rows[rows < end], []
     for first, count, kind, hint in (
-        (int(lost.argmax()), int(lost[:end].sum()), "gap", "inputs there are told from the rows around"),
-        (end, len(rows) - len(here), "cut", "inputs before these rows were lost and cannot be told: not used"),
+        (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
+        (
+            end,
+            len(rows) - len(here),
+            "cut",
+            "inputs before these rows cannot be interpolated: not used",
+        ),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap

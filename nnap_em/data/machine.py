@@ -161,10 +161,10 @@ def unpacked(text: str) -> Machine:
         "sensors": Sensor,
     }
     named = dict(zip(Machine._fields, fields, strict=False))  # models that were saved before a field was there
-    whole: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: tuple(kinds[name](*one) for one in value) if name in kinds else value for name, value in named.items()
     }
-    return Machine(**whole)
+    return Machine(**values)
 
 
 def _tuples(value):

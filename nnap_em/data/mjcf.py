@@ -100,8 +100,8 @@ def _part(
     machine = lock(machine, values, joined)
     group = groups(machine, {joint.body for joint in machine.joints}.__contains__)
     for i in sorted({joint.body for joint in machine.joints}):
-        whole = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
-        if sum(body.mass for body in whole) <= NOTHING:
+        group_bodies = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
+        if sum(body.mass for body in group_bodies) <= NOTHING:
             joint = next(joint.name for joint in machine.joints if joint.body == i)
             hint = f"give it an <inertial>, or hold its joint: {_line(joint)}"
             refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", hint)
@@ -116,8 +116,8 @@ def _line(*joints: str) -> str:
 def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
     """Joints of rig.toml that the file does not have."""
     names = [model.joint(j).name for j in range(model.njnt)]
-    for key, wanted in (("joints", part.joints or ()), ("locked", part.locked)):
-        for name in wanted:
+    for key, names in (("joints", part.joints or ()), ("locked", part.locked)):
+        for name in names:
             if name not in names:
                 refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
     for j, name in enumerate(names):
@@ -178,10 +178,10 @@ def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
     except ValueError as error:
         message = " ".join(str(error).split())
     if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", message, re.I):
-        whole = _included(path, root)
-        _strip(path, whole)
+        tree = _included(path, root)
+        _strip(path, tree)
         try:
-            return _build(mujoco.MjSpec.from_string(ET.tostring(whole, encoding="unicode")), part)
+            return _build(mujoco.MjSpec.from_string(ET.tostring(tree, encoding="unicode")), part)
         except ValueError as error:
             message = " ".join(str(error).split())
     refuse(path, f"MuJoCo's compiler refuses it: {message}", _hint(message))

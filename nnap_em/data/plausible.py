@@ -28,7 +28,7 @@ _ANY = (
 )
 
 
-class Doubt(NamedTuple):
+class Implausible(NamedTuple):
     """Implausible part of a column, from which row on, and the hint."""
 
     ruins: bool
@@ -50,13 +50,13 @@ class Repeat(NamedTuple):
     """True where the sequences are the same from end to end."""
 
 
-def doubts(
+def implausible(
     inputs: Columns,
     readings: Columns,
     dt: float,
     unit: Callable[[str], str] = parameter_unit,
     pairs: Sequence[tuple[str, str]] | None = None,
-) -> Iterator[Doubt]:
+) -> Iterator[Implausible]:
     """Implausible parts of the columns of one sequence, sampled every `dt` [s].
 
     `pairs` are the columns of coordinates and of their rates, where the names do not show it.
@@ -65,10 +65,10 @@ def doubts(
         observed = values[np.isfinite(values)]
         if not observed.size:
             hint = "take the file out, or the column out of [measurement]"
-            yield Doubt(True, name, None, "no sample at all", hint)
+            yield Implausible(True, name, None, "no sample at all", hint)
             return
         if observed.size > 1 and np.ptp(observed) == 0:
-            yield Doubt(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
+            yield Implausible(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
     yield from _copies(inputs, readings)
     for name, rate in pairs if pairs is not None else [(name, f"d{name}") for name in readings]:
         if name in readings and rate in readings:
@@ -78,25 +78,25 @@ def doubts(
             yield from _wrapped(name, values)
         rate = unit(name) == "rad/s"
         if (rate or unit(name) == "rad") and (speed := _speed(values, dt, rate)) > IMPLAUSIBLE:
-            yield Doubt(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
+            yield Implausible(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
 
 
 def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]]) -> Iterator[Repeat]:
     """The first stretch of each sequence that an earlier one holds too; standstill is no copy."""
     seen: dict[bytes, tuple[str, int]] = {}
-    wholes: dict[bytes, str] = {}
+    sequences_seen: dict[bytes, str] = {}
     for name, rows in sequences.items():
         rows = np.asarray(rows) + 0.0  # no -0
         own = dict(_stretches(rows))
-        whole = rows.tobytes() if own else None
-        if whole in wholes:
-            yield Repeat(name, 0, wholes[whole], 0, True)
+        everything = rows.tobytes() if own else None
+        if everything in sequences_seen:
+            yield Repeat(name, 0, sequences_seen[everything], 0, True)
         elif same := next((content for content in own if content in seen), None):
             yield Repeat(name, own[same], *seen[same], False)
         for content, row in own.items():
             seen.setdefault(content, (name, row))
-        if whole:
-            wholes.setdefault(whole, name)
+        if everything:
+            sequences_seen.setdefault(everything, name)
 
 
 def bridge(values: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
@@ -114,31 +114,31 @@ def _stretches(rows: Float[np.ndarray, "time column"]) -> Iterator[tuple[bytes, 
             yield np.ascontiguousarray(rows[k : k + length]).tobytes(), k
 
 
-def _copies(inputs: Columns, readings: Columns) -> Iterator[Doubt]:
+def _copies(inputs: Columns, readings: Columns) -> Iterator[Implausible]:
     """A reading that is another column over again."""
     columns = [*inputs.items(), *readings.items()]
     for i, (name, values) in enumerate(columns[len(inputs) :], len(inputs)):
         for other, others in columns[:i]:
             if np.nanmax(values) > np.nanmin(values) and np.array_equal(values, others, equal_nan=True):
                 problem = f"the same numbers as column {other!r}"
-                yield Doubt(True, name, None, problem, "write what each sensor reads, or take the column out")
+                yield Implausible(True, name, None, problem, "write what each sensor reads, or take the column out")
 
 
-def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Iterator[Doubt]:
+def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Iterator[Implausible]:
     """A coordinate against the integral of its rate: units, sign, and what is swapped."""
     fit, ratio = _follows(columns[name], columns[rate], dt)
     problem = f"the rate of {name!r} is {ratio:.3g} times column {rate!r}"
     for factor, wrong, hint in (*(_ANGLE if angle else ()), *_ANY):
         close = (0.7, 0.7 < ratio / factor < 1.4) if hint == _DEGREES else (0.9, 0.85 < ratio / factor < 1.18)
         if fit > close[0] and close[1]:
-            yield Doubt(True, rate if wrong else name, None, problem, hint)
+            yield Implausible(True, rate if wrong else name, None, problem, hint)
             return
     ways = "units, signs and names of the two"
     if fit > 0.9 and not 0.8 < ratio < 1.25:
-        yield Doubt(False, rate, None, problem, f"it should be once: check {ways}")
+        yield Implausible(False, rate, None, problem, f"it should be once: check {ways}")
     elif fit < -0.7 and 0.7 < ratio < 1.4:
         problem = f"the rate of {name!r} is minus column {rate!r}"
-        yield Doubt(True, rate, None, problem, "turn the sign of the wrong one: both count in the same direction")
+        yield Implausible(True, rate, None, problem, "turn the sign of the wrong one: both count in the same direction")
     elif fit < 0.5:
         for one, two, wrong, other in (
             (rate, name, name, rate),
@@ -148,12 +148,12 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
             fit, ratio = _follows(columns[one], columns[two], dt)
             if fit > 0.95 and 0.8 < ratio < 1.25:
                 problem = f"{two!r} is the rate of {one!r}, and {rate!r} is not that of {name!r}"
-                yield Doubt(
+                yield Implausible(
                     True, wrong, None, problem, f"columns {wrong!r} and {other!r} look swapped: name them right"
                 )
                 return
         if _moves(columns[name]) and _moves(columns[rate]):
-            yield Doubt(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")
+            yield Implausible(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")
 
 
 def _moves(values: np.ndarray) -> bool:
@@ -167,8 +167,8 @@ def _follows(position: np.ndarray, rate: np.ndarray, dt: float) -> tuple[float, 
     if np.isnan(position).all() or np.isnan(rate).all():
         return 0.0, 0.0
     moved, expected = _advance(position, dt), _advance(np.cumsum(bridge(rate)) * dt, dt)
-    size, wanted = math.sqrt(moved @ moved), math.sqrt(expected @ expected)
-    return float(moved @ expected) / max(size * wanted, 1e-300), size / max(wanted, 1e-300)
+    size, expected_size = math.sqrt(moved @ moved), math.sqrt(expected @ expected)
+    return float(moved @ expected) / max(size * expected_size, 1e-300), size / max(expected_size, 1e-300)
 
 
 def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " way"]:
@@ -178,7 +178,7 @@ def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray,
     return values[span:] - values[:-span]
 
 
-def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
+def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Implausible]:
     """Jumps by a turn."""
     rows = np.flatnonzero(np.isfinite(theta))
     step = np.diff(theta[rows])
@@ -187,7 +187,7 @@ def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Doubt]:
         if jumps.any() and np.median(np.abs(step)) < 0.1 * turn:
             k, row = step[jumps][0], int(rows[1:][jumps][0])
             hint = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
-            yield Doubt(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", hint)
+            yield Implausible(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", hint)
             return
 
 

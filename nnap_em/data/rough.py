@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from .frozen import frozen
+from .constant import constant_readings
 from .plausible import Columns
 from .spikes import spikes
 
@@ -29,7 +29,7 @@ def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = 
     rest = {name: _without(values, first[name]) for name, values in readings.items()}
     entries = []
     for name, values in rest.items():
-        still = list(frozen(name, rest, dt, [value for column, value in limits if column == name]))
+        still = list(constant_readings(name, rest, dt, [value for column, value in limits if column == name]))
         entries += [Rough(kind, name, rows[np.isfinite(values[rows])]) for kind, rows in still]
         y = _without(values, *(rows for _, rows in still))
         rows = np.sort(np.concatenate([first[name], spikes(y)])) if still else first[name]

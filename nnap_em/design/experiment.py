@@ -178,9 +178,9 @@ def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.nd
     nodes, dof = np.asarray(fit.nodes), fit.nodes.shape[0]
     low, high = np.percentile(visited, [0.5, 99.5], axis=0)
     place = np.arcsinh(nodes / (NEAR_REST * np.abs(nodes).max(axis=1, keepdims=True)))
-    whole = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
+    everywhere = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
     near = np.gradient(nodes, axis=1) * (np.abs(nodes) <= slow[:, None])
-    weight = np.stack([whole, near])
+    weight = np.stack([everywhere, near])
     weight = weight / np.maximum(weight.sum(axis=2, keepdims=True), 1e-12) / dof
     torque = np.stack([np.asarray(fit.model.unknown(jnp.asarray(v))) for v in nodes.T], axis=1)
     scale = np.sqrt(np.sum(weight[0] * torque**2, axis=1) * dof)

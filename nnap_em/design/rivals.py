@@ -49,7 +49,7 @@ def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
 
 
 def rivals(
-    fitted: Identified, data: Dataset, wanted: Sequence[tuple[Law | None, Law]], log: Log = silent
+    fitted: Identified, data: Dataset, laws: Sequence[tuple[Law | None, Law]], log: Log = silent
 ) -> list[Rivals]:
     """Models to be discriminated: `fitted` beside itself with another law in the place of one of its own, and, where
     there is none (None), all that may come on top beside each other and beside `fitted` as it is, if there is but one.
@@ -57,7 +57,7 @@ def rivals(
     Raises DesignError where the machine cannot have such a law, or the fit does not hold the one.
     """
     out, beside = [], []
-    for own, other in wanted:
+    for own, other in laws:
         log(f"fitting {other} in place of {own or 'nothing'}")
         model = _instead(fitted, data, own, other)
         if own is None:

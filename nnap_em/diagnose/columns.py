@@ -120,12 +120,12 @@ def _stacks(probes: Sequence[AbstractEffect]) -> list[Stack]:
 def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     """Stack made by NumPy: a stack of many small arrays would be one program for every number of them."""
     flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
-    whole = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
-    same = [bool((a == a[0]).all()) for a in whole]
+    stacked = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
+    same = [bool((a == a[0]).all()) for a in stacked]
     if all(same):  # one probe, or one given twice
         same = [False] * len(same)
     pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
-    leaves = [np.asarray(a[0]) if one else pad(a) for a, one in zip(whole, same, strict=True)]
+    leaves = [np.asarray(a[0]) if one else pad(a) for a, one in zip(stacked, same, strict=True)]
     axes = [None if one else 0 for one in same]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
 
@@ -174,8 +174,8 @@ def candidate_columns(
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):
-                for whole, own in ((force, columns.force), (reading, columns.reading)):
-                    whole[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
+                for full, own in ((force, columns.force), (reading, columns.reading)):
+                    full[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
         return Columns(force, reading)
 
     return along

@@ -230,9 +230,9 @@ def _labels(given: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> 
         fit.fitted.rig.name if path is None else path.parent.name if path.stem in ("model", "after") else path.stem
         for path, fit in zip(paths, opened, strict=True)
     ]
-    whole = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, given, strict=True)]
+    full = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, given, strict=True)]
     numbered = [f"fit {i}" for i in range(1, len(short) + 1)]
-    return tuple(next(labels for labels in (short, whole, numbered) if len(set(labels)) == len(labels)))
+    return tuple(next(labels for labels in (short, full, numbered) if len(set(labels)) == len(labels)))
 
 
 def _visited(fitted: Identified, file: Path | None) -> tuple[Float[np.ndarray, "dof 2"], Float[np.ndarray, "dof 2"]]:
@@ -410,13 +410,13 @@ def _warnings(fits: Sequence[Fit]) -> Iterator[str]:
             ranges = " and ".join(
                 f"{fit.name} {getattr(fit, kind)[j][0]:.3g} to {getattr(fit, kind)[j][1]:.3g}" for fit in (one, two)
             )
-            apart = kind == "velocity" and share == 0
-            means = "its friction is not compared" if apart else MEANINGLESS
+            unmeasured = kind == "velocity" and share == 0
+            means = "its friction is not compared" if unmeasured else MEANINGLESS
             yield f"joint {j + 1}: the {kind} ranges of {ranges} {units[kind][j]} share {share:.0%}; {means}"
 
 
 def shared(one: Float[np.ndarray, " 2"], two: Float[np.ndarray, " 2"]) -> float:
     """Share of the range that two visited together which both visited; 1 where either is not known."""
     inside = min(one[1], two[1]) - max(one[0], two[0])
-    whole = max(one[1], two[1]) - min(one[0], two[0])
-    return float(np.clip(inside / whole, 0.0, 1.0)) if np.isfinite(whole) and whole > 0 else 1.0
+    union = max(one[1], two[1]) - min(one[0], two[0])
+    return float(np.clip(inside / union, 0.0, 1.0)) if np.isfinite(union) and union > 0 else 1.0

@@ -40,8 +40,8 @@ class Effort(NamedTuple):
     """Passes of a refit."""
     most: int = 4
     """Effects at most."""
-    loud: float = 5.0
-    """Standard deviations of a kick with which a track begins to diverge."""
+    large_kick: float = 5.0
+    """Kick [its standard deviations] from which on a sequence counts as diverged."""
     later: tuple[int, ...] = (8, 3, 1)
     """Rows after that which still count; the fewer where the many are too much."""
 
@@ -88,16 +88,16 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
     before, rows = context.before, context.data.t.shape[1]
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
     posterior = e_step(now.model, every, smoother, key=before.state.key)
-    whole = np.asarray(kept(posterior, every))
+    followed = np.asarray(kept(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    fit = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
-    if whole.all():
-        return fit, whole
+    fit = SmoothedFit(context.declared, now, *both, followed, rows, context.pieces)
+    if followed.all():
+        return fit, followed
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
-    loud = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.loud)
-    first = np.where(loud.any(axis=1), loud.argmax(axis=1), every.t.shape[1])
-    row, used, cut = np.arange(every.t.shape[1]), whole, every
+    large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.large_kick)
+    first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
+    row, used, cut = np.arange(every.t.shape[1]), followed, every
     for later in context.effort.later:
         early = every.valid & jnp.asarray(row < first[:, None] + later)
         cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
@@ -105,7 +105,7 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
-    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
+    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), followed
 
 
 def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:

@@ -17,7 +17,7 @@ from ..em.identify import Identified, friction_table
 from ..numerics.digits import with_std
 from ..systems import AbstractSystem
 from .hypothesis import blocks
-from .keys import Key, key_of, listed, rest_of, with_article, words
+from .keys import Key, key_of, listed, remainder_of, with_article, words
 from .outcome import Closed
 
 
@@ -87,7 +87,7 @@ def findings(closed: Closed) -> list[Finding]:
     fitted, model = closed.after, closed.after.model
     cov = covariance(fitted)
     own = [cov[block, block] for block in blocks(model, fitted.m_step)]
-    laws = [None if (place := rest_of(e, model)) is None else model.effects[place] for e in model.effects]
+    laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]
     entries = list(zip(model.effects, closed.found, own, laws, strict=True))
     out = []
     for effect, found, numbers, law in entries:

@@ -87,7 +87,7 @@ class Hypothesis(NamedTuple):
         """The same with other numbers in the model."""
         return self._replace(model=model)
 
-    def because(self, place: int, found: Found) -> "Hypothesis":
+    def with_evidence(self, place: int, found: Found) -> "Hypothesis":
         """The same with the evidence of the effect at `place`."""
         evidence = list(self.found)
         evidence[place] = found

@@ -44,7 +44,7 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-def rest_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
+def remainder_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the named law whose rest an unnamed one is: a function of the same signals at the same joint."""
     laws = (i for i, e in enumerate(model.effects) if e.named and _alike(e, effect, model))
     return None if effect.named else next(laws, None)
@@ -58,7 +58,7 @@ def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
 
 
-def covered(effect: AbstractEffect, model: StateSpaceModel) -> bool:
+def completed(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """True if an unnamed law in the model is a function of the same signals at the same joint as a named one."""
     return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
 

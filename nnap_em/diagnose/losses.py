@@ -164,8 +164,8 @@ class OneStep(AbstractLoss):
             innovations = each(_innovations, common, (local, own.middle, along(own)), together=1)
             parts.append([np.asarray(a, np.float32) for a in innovations])
         error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
-        sound = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
-        weight = (np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None] & sound[:, None, None]).astype(
+        finite = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
+        weight = (np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None] & finite[:, None, None]).astype(
             float
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)

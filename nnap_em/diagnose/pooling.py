@@ -46,15 +46,15 @@ def joint_test(value: Float[np.ndarray, "fit number"], cov: Float[np.ndarray, "f
     with a generalised inverse]
     """
     contrasts = np.asarray(scipy.linalg.helmert(len(value)))
-    apart = (contrasts @ value).ravel()
-    spread = np.einsum("ai,bi,imn->ambn", contrasts, contrasts, cov).reshape(apart.size, apart.size)
+    differences = (contrasts @ value).ravel()
+    spread = np.einsum("ai,bi,imn->ambn", contrasts, contrasts, cov).reshape(differences.size, differences.size)
     scale = np.sqrt(np.maximum(np.diag(spread), 0.0))
     known = scale > 0
     unit = spread[np.ix_(known, known)] / np.outer(scale[known], scale[known])
     variance, turn = np.linalg.eigh(unit)
-    kept = variance >= LEAST_VARIANCE
-    along = turn.T @ (apart[known] / scale[known])
-    statistic, freedom = float(np.sum(along[kept] ** 2 / variance[kept])), int(kept.sum())
+    determined = variance >= LEAST_VARIANCE
+    along = turn.T @ (differences[known] / scale[known])
+    statistic, freedom = float(np.sum(along[determined] ** 2 / variance[determined])), int(determined.sum())
     p = float(scipy.stats.chi2.sf(statistic, freedom)) if freedom else 1.0
     return JointTest(statistic, freedom, p, p)
 

@@ -21,7 +21,7 @@ from .propose import proposals, seeded, surroundings
 from .refit import Trial, refit
 from .screen import screen
 from .smoothed import SmoothedFit
-from .verdict import EVEN_NATS
+from .verdict import EQUIVALENT_NATS
 
 STARTS = 3
 """Places from which a law is fitted; one that is not linear, from all that there are."""
@@ -62,7 +62,7 @@ def again(fitted: Identified, data: Dataset) -> Identified:
     return _with(fitted, refit(fit.model, rule, fit.path, fit.data, fit.used, passes=PASSES))
 
 
-def apart(closed: Closed, data: Dataset) -> Closed:
+def compare_equivalents(closed: Closed, data: Dataset) -> Closed:
     """`closed` after its effects and their equivalents were compared over the whole length of the logs.
 
     Screens are linear, fits over the whole length are not: an equivalent that is
@@ -76,14 +76,14 @@ def apart(closed: Closed, data: Dataset) -> Closed:
         own = max(_total(one) for one in (again(fitted, data), own[1]) if one is not None)
         leads = {key: _total(other) - own for key, other in others if other is not None}
         best, other = max(others, key=lambda entry: leads.get(entry[0], -math.inf))
-        if other is not None and leads[best] > EVEN_NATS:
+        if other is not None and leads[best] > EQUIVALENT_NATS:
             rest = [one for i, one in enumerate(closed.found) if i != place]
-            even = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EVEN_NATS]
-            found = found._replace(equivalent=tuple(even), gain=found.gain + leads[best])
+            equivalent = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EQUIVALENT_NATS]
+            found = found._replace(equivalent=tuple(equivalent), gain=found.gain + leads[best])
             return closed._replace(after=_settled(other, data), found=(*rest, found))
-        even = [key for key in found.equivalent if leads.get(key, 0.0) >= -EVEN_NATS]
+        equivalent = [key for key in found.equivalent if leads.get(key, 0.0) >= -EQUIVALENT_NATS]
         both = closed.found[:place], closed.found[place + 1 :]
-        closed = closed._replace(found=(*both[0], found._replace(equivalent=tuple(even)), *both[1]))
+        closed = closed._replace(found=(*both[0], found._replace(equivalent=tuple(equivalent)), *both[1]))
     return closed
 
 

@@ -10,14 +10,14 @@ from ..model.state_space import StateSpaceModel
 from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
 from .context import SearchContext
-from .keys import Key, contains, covered, free_signals, key_of, replaced, rest_of, words
+from .keys import Key, completed, contains, free_signals, key_of, remainder_of, replaced, words
 from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
 from .refit import Trial
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
 from .trial import Refit, fitted, with_candidate
-from .verdict import EVEN, EVEN_NATS, NAMED, SAME, agreed, odds, required, suspected
+from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, SAME, agreed, odds, required, suspected
 
 _Law = TypeVar("_Law", Screened, Refit)
 
@@ -54,16 +54,16 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
         while admitted and len(tried) < context.effort.shortlist:
             first = min(s.band for s in admitted)
             entries = _entries([s for s in admitted if s.band == first], model)
-            even = [s for s in entries if score(s, model) >= EVEN * score(entries[0], model)]
-            group = even + _inside(even, admitted, model)
+            tied = [s for s in entries if score(s, model) >= EQUIVALENT * score(entries[0], model)]
+            group = tied + _inside(tied, admitted, model)
             cases = []
             for s in group:
                 cases.append(with_candidate(s, cast(Trial, null), *fitting))
                 _log(cases[-1], context)
             tried += cases
-            sound = [case for case in cases if case.rejection is None]
-            if sound:
-                return _accepted(sound, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
+            admissible = [case for case in cases if case.rejection is None]
+            if admissible:
+                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
         step = step._replace(untried=len(admitted))
@@ -72,26 +72,26 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
-def _accepted(sound: list[Refit], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
     """Choose among laws that the screen cannot distinguish.
 
     The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
     best odds, then the likeliest.  None is accepted where one of these is of another cause.
     """
-    sound = _standing(sound, [case.removed for case in sound], fit.model)
-    values = [case.removed * _odds(case.candidate.start, fit.model) for case in sound]
-    even = [case for case, value in zip(sound, values, strict=True) if value >= EVEN * max(values)]
-    best = max(even, key=lambda case: (_odds(case.candidate.start, fit.model), case.gain))
+    admissible = _standing(admissible, [case.removed for case in admissible], fit.model)
+    values = [case.removed * _odds(case.candidate.start, fit.model) for case in admissible]
+    tied = [case for case, value in zip(admissible, values, strict=True) if value >= EQUIVALENT * max(values)]
+    best = max(tied, key=lambda case: (_odds(case.candidate.start, fit.model), case.gain))
     law = best.candidate.start
-    rivals = [case for case in even if other_cause(case.effect, law, fit.model.system)]
+    rivals = [case for case in tied if other_cause(case.effect, law, fit.model.system)]
     if rivals and context.loss.predicts:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = zip(candidates, overlaps(outcome.screen, best.screened), strict=True)
-    same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EVEN_NATS)]
-    same += [key_of(case.effect) for case in even if case.effect.named and best.gain - case.gain < EVEN_NATS]
+    same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EQUIVALENT_NATS)]
+    same += [key_of(case.effect) for case in tied if case.effect.named and best.gain - case.gain < EQUIVALENT_NATS]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
 
@@ -111,7 +111,7 @@ def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceMo
     kept: list[tuple[_Law, float]] = []
     for law, value in sorted(zip(laws, values, strict=True), key=lambda pair: free_signals(pair[0].candidate.start)):
         inside = [k for k in kept if contains(law.candidate.start, k[0].candidate.start, model.system)]
-        if not any(other >= EVEN * value for _, other in inside):
+        if not any(other >= EQUIVALENT * value for _, other in inside):
             kept = [k for k in kept if not any(k is other for other in inside)] + [(law, value)]
     return [law for law, _ in kept]
 
@@ -145,7 +145,7 @@ def score(screened: Screened, model: StateSpaceModel) -> float:
 
 
 def _odds(law: AbstractEffect, model: StateSpaceModel) -> float:
-    remainder = rest_of(law, model) is not None or replaced(law, model) is not None
+    remainder = remainder_of(law, model) is not None or replaced(law, model) is not None
     return odds(free_signals(law), remainder=remainder)
 
 
@@ -157,7 +157,7 @@ def _listed(screened: Screened) -> float:
 def _fresh(law: AbstractEffect, model: StateSpaceModel) -> bool:
     """True for a law that the model does not hold, or that takes the place of one."""
     present = {key_of(effect) for effect in model.effects}
-    return (key_of(law) not in present or replaced(law, model) is not None) and not covered(law, model)
+    return (key_of(law) not in present or replaced(law, model) is not None) and not completed(law, model)
 
 
 def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:

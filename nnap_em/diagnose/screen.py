@@ -296,10 +296,10 @@ def overlaps(screen: Screen, chosen: Screened) -> list[float]:
     candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
     where = spans(candidates)
     own = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
-    whole, out = information[own, own].astype(float), []
+    total, out = information[own, own].astype(float), []
     for here in where:
         cross = information[own, here].astype(float)
         block = information[here, here].astype(float)
-        left = whole - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross.T
-        out.append(float(np.clip(np.trace(left) / max(np.trace(whole), 1e-300), 0.0, 1.0)))
+        left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross.T
+        out.append(float(np.clip(np.trace(left) / max(np.trace(total), 1e-300), 0.0, 1.0)))
     return out

@@ -25,11 +25,11 @@ from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, renamed, silent
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
-from .keys import Key, key_of, replaced, rest_of, words
+from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Closed, Step
 from .quantised import quantised
-from .rivals import apart
+from .rivals import compare_equivalents
 from .rounds import Round, screening_round
 from .trial import Refit, fitted
 from .verdict import Rejection, explains, needed
@@ -38,9 +38,9 @@ from .verdict import Rejection, explains, needed
 def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
     """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
     release_programs()
-    fit, whole = smooth(context, now, length)
+    fit, followed = smooth(context, now, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
-    context.log(f"{context.loss.measure}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
+    context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
     added = sum(not effect.read_off for effect in now.model.effects)
     if not fit.used.any() or added >= context.effort.most:
         return now
@@ -55,14 +55,14 @@ def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) ->
     """`now` with a refitted law; a named law whose remainder explains the larger part of both gives way to that."""
     context.log(f"  added {words(key_of(case.effect))}")
     m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, now.m_step.tie)  # under the old hold on noise
-    following, rest = case.after._replace(m_step=m_step), rest_of(case.effect, now.model)
+    following, rest = case.after._replace(m_step=m_step), remainder_of(case.effect, now.model)
     form = replaced(case.effect, now.model)
     place = rest if form is None else form
     law = None if place is None else now.found[place]
     if law is None or (form is None and explains(law.removed, case.removed)):
-        return following.because(-1, found)
+        return following.with_evidence(-1, found)
     both = found._replace(removed=1 - (1 - law.removed) * (1 - case.removed))  # over the model without the older law
-    following = following.because(-1, both)
+    following = following.with_evidence(-1, both)
     if form is not None:  # its place is taken already
         return following
     context.log(f"  {words(key_of(now.model.effects[cast(int, rest)]))} is a part of it, and is removed")
@@ -94,14 +94,14 @@ def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
         if not fit.used.any():
             break
         full = fitted(now, fit.path, fit, context.loss, context.effort.passes)
-        lost = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
-        least = int(np.argmin(lost))
+        losses = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
+        least = int(np.argmin(losses))
         floor = context.loss.bars.floor(context.loss.count(fit))
-        if needed(lost[least], floor):
+        if needed(losses[least], floor):
             break
         name = words(key_of(now.model.effects[least]))
-        reason = f"without it {lost[least]:.1%} of the squared error is lost, {floor:.1%} counts"
-        context.log(f"  {name} is removed: {reason if lost[least] > -math.inf else Rejection('impossible').sentence}")
+        reason = f"without it {losses[least]:.1%} of the squared error is lost, {floor:.1%} counts"
+        context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
         now = now.without(least)
     return now
 
@@ -112,7 +112,7 @@ def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> flo
     Infinite for steps of a reading, which are seen in the numbers themselves.
     """
     effect = now.model.effects[place]
-    if effect.read_off or any(rest_of(other, now.model) == place for other in now.model.effects):
+    if effect.read_off or any(remainder_of(other, now.model) == place for other in now.model.effects):
         return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
     if not effect.possible():
         return -math.inf
@@ -143,7 +143,7 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     if one_step is None:
         return closed
     try:
-        return apart(closed, data)
+        return compare_equivalents(closed, data)
     except FitError as error:
         context.log(f"  equivalent laws could not be compared over the whole length ({error})")
         return closed
@@ -281,8 +281,8 @@ def close_the_loop(
     before = identified(data)
     if white_readings(data, before.model):
         return search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True)
-    before, data, touches, pieces = disturbance_free(identified, before, data)
-    if touches:
-        log(f"{len(touches)} external disturbances: their rows are left out")
+    before, data, disturbances, pieces = disturbance_free(identified, before, data)
+    if disturbances:
+        log(f"{len(disturbances)} external disturbances: their rows are left out")
     closed = search(SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), white=False)
-    return closed._replace(interventions=touches, pieces=pieces)
+    return closed._replace(interventions=disturbances, pieces=pieces)

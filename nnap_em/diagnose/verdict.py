@@ -23,10 +23,10 @@ CERTAIN = 5.0
 """Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
 DETERMINED = 2.0
 """The same for its amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
-EVEN = 0.9
+EQUIVALENT = 0.9
 """Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
 refits decide between others, and between laws of different causes the question stays open."""
-EVEN_NATS = 5.0
+EQUIVALENT_NATS = 5.0
 """Log-likelihood [nat] within which two laws are indistinguishable: 1 in 150."""
 SAME = 0.01
 """Share of the information on an effect that an equivalent one may leave unexplained."""
@@ -139,9 +139,9 @@ def veto(
     return None if needed(removed, required(floor, signals)) else Rejection("small", removed)
 
 
-def needed(lost: float, floor: float) -> bool:
+def needed(share: float, floor: float) -> bool:
     """True for a share between two fits, with an effect and without it, that is enough for the effect."""
-    return lost >= KEEP * floor
+    return share >= KEEP * floor
 
 
 def explains(own: float, more: float) -> bool:
@@ -149,7 +149,7 @@ def explains(own: float, more: float) -> bool:
 
     The law removes the share `own`, the remainder the share `more` of what is left then.
     """
-    return own >= EVEN * (own + (1 - own) * more)
+    return own >= EQUIVALENT * (own + (1 - own) * more)
 
 
 def suspected(share: float, floor: float, chance: float) -> bool:

@@ -118,9 +118,9 @@ class PayloadStep(JointEffect):
         first, last = around.duration
         out = []
         for j, size in varieties(around, "payload"):
-            make, apart, edge = partial(cls.of, joint=j), (last - first) / 24, 3 * around.dt
-            for time in (first + apart * i for i in range(1, 24)):
-                probe, spread = make(0.05 * size, time, edge), make(size, apart, edge)
+            make, interval, edge = partial(cls.of, joint=j), (last - first) / 24, 3 * around.dt
+            for time in (first + interval * i for i in range(1, 24)):
+                probe, spread = make(0.05 * size, time, edge), make(size, interval, edge)
                 out.append(Candidate(make(0.0, time, edge), (probe,), spread))
         return out
 

@@ -124,11 +124,11 @@ class LoadFriction(JointEffect):
         return out
 
     def richer(self, around):
-        apart, falls = self.load is not None, self.stribeck is not None
+        two_sided, falls = self.load is not None, self.stribeck is not None
         if not falls:
             both = [self._with_stribeck(share * float(around.speed[self.joint - 1])) for share in (0.05, 0.15, 0.4)]
-            return [_grown(self, form) for form in both] + ([] if apart else [_grown(self, self._with_load())])
-        if not apart:
+            return [_grown(self, form) for form in both] + ([] if two_sided else [_grown(self, self._with_load())])
+        if not two_sided:
             return [_grown(self, self._with_load())]
         if self.square_load is not None:
             return []
@@ -141,8 +141,8 @@ class LoadFriction(JointEffect):
 
     def _with_load(self) -> "LoadFriction":
         share = 1.0 if self.whole else 0.0
-        apart = replace(self, load=share * self.mu)
-        return apart if self.stribeck is None else replace(apart, load_stribeck=share * self.stribeck)
+        split = replace(self, load=share * self.mu)
+        return split if self.stribeck is None else replace(split, load_stribeck=share * self.stribeck)
 
     def values(self):
         mu, load, stribeck, load_stribeck = self._shares()

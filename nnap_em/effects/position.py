@@ -171,8 +171,8 @@ class HardStop(PlaceEffect):
         return out
 
     def possible(self):
-        apart = float(self.upper - self.lower) > 0.3 * float(self.reach)
-        return apart and float(self.stiffness) > float(self.soft)
+        separate = float(self.upper - self.lower) > 0.3 * float(self.reach)
+        return separate and float(self.stiffness) > float(self.soft)
 
     def force(self, scene, memory):
         q, v = self.own(scene.q), self.own(scene.v)

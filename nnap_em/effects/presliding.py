@@ -56,8 +56,8 @@ class PreslidingFriction(JointEffect):
         v = self.own(scene.v)
         fast = jnp.sign(v) * jnp.sqrt(v**2 + self.knee**2)
         away = scene.v.at[self.joint - 1].set(jnp.where(v == 0, self.knee, fast))
-        whole = jnp.abs(0.5 * self.own(scene.map(away) - scene.map(-away)))
-        return jnp.maximum(whole - self.viscous * jnp.abs(fast), 0.1 * whole) + 1e-9
+        total = jnp.abs(0.5 * self.own(scene.map(away) - scene.map(-away)))
+        return jnp.maximum(total - self.viscous * jnp.abs(fast), 0.1 * total) + 1e-9
 
     def force(self, scene, memory):
         torque = memory[0] + self.damping * jnp.exp(-self.log_sigma) * self.drift(scene, memory)[0]

@@ -98,8 +98,8 @@ def exp2(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     if x.dtype != jnp.float32:
         return jnp.exp2(x)
     x = jnp.maximum(x, -126.0)
-    whole = jnp.round(x)
-    z = (x - whole) * math.log(2)
+    integer = jnp.round(x)
+    z = (x - integer) * math.log(2)
     power = 1 + z * (1 + z * (1 / 2 + z * (1 / 6 + z * (1 / 24 + z / 120))))
-    shift = whole.astype(jnp.int32) << 23
+    shift = integer.astype(jnp.int32) << 23
     return jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(power, jnp.int32) + shift, jnp.float32)

@@ -77,9 +77,9 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         mesh = Mesh(mesh.devices[: -(-count // share)], mesh.axis_names)
     rounds = -(-share // (together or share))
     group = -(-share // rounds)
-    whole = group * rounds * (1 if mesh is None else mesh.size)
-    if whole > count:  # what is over does the work of the last once more
-        index = np.minimum(np.arange(whole), count - 1)
+    padded = group * rounds * (1 if mesh is None else mesh.size)
+    if padded > count:  # what is over does the work of the last once more
+        index = np.minimum(np.arange(padded), count - 1)
         batch = jax.tree.map(lambda a: a[index], batch)
     if mesh is None:
         common, batch = at_home((common, batch))
@@ -87,7 +87,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     else:
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
         out = _gather(_program(function)(mesh, group, common, batch))
-    return jax.tree.map(lambda a: a[:count], out) if whole > count else out
+    return jax.tree.map(lambda a: a[:count], out) if padded > count else out
 
 
 def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " some"], tuple[Any, ...]]]:
@@ -155,8 +155,8 @@ def _place(tree, sharding: NamedSharding):
             plain = [np.asarray(a) for a in plain]
         placed = jax.device_put(plain, sharding)  # all in one call: each takes its time
     else:
-        whole = [np.asarray(a) for a in plain]
-        placed = [jax.make_array_from_callback(a.shape, sharding, a.__getitem__) for a in whole]
+        local = [np.asarray(a) for a in plain]
+        placed = [jax.make_array_from_callback(a.shape, sharding, a.__getitem__) for a in local]
     keyed = [
         a if kind is None else jax.random.wrap_key_data(a, impl=kind) for a, kind in zip(placed, kinds, strict=True)
     ]

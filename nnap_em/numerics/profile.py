@@ -29,7 +29,7 @@ class Profile:
             self.spent[name][STAGES[event]].append(duration_secs)
 
     def __str__(self) -> str:
-        whole = time.perf_counter() - self._began
+        elapsed = time.perf_counter() - self._began
         row = lambda *cells: "{:32.32} {:>8} {:>9} {:>9} {:>9}".format(*cells)  # noqa: E731
         seconds = lambda stages: [f"{sum(stages[stage]):.2f}" for stage in STAGES.values()]  # noqa: E731
         order = sorted(self.spent.items(), key=lambda one: -sum(map(sum, one[1].values())))
@@ -40,7 +40,7 @@ class Profile:
                 row("program", "count", "trace s", "lower s", "compile s"),
                 *(row(name, len(stages["compile"]), *seconds(stages)) for name, stages in programs),
                 row(f"all of {len(programs)} names", len(every["compile"]), *seconds(every)),
-                f"{whole:.1f} s in all; a program within another is traced with it, and counts in both",
+                f"{elapsed:.1f} s in all; a program within another is traced with it, and counts in both",
             ]
         )
 

@@ -15,7 +15,7 @@ from ..model.state_space import StateSpaceModel
 from ..systems.tree import Tree
 from . import acting
 from .export import literal, unrolled
-from .homes import takes_time
+from .placement import takes_time
 
 
 class Acting(NamedTuple):
@@ -28,7 +28,7 @@ class Acting(NamedTuple):
 def actuator(
     fitted: Identified,
     model: StateSpaceModel,
-    homeless: Sequence[tuple[AbstractEffect, str]],
+    unplaced: Sequence[tuple[AbstractEffect, str]],
     motors: Sequence[Any],
 ) -> Acting:
     """The module of the laws that a written file does not hold; those of bodies and with states of their own aside.
@@ -37,7 +37,7 @@ def actuator(
     """
     rig, system = fitted.rig, model.system
     assert isinstance(system, Tree)
-    laws = tuple(effect for effect, _ in homeless if _momentary(effect))
+    laws = tuple(effect for effect, _ in unplaced if _momentary(effect))
     dof, driven = len(system.coordinates), [motor for motor in motors if motor.joint + 1 in system.joints]
 
     def command(u):

@@ -15,7 +15,7 @@ from ..em.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_text
 from .export import ExportError, unrolled
-from .homes import of_command
+from .placement import of_command
 from .unroll import Source
 
 CALLS: dict[str, str] = {
@@ -106,10 +106,10 @@ def function(source: Source) -> str:
     (results,) = source.results
     arrays = [f"const double {name}[{size}]" for name, size in source.sizes.items()]
     lines = [f"void {source.name}({', '.join(arrays)}, double tau[{len(results)}])", "{"]
-    whole = "\n".join((*source.lines, *results))
+    code = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
         lines += [
-            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", whole)
+            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", code)
         ]
         lines += [f"    (void){name};"]
     whole_numbers: set[str] = set()

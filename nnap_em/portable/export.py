@@ -21,7 +21,7 @@ from ..report.tables import write_json
 from ..storage.files import replace_bytes, replace_text
 from ..systems import AbstractSystem
 from . import program as portable
-from .homes import of_command
+from .placement import of_command
 from .unroll import Source, UnrollError, unroll
 
 PARAMETERS, PREDICTOR, STEP = "parameters.json", "predictor.py", "model.stablehlo"
@@ -175,11 +175,11 @@ def unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments:
     rng, space = np.random.default_rng(0), {"np": np}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    wanted = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    expected = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):
         outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
-    for mine, truth in zip((outputs,) if len(wanted) == 1 else outputs, wanted, strict=True):
+    for mine, truth in zip((outputs,) if len(expected) == 1 else outputs, expected, strict=True):
         flat = np.asarray(truth, np.float64).reshape(4, -1)
         own = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
         bound = math.sqrt(jnp.finfo(truth.dtype).eps)

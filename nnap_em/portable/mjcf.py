@@ -18,10 +18,10 @@ from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .actuator import actuator
+from .content import Bristle, Contact, Content, Drive, JointContent, SensorContent
 from .export import ExportError
 from .friction import SHARE, FrictionForm, friction_forms
-from .homes import file_springs, placed
-from .sheet import Bristle, Contact, Drive, JointSheet, SensorSheet, Sheet
+from .placement import file_springs, placed
 
 STEP = 5e-4
 """Longest time step of a written file [s]."""
@@ -65,10 +65,10 @@ def write_model(
 ) -> list[str]:
     """`write_mjcf` for a model and friction near those of a fit."""
     system = as_it_is(fitted, model)
-    sheet, homeless = placed(sheet_of(fitted, model, system, forms), model.effects)
-    sheet = with_dips(sheet)
-    if alone and homeless:
-        effect, reason = homeless[0]
+    content, unplaced = placed(content_of(fitted, model, system, forms), model.effects)
+    content = with_dips(content)
+    if alone and unplaced:
+        effect, reason = unplaced[0]
         raise ExportError(
             f"{named(effect)} has no place in MuJoCo ({reason}); leave out --alone to have {beside(out).name} play it, "
             "or diagnose again without this law"
@@ -78,12 +78,12 @@ def write_model(
         for name, form in zip(system.coordinates, forms, strict=True)
         if form.missed > SHARE
     ]
-    acting = actuator(fitted, model, homeless, motors_of(fitted, system)) if homeless else None
+    acting = actuator(fitted, model, unplaced, motors_of(fitted, system)) if unplaced else None
     left += [
         f"{named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
-        for effect, reason in homeless
+        for effect, reason in unplaced
     ]
-    root = _model(sheet, motors_of(fitted, system))
+    root = _model(content, motors_of(fitted, system))
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
     comment = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
     root.insert(0, ET.Comment(comment.replace("--", "- -")))
@@ -115,26 +115,26 @@ def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
     return true
 
 
-def sheet_of(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> Sheet:
-    """The sheet of a machine before its laws."""
+def content_of(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> Content:
+    """The content of a machine before its laws."""
     noise = np.exp(0.5 * np.asarray(model.log_r))
-    sensors = {name: SensorSheet(noise=float(std)) for name, std in zip(fitted.rig.measured, noise, strict=True)}
-    joints = tuple(JointSheet(form=form) for form in forms)
+    sensors = {name: SensorContent(noise=float(std)) for name, std in zip(fitted.rig.measured, noise, strict=True)}
+    joints = tuple(JointContent(form=form) for form in forms)
     drives = {joint: Drive() for joint in system.joints}
-    return file_springs(Sheet(system, system.machine.gravity, model.dt, joints, drives, sensors))
+    return file_springs(Content(system, system.machine.gravity, model.dt, joints, drives, sensors))
 
 
-def with_dips(sheet: Sheet) -> Sheet:
-    """The sheet with a stiff bristle at every joint whose friction dips: MuJoCo has a dip only there."""
-    inertia = 1 / _mobility(sheet.system)
-    for number, joint in enumerate(sheet.joints, 1):
+def with_dips(content: Content) -> Content:
+    """The content with a stiff bristle at every joint whose friction dips: MuJoCo has a dip only there."""
+    inertia = 1 / _mobility(content.system)
+    for number, joint in enumerate(content.joints, 1):
         form = joint.form
         if joint.bristle is None and form.breakaway > form.coulomb:
-            soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * sheet.dt)
+            soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * content.dt)
             stiffness = min(soft, STIFF * _level(form) / (form.fastest * STEP))
             bristle = Bristle(stiffness, float(np.sqrt(stiffness * inertia[number - 1])))
-            sheet = sheet.with_joint(number, bristle=bristle)
-    return sheet
+            content = content.with_joint(number, bristle=bristle)
+    return content
 
 
 def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
@@ -160,35 +160,35 @@ def named(effect: AbstractEffect) -> str:
 # --- XML
 
 
-def _model(sheet: Sheet, motors: Sequence[Motor]) -> ET.Element:
-    machine = sheet.system.machine
+def _model(content: Content, motors: Sequence[Motor]) -> ET.Element:
+    machine = content.system.machine
     root = ET.Element("mujoco", model=Path(machine.file).stem)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    step = sheet.dt / math.ceil(sheet.dt / _longest_step(sheet) - 1e-9)
-    ET.SubElement(root, "option", timestep=_text(step), integrator="RK4", gravity=_text(*sheet.gravity))
+    step = content.dt / math.ceil(content.dt / _longest_step(content) - 1e-9)
+    ET.SubElement(root, "option", timestep=_text(step), integrator="RK4", gravity=_text(*content.gravity))
     world = ET.SubElement(root, "worldbody")
-    mobility = _mobility(sheet.system)
-    places = _bodies(world, sheet, mobility)
+    mobility = _mobility(content.system)
+    places = _bodies(world, content, mobility)
     tendons = ET.Element("tendon")
-    for j, joint in enumerate(sheet.joints):
+    for j, joint in enumerate(content.joints):
         if joint.rotor is not None:
             _rotor(world, tendons, machine.joints[j].name, joint, mobility[j])
     if len(tendons):
         root.append(tendons)
     actuators = ET.SubElement(root, "actuator")
     for motor in motors:
-        _motor(actuators, sheet, motor, step)
-    for j, joint in enumerate(sheet.joints):
+        _motor(actuators, content, motor, step)
+    for j, joint in enumerate(content.joints):
         _passive(actuators, machine.joints[j].name, joint)
-    _sensors(ET.SubElement(root, "sensor"), sheet, places, world, step)
+    _sensors(ET.SubElement(root, "sensor"), content, places, world, step)
     return root
 
 
-def _longest_step(sheet: Sheet) -> float:
+def _longest_step(content: Content) -> float:
     """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
     rates = [
         own.bristle.stiffness * own.form.fastest / _level(own.form)
-        for own in sheet.joints
+        for own in content.joints
         if own.bristle is not None and _bristled(own)
     ]
     return max(min([STEP, *(STIFF / rate for rate in rates)]), SHORTEST)
@@ -205,8 +205,8 @@ def _mobility(system: Tree) -> np.ndarray:
     return np.diagonal(np.linalg.inv(np.asarray(system.mass(still))))
 
 
-def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.Element]:
-    machine, places = sheet.system.machine, []
+def _bodies(world: ET.Element, content: Content, mobility: np.ndarray) -> list[ET.Element]:
+    machine, places = content.system.machine, []
     for i, body in enumerate(machine.bodies):
         own = ET.SubElement(
             places[body.parent] if body.parent >= 0 else world,
@@ -218,8 +218,8 @@ def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.El
         places.append(own)
         for j, joint in enumerate(machine.joints):
             if joint.body == i:
-                ET.SubElement(own, "joint", _joint(sheet, joint, sheet.joints[j], mobility[j]))
-        mass, centre, inertia = sheet.system.body_numbers(i)
+                ET.SubElement(own, "joint", _joint(content, joint, content.joints[j], mobility[j]))
+        mass, centre, inertia = content.system.body_numbers(i)
         if float(mass) > 0:
             full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
             ET.SubElement(own, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
@@ -229,7 +229,7 @@ def _bodies(world: ET.Element, sheet: Sheet, mobility: np.ndarray) -> list[ET.El
     return places
 
 
-def _joint(sheet: Sheet, joint: Joint, own: JointSheet, mobility: float) -> dict[str, str]:
+def _joint(content: Content, joint: Joint, own: JointContent, mobility: float) -> dict[str, str]:
     """Attributes of a joint, those aside that are MuJoCo's own."""
     viscous, bristled = own.form.viscous + own.viscous, _bristled(own)
     given = {
@@ -237,7 +237,7 @@ def _joint(sheet: Sheet, joint: Joint, own: JointSheet, mobility: float) -> dict
         "type": "slide" if joint.slide else "hinge",
         "axis": _text(*joint.axis),
         "pos": _text(*joint.anchor),
-        "armature": _text(sheet.system.values.get(f"{joint.name}.armature", joint.armature)),
+        "armature": _text(content.system.values.get(f"{joint.name}.armature", joint.armature)),
         "damping": _text(viscous, own.drag) if own.drag else _text(viscous),
         "frictionloss": _text(0.0 if bristled else own.form.coulomb),
     }
@@ -248,7 +248,7 @@ def _joint(sheet: Sheet, joint: Joint, own: JointSheet, mobility: float) -> dict
     return given | ({"range": _text(*joint.range)} if joint.range else {})
 
 
-def _spring(own: JointSheet) -> dict[str, str]:
+def _spring(own: JointContent) -> dict[str, str]:
     """Stiffness and rest of a pull; a constant that has no rest goes to `_passive`."""
     rest = _rest(own)
     if not any(own.pull[1:]):
@@ -258,7 +258,7 @@ def _spring(own: JointSheet) -> dict[str, str]:
     return {"stiffness": _text(*(slopes if c or d else slopes[:1])), "springref": _text(rest)}
 
 
-def _rest(own: JointSheet) -> float:
+def _rest(own: JointContent) -> float:
     """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
     a, b, c, d = own.pull
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
@@ -274,7 +274,7 @@ def _contact(contact: Contact, mobility: float, of: str) -> dict[str, str]:
     }
 
 
-def _rotor(world: ET.Element, tendons: ET.Element, name: str, own: JointSheet, mobility: float) -> None:
+def _rotor(world: ET.Element, tendons: ET.Element, name: str, own: JointContent, mobility: float) -> None:
     """The motor as a wheel of its own, joined to its joint by a tendon."""
     rotor = own.rotor
     assert rotor is not None
@@ -293,10 +293,10 @@ def _rotor(world: ET.Element, tendons: ET.Element, name: str, own: JointSheet, m
     ET.SubElement(tendon, "joint", joint=name, coef="-1")
 
 
-def _motor(actuators: ET.Element, sheet: Sheet, motor: Motor, step: float) -> None:
-    name, joint = sheet.system.machine.joints[motor.joint].name, sheet.joints[motor.joint]
+def _motor(actuators: ET.Element, content: Content, motor: Motor, step: float) -> None:
+    name, joint = content.system.machine.joints[motor.joint].name, content.joints[motor.joint]
     given = {"name": motor.name, "joint": f"{name}_rotor" if joint.rotor else name, "gear": _text(motor.gear)}
-    drive = sheet.drives.get(motor.joint + 1, Drive())
+    drive = content.drives.get(motor.joint + 1, Drive())
     more = _drive(drive, abs(motor.unit), step)
     ET.SubElement(actuators, "general" if {"gainprm", "dyntype"} & set(more) else "motor", given | more)
 
@@ -323,7 +323,7 @@ def _late(delay: float, step: float) -> dict[str, str]:
     return {"delay": _text(late), "nsample": str(ROOM * (math.ceil(delay / step) + 1)), "interp": "linear"}
 
 
-def _passive(actuators: ET.Element, name: str, own: JointSheet) -> None:
+def _passive(actuators: ET.Element, name: str, own: JointContent) -> None:
     """Torques of a joint that MuJoCo has as those of a passive motor: cogging, a bristle, a constant."""
     still = {"joint": name, "input": "none", "motorconst": "0", "resistance": "1"}
 
@@ -341,26 +341,28 @@ def _passive(actuators: ET.Element, name: str, own: JointSheet) -> None:
         add("bristle", lugre=_text(*bristle, _level(form), form.breakaway, form.stribeck))
 
 
-def _unheld(own: JointSheet) -> float:
+def _unheld(own: JointContent) -> float:
     """Constant pull that no rest holds."""
     a, b, c, d = own.pull
     rest = _rest(own)
     return a + rest * (b + rest * (c + rest * d)) if abs(a) > 0 else 0.0
 
 
-def _bristled(own: JointSheet) -> bool:
+def _bristled(own: JointContent) -> bool:
     return own.bristle is not None and own.form.breakaway > 0
 
 
-def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], world: ET.Element, step: float) -> None:
-    machine = sheet.system.machine
+def _sensors(
+    sensors: ET.Element, content: Content, bodies: Sequence[ET.Element], base: ET.Element, step: float
+) -> None:
+    machine = content.system.machine
     named = {sensor.name for sensor in machine.joint_sensors}
     for sensor in machine.joint_sensors:
         kind = "jointvel" if sensor.rate else "jointpos"
         given = {"name": sensor.name, "joint": machine.joints[sensor.joint].name}
-        ET.SubElement(sensors, kind, given | _reading(sheet.sensors.get(sensor.name), step))
+        ET.SubElement(sensors, kind, given | _reading(content.sensors.get(sensor.name), step))
     dof = len(machine.joints)
-    for name, sensor in sheet.sensors.items():
+    for name, sensor in content.sensors.items():
         if name in named or name not in machine.states or not sensor.delay:
             continue
         place = machine.states.index(name)
@@ -369,14 +371,14 @@ def _sensors(sensors: ET.Element, sheet: Sheet, places: Sequence[ET.Element], wo
         ET.SubElement(sensors, kind, given | _reading(sensor, step))
     for name, sensor in {one.name.rpartition(".")[0]: one for one in machine.sensors}.items():
         axes = _text(*(row[0] for row in sensor.turn), *(row[1] for row in sensor.turn))
-        where = places[sensor.body] if sensor.body >= 0 else world
+        where = bodies[sensor.body] if sensor.body >= 0 else base
         ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sensor.place), xyaxes=axes)
         at = {"objtype": "site", "objname": f"{name}_site"} if sensor.kind == "framepos" else {"site": f"{name}_site"}
-        reading = next((sheet.sensors[f"{name}.{x}"] for x in "xyz" if f"{name}.{x}" in sheet.sensors), None)
+        reading = next((content.sensors[f"{name}.{x}"] for x in "xyz" if f"{name}.{x}" in content.sensors), None)
         ET.SubElement(sensors, sensor.kind, {"name": name, **at, **_reading(reading, step)})
 
 
-def _reading(sensor: SensorSheet | None, step: float) -> dict[str, str]:
+def _reading(sensor: SensorContent | None, step: float) -> dict[str, str]:
     """Noise and delay of a sensor."""
     if sensor is None:
         return {}

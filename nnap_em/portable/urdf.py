@@ -11,10 +11,10 @@ from ..data.machine import Joint
 from ..em.identify import Identified
 from ..storage.files import replace_text
 from ..systems.tree import Tree
+from .content import Content, Drive, JointContent
 from .friction import SHARE, friction_forms
-from .homes import placed
-from .mjcf import MASSLESS, as_it_is, named, sheet_of
-from .sheet import Drive, JointSheet, Sheet
+from .mjcf import MASSLESS, as_it_is, content_of, named
+from .placement import placed
 
 HELD = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
 """Laws that URDF holds, by name: in the numbers of the bodies and in the damping."""
@@ -29,7 +29,7 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
     """
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
-    sheet, _ = placed(sheet_of(fitted, fitted.model, system, forms), fitted.model.effects)
+    content, _ = placed(content_of(fitted, fitted.model, system, forms), fitted.model.effects)
     left = [named(effect) for effect in fitted.model.effects if effect.name not in HELD]
     for joint, form in zip(system.machine.joints, forms, strict=True):
         form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > SHARE
@@ -44,7 +44,7 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
     frames: list[tuple[str, np.ndarray]] = []
     for i, body in enumerate(system.machine.bodies):
         parent, pose = frames[body.parent] if body.parent >= 0 else (_base(system), np.eye(4))
-        frames.append(_body(root, sheet, i, parent, pose @ _pose(body.turn, body.place)))
+        frames.append(_body(root, content, i, parent, pose @ _pose(body.turn, body.place)))
     ET.indent(root)
     replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
     return left
@@ -59,9 +59,9 @@ def _armature(system: Tree, joint: Joint) -> float:
     return float(system.values.get(f"{joint.name}.armature", joint.armature))
 
 
-def _body(root: ET.Element, sheet: Sheet, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
+def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
     """Links and joints of one body at `pose` in the frame of its parent link; its link, and its frame in there."""
-    machine = sheet.system.machine
+    machine = content.system.machine
     body = machine.bodies[i]
     own = [j for j, joint in enumerate(machine.joints) if joint.body == i]
     for k, j in enumerate(own):
@@ -73,8 +73,8 @@ def _body(root: ET.Element, sheet: Sheet, i: int, parent: str, pose: np.ndarray)
         ET.SubElement(element, "parent", link=parent)
         ET.SubElement(element, "child", link=link)
         ET.SubElement(element, "axis", xyz=_text(*joint.axis))
-        _limits(element, joint, sheet.drives.get(j + 1, Drive()))
-        _dynamics(element, sheet.joints[j])
+        _limits(element, joint, content.drives.get(j + 1, Drive()))
+        _dynamics(element, content.joints[j])
         parent, pose = link, np.linalg.inv(anchor)
         if not last:
             _inertial(ET.SubElement(root, "link", name=link), MASSLESS, np.zeros(3), MASSLESS * np.eye(3))
@@ -85,7 +85,7 @@ def _body(root: ET.Element, sheet: Sheet, i: int, parent: str, pose: np.ndarray)
         ET.SubElement(element, "child", link=body.name)
         pose = np.eye(4)
     link = ET.SubElement(root, "link", name=body.name)
-    mass, centre, inertia = sheet.system.body_numbers(i)
+    mass, centre, inertia = content.system.body_numbers(i)
     if float(mass) > 0:
         place = pose @ np.array([*map(float, centre), 1.0])
         _inertial(link, float(mass), place[:3], np.array([[float(x) for x in row] for row in inertia]))
@@ -104,7 +104,7 @@ def _limits(element: ET.Element, joint: Joint, drive: Drive) -> None:
     ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(FAR))
 
 
-def _dynamics(element: ET.Element, own: JointSheet) -> None:
+def _dynamics(element: ET.Element, own: JointContent) -> None:
     viscous = own.form.viscous + own.viscous
     ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(own.form.coulomb))
 

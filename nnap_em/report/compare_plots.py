@@ -16,17 +16,17 @@ def comparison_figure(comparison: Comparison, curve: Curve) -> Figure:
     colours = [COLOURS[i % len(COLOURS)] for i in curve.fits]
     figure = Figure(figsize=(6.6, 5.6 + 0.2 * len(curve.fits)), layout="constrained")
     heights = (1.0, 0.7, 0.04 + 0.05 * len(curve.fits))
-    above, apart, below = figure.subplots(3, 1, sharex=True, height_ratios=heights)
+    above, difference, below = figure.subplots(3, 1, sharex=True, height_ratios=heights)
     for i, colour, torque, std in zip(curve.fits, colours, curve.torque, curve.std, strict=True):
-        for ax, mean in ((above, torque), (apart, torque - curve.pooled.value)):
+        for ax, mean in ((above, torque), (difference, torque - curve.pooled.value)):
             band(ax, curve.velocity, mean, std, colour, comparison.fits[i].name)
             ax.collections[-1].set_label("_")  # the caption explains the bands
     above.plot(curve.velocity, curve.pooled.value, color=TRUTH, lw=1.0, ls="--", label="pooled")
     above.set_ylim(*limits(list(curve.torque), 0.2))
     above.set_ylabel(f"friction [{curve.units[1]}]")
-    apart.set_ylim(*limits(list(curve.torque - curve.pooled.value), 0.5))
-    apart.set_ylabel(f"minus pooled [{curve.units[1]}]")
-    for ax in (above, apart):
+    difference.set_ylim(*limits(list(curve.torque - curve.pooled.value), 0.5))
+    difference.set_ylabel(f"minus pooled [{curve.units[1]}]")
+    for ax in (above, difference):
         ax.axhline(0, color="#BBBBBB", lw=0.8, zorder=0)
     for row, (i, colour) in enumerate(zip(curve.fits, colours, strict=True)):
         low, high = comparison.fits[i].velocity[curve.joint - 1]

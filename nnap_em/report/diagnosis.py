@@ -49,7 +49,7 @@ def write_diagnosis(
     if error:
         error.setdefault("after", error["before"])
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
-    lacked = left["after"].without_effects() if found else left["before"]
+    partial = left["after"].without_effects() if found else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
     nodes = visited_nodes(velocities)
@@ -58,7 +58,7 @@ def write_diagnosis(
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
     figures = [
         *_error_pictures(error, predicted, tables, names, test),
-        *_residual_pictures(left, lacked, names),
+        *_residual_pictures(left, partial, names),
         *_found_pictures(found),
         *_search_pictures(closed.steps, closed.before.rig.named),
     ]
@@ -68,7 +68,7 @@ def write_diagnosis(
         "verdict": verdict(found, error, failed, rivals, suspects, closed.complete),
         "complete": closed.complete,
         "effects": [entry(f) for f in found],
-        "interventions": [_touch(touch, train.files) for touch in closed.interventions],
+        "interventions": [_disturbance(force, train.files) for force in closed.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
         "visited": visited(closed.before, velocities, train) if closed.before.rig.friction else None,
@@ -132,13 +132,13 @@ def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test:
     return picture("error", "One test sequence", caption, figure, test.files[number])
 
 
-def _residual_pictures(left: Mapping[str, Residual], lacked: Residual, names: Names) -> list[Picture]:
+def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: Names) -> list[Picture]:
     return [
         picture(
             "residual",
             "The force that the declared model lacks",
             "What the smoothed motion asks for beyond the declared model, against everything that could cause it.",
-            residual_figure(lacked, names, left.get("after")),
+            residual_figure(partial, names, left.get("after")),
         ),
         picture(
             "residual",
@@ -191,9 +191,9 @@ def _look(step: Step, dt: float) -> dict[str, Any]:
     }
 
 
-def _touch(touch: Intervention, files: Sequence[str]) -> dict[str, Any]:
-    interval = {"joint": touch.joint, "from": touch.from_s, "to": touch.to_s}
-    return {"file": files[touch.sequence], **interval, "size": touch.size, "std": touch.std, "unit": touch.unit}
+def _disturbance(force: Intervention, files: Sequence[str]) -> dict[str, Any]:
+    interval = {"joint": force.joint, "from": force.from_s, "to": force.to_s}
+    return {"file": files[force.sequence], **interval, "size": force.size, "std": force.std, "unit": force.unit}
 
 
 def _screened(key: Key, gain: float) -> dict[str, Any]:

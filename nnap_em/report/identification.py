@@ -81,8 +81,8 @@ def write_identification(
 def _verdict(fitted: Identified, sequences: int) -> str:
     dof = len(fitted.model.system.coordinates)
     friction = [f"the friction of {_counted(dof, 'joint')}"] * fitted.rig.friction
-    wanted = listed([*friction, *parameters(fitted)]) or "the noise"
-    return f"Fitted {wanted} to {_counted(sequences, 'sequence')} in {_counted(fitted.state.epoch, 'epoch')}."
+    estimated = listed([*friction, *parameters(fitted)]) or "the noise"
+    return f"Fitted {estimated} to {_counted(sequences, 'sequence')} in {_counted(fitted.state.epoch, 'epoch')}."
 
 
 def _counted(count: int, noun: str) -> str:

@@ -103,8 +103,8 @@ def window_mean(force: Float[np.ndarray, "seq time dof"], rows: int) -> WindowMe
     for j in range(mean.shape[-1]):
         m, s = mean[..., j], scatter[..., j]
         if np.isfinite(m).any():
-            loud = s >= np.nanquantile(s, 0.9)
-            std[..., j] = np.maximum(level(m), 1.4826 * np.nanmedian(np.abs(m[loud]) / s[loud]) * s)
+            large = s >= np.nanquantile(s, 0.9)
+            std[..., j] = np.maximum(level(m), 1.4826 * np.nanmedian(np.abs(m[large]) / s[large]) * s)
     return WindowMean(mean, std)
 
 
@@ -118,9 +118,9 @@ class Places(NamedTuple):
     views: tuple[Float[np.ndarray, "place feature"], ...]
     """All that a law of one joint may depend on: its angle and rate; the input and rate."""
 
-    def away(self, at: int, apart: int) -> Bool[np.ndarray, " place"]:
+    def away(self, at: int, separation: int) -> Bool[np.ndarray, " place"]:
         """True for places of another moment than `at`."""
-        return (self.seq != self.seq[at]) | (np.abs(self.row - self.row[at]) >= apart)
+        return (self.seq != self.seq[at]) | (np.abs(self.row - self.row[at]) >= separation)
 
 
 def places(residual: Residual, names: Names, dt: float) -> Places:
@@ -145,7 +145,7 @@ def places(residual: Residual, names: Names, dt: float) -> Places:
     return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(views))
 
 
-def neighbours(here: Places, apart: int) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
+def neighbours(here: Places, separation: int) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
     """The places nearest to each in state space; True for those that count: of another moment, and one a moment."""
     count = len(here.seq)
     near = min(128, count)
@@ -154,8 +154,8 @@ def neighbours(here: Places, apart: int) -> tuple[Int[np.ndarray, "place near"],
     known = np.isfinite(distance)
     place = np.where(known, place, 0)
     seq, row = here.seq[place], here.row[place]
-    known &= (seq != here.seq[:, None]) | (np.abs(row - here.row[:, None]) >= apart)
-    moment = seq * (1 + here.row.max(initial=0) // apart) + row // apart
+    known &= (seq != here.seq[:, None]) | (np.abs(row - here.row[:, None]) >= separation)
+    moment = seq * (1 + here.row.max(initial=0) // separation) + row // separation
     counts = np.zeros(place.shape, bool)
     for k in range(near):
         twice = np.any(counts[:, :k] & (moment[:, :k] == moment[:, k : k + 1]), axis=1)
@@ -163,9 +163,9 @@ def neighbours(here: Places, apart: int) -> tuple[Int[np.ndarray, "place near"],
     return place, counts
 
 
-def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, apart: int) -> float:
+def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, separation: int) -> float:
     """The largest share of a force that acts wherever the signals of one joint are the same."""
-    away = here.away(at, apart) & np.isfinite(mean)
+    away = here.away(at, separation) & np.isfinite(mean)
     shares = [0.0]
     for view in here.views:
         distance = np.where(away, np.linalg.norm(view - view[at], axis=1), np.inf)
@@ -187,10 +187,10 @@ def disturbances(
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
     force = np.where(known[..., None], residual.force, np.nan)
     force[:, 0] = np.nan  # no reading before it fixes the start
-    here, apart = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
+    here, separation = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
     if not here.seq.size:
         return ()
-    place, counts = neighbours(here, apart)
+    place, counts = neighbours(here, separation)
     lengths = list(dict.fromkeys(max(3, round(w / dt)) for w in WIDTHS))
     windows = [window_mean(force, rows) for rows in lengths]
     out: list[Intervention] = []
@@ -207,23 +207,23 @@ def disturbances(
             reach = np.asarray(lengths)[:, None] // 2  # of a window: those beside it average the same push
             sure = np.where((here.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(residual.t[i, first]), float(residual.t[i, last])
-            touch = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
-            again = any(overlap(touch, other) for other in out)
-            if not again and repeated(means[k], here, int(at), apart) < REPEATED:
-                out.append(touch)
-    return tuple(sorted((t for t in out if not any(_again(t, other, apart) for other in out)), key=in_order))
+            disturbance = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
+            again = any(overlap(disturbance, other) for other in out)
+            if not again and repeated(means[k], here, int(at), separation) < REPEATED:
+                out.append(disturbance)
+    return tuple(sorted((t for t in out if not any(_again(t, other, separation) for other in out)), key=in_order))
 
 
-def _again(touch: Intervention, other: Intervention, apart: int) -> bool:
+def _again(disturbance: Intervention, other: Intervention, separation: int) -> bool:
     """True if another push on the same joint is so near that both are a swing of the machine."""
-    if (touch.sequence, touch.joint) != (other.sequence, other.joint) or touch is other:
+    if (disturbance.sequence, disturbance.joint) != (other.sequence, other.joint) or disturbance is other:
         return False
-    return max(touch.first - other.last, other.first - touch.last) < apart
+    return max(disturbance.first - other.last, other.first - disturbance.last) < separation
 
 
-def in_order(touch: Intervention) -> tuple[int, int, int]:
+def in_order(disturbance: Intervention) -> tuple[int, int, int]:
     """Key of a sort by recording, then time, then joint."""
-    return touch.sequence, touch.first, touch.joint
+    return disturbance.sequence, disturbance.first, disturbance.joint
 
 
 def _sure(mean, std, here: Places, place, counts) -> Float[np.ndarray, " place"]:

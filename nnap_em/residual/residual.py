@@ -68,11 +68,11 @@ class Residual(NamedTuple):
     """Generalised force that the model lacks between a row and the next [N m, or N]; NaN behind the last row."""
     force_std: Float[np.ndarray, "seq time dof"]
     """Standard deviation of it given all readings."""
-    lacked: Float[np.ndarray, "seq time dof"]
+    partial_force: Float[np.ndarray, "seq time dof"]
     """The force that the model without its effects lacks, on the paths smoothed with them: the component-plus-residual
     of a regression.  The paths of a model that lacks much are wrong themselves.
     [Larsen & McCleary 1972, Technometrics 14, 781]"""
-    lacked_std: Float[np.ndarray, "seq time dof"]
+    partial_force_std: Float[np.ndarray, "seq time dof"]
     state: Float[np.ndarray, "seq time state"]
     """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
@@ -86,8 +86,8 @@ class Residual(NamedTuple):
     """False for a diverged sequence, which takes part in no test and no figure."""
 
     def without_effects(self) -> "Residual":
-        """The residual with `lacked` as its force."""
-        return self._replace(force=self.lacked, force_std=self.lacked_std)
+        """The residual with `partial_force` as its force."""
+        return self._replace(force=self.partial_force, force_std=self.partial_force_std)
 
     def followed(self) -> "Residual":
         """The residual of the sequences that did not diverge."""
@@ -142,7 +142,7 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     data = jax.device_put(data)
     posterior = smooth(fitted, data)
     outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
-    innovation, force, std, lacked, lacked_std, state, predicted, u = outcome
+    innovation, force, std, partial_force, partial_force_std, state, predicted, u = outcome
     t, valid = np.asarray(data.t), np.asarray(data.valid)
     used = np.asarray(kept(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
-    return Residual(innovation, force, std, lacked, lacked_std, state, predicted, u, t, valid, used)
+    return Residual(innovation, force, std, partial_force, partial_force_std, state, predicted, u, t, valid, used)

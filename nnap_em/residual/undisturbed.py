@@ -28,9 +28,9 @@ def without(
     pieces: list[tuple[int, int, int]] = []
     for i, valid in enumerate(np.asarray(data.valid)):
         use = np.append(valid, False)
-        for touch in disturbances:
-            if touch.sequence == i:
-                use[max(0, touch.first - margin) : touch.last + margin + 1] = False
+        for disturbance in disturbances:
+            if disturbance.sequence == i:
+                use[max(0, disturbance.first - margin) : disturbance.last + margin + 1] = False
         edges = np.flatnonzero(np.diff(np.concatenate([[False], use]).astype(int)))
         runs = [(i, int(a), int(b)) for a, b in edges.reshape(-1, 2)]
         if not restart:

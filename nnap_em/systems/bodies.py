@@ -164,7 +164,7 @@ def load(spot: LoadPoint, mass: Scalar, moment: Three) -> Inertia:
 
 def with_load(body: tuple[Scalar, Three, Turn], more: Inertia) -> tuple[Scalar, Three, Turn]:
     """Mass, centre and inertia about it of a body with a load."""
-    whole = united(inertia(*body), more)
-    centre = scaled(1.0 / whole.mass, whole.moment)
-    steiner = about(scaled(-0.5, whole.moment), centre)
-    return whole.mass, centre, summed(whole.second, steiner)
+    total = united(inertia(*body), more)
+    centre = scaled(1.0 / total.mass, total.moment)
+    steiner = about(scaled(-0.5, total.moment), centre)
+    return total.mass, centre, summed(total.second, steiner)

@@ -30,10 +30,10 @@ def pseudo(body: Numbers) -> Float[Array, "4 4"]:
     return jnp.block([[second, moment[:, None]], [moment[None], body.mass[None, None]]])
 
 
-def of_pseudo(whole: Float[Array, "4 4"]) -> Numbers:
+def of_pseudo(pseudo_inertia: Float[Array, "4 4"]) -> Numbers:
     """The body of a pseudo-inertia."""
-    mass, centre = whole[3, 3], whole[:3, 3] / whole[3, 3]
-    second = whole[:3, :3] - mass * jnp.outer(centre, centre)
+    mass, centre = pseudo_inertia[3, 3], pseudo_inertia[:3, 3] / pseudo_inertia[3, 3]
+    second = pseudo_inertia[:3, :3] - mass * jnp.outer(centre, centre)
     return Numbers(mass, centre, jnp.trace(second) * jnp.eye(3) - second)
 
 
@@ -44,8 +44,8 @@ def stepped(before: Numbers, after: Numbers) -> Numbers:
     To first order it is the step itself.  Not numbers where `before` cannot be.
     """
     change = jax.tree.map(jnp.subtract, after, before)
-    whole, moved = jax.jvp(pseudo, (before,), (change,))
-    root = jnp.linalg.cholesky(whole)
+    inertia, moved = jax.jvp(pseudo, (before,), (change,))
+    root = jnp.linalg.cholesky(inertia)
     inward = jax.scipy.linalg.solve_triangular(root, moved, lower=True)
     inward = jax.scipy.linalg.solve_triangular(root, inward.T, lower=True)
     by = root @ (jnp.tril(inward) - 0.5 * jnp.diag(jnp.diag(inward)))

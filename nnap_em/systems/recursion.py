@@ -145,12 +145,12 @@ def newton_euler(
 def composite(frames: Sequence[Frame], poses: Sequence[Pose], bodies: Sequence[Inertia]) -> list[list[Scalar]]:
     """Mass matrix by rows; 0.0 where two joints stand on different branches."""
     n = len(frames)
-    whole = list(bodies)
+    composite = list(bodies)
     for i in reversed(range(n)):
         if (k := frames[i].before) >= 0:
-            whole[k] = united(whole[k], carried(whole[i], poses[i].place, poses[i].turn))
+            composite[k] = united(composite[k], carried(composite[i], poses[i].place, poses[i].turn))
     rows: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
-    for i, body in enumerate(whole):
+    for i, body in enumerate(composite):
         x, y, _ = body.moment
         if frames[i].slide:
             force, moment = (0.0, 0.0, body.mass), (y, times(-1.0, x), 0.0)

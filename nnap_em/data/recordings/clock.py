@@ -85,5 +85,5 @@ def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -
     back = np.flatnonzero(np.diff(stamp) < 0)
     if back.size:
         return f"run backwards ({back.size} times)"
-    apart = float(np.median(np.abs(stamp - log))) * 1e-9
-    return f"are of another clock, {apart:.4g} s from that of the log" if apart > APART else None
+    offset = float(np.median(np.abs(stamp - log))) * 1e-9
+    return f"are of another clock, {offset:.4g} s from that of the log" if offset > APART else None

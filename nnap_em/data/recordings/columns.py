@@ -36,10 +36,10 @@ def declared_at(path: Path, topics: Sequence[Topic], given: Address, column: str
 
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
-    wanted = set(_names(column, is_input))
-    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in wanted]
+    names = set(_names(column, is_input))
+    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in names]
     addresses = addresses or [
-        Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in wanted
+        Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in names
     ]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:

@@ -62,15 +62,15 @@ def pairs(
     """
     dof, out = len(states) // 2, []
 
-    def apart(one: str, two: str) -> bool:
+    def on_two_topics(one: str, two: str) -> bool:
         return one in signals and two in signals and signals[one].topic != signals[two].topic
 
     for name, joint in inputs.items():
         moved = ((states[dof + joint - 1], 1), (states[joint - 1], 2)) if joint <= dof else ()
-        out += [Pair(name, state, order, True) for state, order in moved if apart(name, state)][:1]
+        out += [Pair(name, state, order, True) for state, order in moved if on_two_topics(name, state)][:1]
     for q, v in zip(states[:dof], states[dof:], strict=True):
-        out += [Pair(v, q, 1, False)] if apart(v, q) else []
-    return out + [Pair(name, f"{name}'", 0, False) for name in duplicates if apart(name, f"{name}'")]
+        out += [Pair(v, q, 1, False)] if on_two_topics(v, q) else []
+    return out + [Pair(name, f"{name}'", 0, False) for name in duplicates if on_two_topics(name, f"{name}'")]
 
 
 def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> Delay:

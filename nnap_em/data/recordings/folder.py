@@ -21,13 +21,13 @@ def places(logs: Sequence[Resampled], test: float) -> list[str]:
     `test` from 1 on is how many, below 1 their share; one sequence is left to train on.
     """
     count = sum(len(log.values) for log in logs)
-    wanted = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
-    if wanted >= count:
+    tests = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
+    if tests >= count:
         hint = "give fewer, or set [import] longest lower in rig.toml"
         raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {hint}")
     digits = max(len(str(count - 1)), 3)
-    return [f"train/{i:0{digits}d}.csv" for i in range(count - wanted)] + [
-        f"test/{i:0{digits}d}.csv" for i in range(wanted)
+    return [f"train/{i:0{digits}d}.csv" for i in range(count - tests)] + [
+        f"test/{i:0{digits}d}.csv" for i in range(tests)
     ]
 
 

@@ -59,21 +59,21 @@ class Frames:
         self.lost = 0
         """Bytes after the last whole record."""
 
-    def batches(self, wanted: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
+    def batches(self, channels: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
         """Messages of wanted channels, piece by piece; of all of the file, or of the chunk at an offset.
 
-        `wanted` is called before each piece, because channels appear on the way.
+        `channels` is called before each piece, because channels appear on the way.
         """
         self.file.seek(len(MAGIC) if at is None else at)
         chunk, index, loose = None, {}, bytearray()
         for code, position, size in self._records():
             if chunk is not None and code != INDEX:
-                yield from self._chunk(chunk, index, wanted)
+                yield from self._chunk(chunk, index, channels)
                 chunk, index = None, {}
                 if at is not None:
                     return
             if loose and (code not in (SCHEMA, CHANNEL, MESSAGE) or len(loose) > _LOOSE):
-                yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, wanted)
+                yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, channels)
                 loose = bytearray()
             if code == CHUNK:
                 chunk = (position, size)
@@ -84,9 +84,9 @@ class Frames:
             elif code in (SCHEMA, CHANNEL, MESSAGE):
                 loose += struct.pack("<BQ", code, size) + self.file.read(size)
         if chunk is not None:
-            yield from self._chunk(chunk, {}, wanted)  # its indices may be cut short
+            yield from self._chunk(chunk, {}, channels)  # its indices may be cut short
         if loose:
-            yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, wanted)
+            yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, channels)
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
         """Code, offset of the content and size of each record, up to the summary."""
@@ -104,20 +104,22 @@ class Frames:
             self.whole, self.lost = False, self.end - position
             return
 
-    def _chunk(self, chunk: tuple[int, int], index: Mapping[int, np.ndarray], wanted) -> Iterator[Batch]:
+    def _chunk(self, chunk: tuple[int, int], index: Mapping[int, np.ndarray], channels) -> Iterator[Batch]:
         known = index and index.keys() <= self.channels.keys()
-        if known and not any(channel in wanted() for channel in index):
+        if known and not any(channel in channels() for channel in index):
             return
         self.file.seek(chunk[0])
-        yield from self._piece(unpack(self.file.read(chunk[1])), index if known else {}, wanted)
+        yield from self._piece(unpack(self.file.read(chunk[1])), index if known else {}, channels)
 
-    def _piece(self, data: UInt8[np.ndarray, " byte"], index: Mapping[int, np.ndarray], wanted) -> Iterator[Batch]:
-        batches = [_batch(channel, data, entries) for channel, entries in index.items() if channel in wanted()]
+    def _piece(self, data: UInt8[np.ndarray, " byte"], index: Mapping[int, np.ndarray], channels) -> Iterator[Batch]:
+        batches = [_batch(channel, data, entries) for channel, entries in index.items() if channel in channels()]
         if not index or None in batches:
             walked = walk(data)
             self.schemas |= walked.schemas
             self.channels |= walked.channels
-            batches = [_batch(channel, data, rows) for channel, rows in walked.messages.items() if channel in wanted()]
+            batches = [
+                _batch(channel, data, rows) for channel, rows in walked.messages.items() if channel in channels()
+            ]
         yield from (batch for batch in batches if batch is not None and batch.t.size)
 
 

@@ -87,10 +87,10 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
         if topic not in {at.topic for at in every.values()}:
             known = nearest(topic, sorted({at.topic for at in every.values()}))
             raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {known}")
-    wanted: dict[str, list[str]] = {}
+    fields: dict[str, list[str]] = {}
     for at in every.values():
-        wanted.setdefault(at.topic, []).append(at.path)
-    recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in wanted.items()})
+        fields.setdefault(at.topic, []).append(at.path)
+    recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     signals = {name: _signal(recording, name, at, clocks[at.topic]) for name, at in every.items()}

@@ -33,11 +33,11 @@ def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.n
 
 def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
     """The mean from each row to the next of a signal that is held between its values."""
-    whole = np.append(0.0, np.cumsum(signal.y[:-1] * np.diff(signal.t)))
+    before = np.append(0.0, np.cumsum(signal.y[:-1] * np.diff(signal.t)))
 
     def integral(x: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
         i = _before(signal, x)
-        return whole[i] + signal.y[i] * (x - signal.t[i])
+        return before[i] + signal.y[i] * (x - signal.t[i])
 
     return (integral(at + dt) - integral(at)) / dt
 

@@ -35,7 +35,7 @@ class Run(NamedTuple):
         return self.end - self.first
 
 
-def frozen(
+def constant_readings(
     name: str, readings: Columns, dt: float, limits: Collection[float]
 ) -> Iterator[tuple[str, Int[np.ndarray, " row"]]]:
     """Saturated, stuck and late: kinds and rows."""
@@ -142,8 +142,8 @@ def _travel(name: str, readings: Columns, run: Run, dt: float) -> Float[np.ndarr
         away = dt * (np.cumsum(part) - part[0])
         return away / (6 * noise(z) * dt * math.sqrt(run.length) + 3 * _quantum(y) + 1e-300)
     away = part - np.median(part[:3]) - still * since
-    doubt = 9 * noise(z) + 3 * _quantum(z) + (_quantum(y) + 0.3 * abs(still)) * since[-1]
-    return away / (doubt + 1e-300)
+    uncertainty = 9 * noise(z) + 3 * _quantum(z) + (_quantum(y) + 0.3 * abs(still)) * since[-1]
+    return away / (uncertainty + 1e-300)
 
 
 def _quantum(y: Float[np.ndarray, " time"]) -> float:
@@ -176,8 +176,8 @@ def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> b
     rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
     spread, coarse = noise(y), 4 * _quantum(y)
     for side in (before, after[::-1]):
-        there, doubt = _ahead(side, rows, spread)
-        if np.all(sign * (there - y[run.first]) <= _SURE * doubt + coarse):
+        there, uncertainty = _ahead(side, rows, spread)
+        if np.all(sign * (there - y[run.first]) <= _SURE * uncertainty + coarse):
             return False
     return True
 

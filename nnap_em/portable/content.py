@@ -47,7 +47,7 @@ class Rotor(NamedTuple):
     play: Contact | None = None
 
 
-class JointSheet(NamedTuple):
+class JointContent(NamedTuple):
     """Forces at one joint."""
 
     pull: Polynomial = (0.0, 0.0, 0.0, 0.0)
@@ -77,7 +77,7 @@ class Drive(NamedTuple):
     """Limit of what the gain gives, in the unit of the command."""
 
 
-class SensorSheet(NamedTuple):
+class SensorContent(NamedTuple):
     """One reading."""
 
     delay: float = 0.0
@@ -86,7 +86,7 @@ class SensorSheet(NamedTuple):
     """Standard deviation, in the unit of the reading."""
 
 
-class Sheet(NamedTuple):
+class Content(NamedTuple):
     """All of a file that laws may change."""
 
     system: Tree
@@ -95,28 +95,28 @@ class Sheet(NamedTuple):
     """[m/s^2]"""
     dt: float
     """Sample interval of the fit [s]."""
-    joints: tuple[JointSheet, ...]
+    joints: tuple[JointContent, ...]
     drives: Mapping[int, Drive] = MappingProxyType({})
     """Drives by joint, counted from 1."""
-    sensors: Mapping[str, SensorSheet] = MappingProxyType({})
+    sensors: Mapping[str, SensorContent] = MappingProxyType({})
     """Sensors by measured column."""
 
-    def joint(self, number: int) -> JointSheet:
+    def joint(self, number: int) -> JointContent:
         """Joint by its number, counted from 1."""
         return self.joints[number - 1]
 
-    def with_joint(self, number: int, **changes) -> "Sheet":
-        """The sheet with one joint changed."""
+    def with_joint(self, number: int, **changes) -> "Content":
+        """The content with one joint changed."""
         joints = list(self.joints)
         joints[number - 1] = joints[number - 1]._replace(**changes)
         return self._replace(joints=tuple(joints))
 
-    def with_drive(self, joint: int, **changes) -> "Sheet":
-        """The sheet with the drive of one joint changed."""
+    def with_drive(self, joint: int, **changes) -> "Content":
+        """The content with the drive of one joint changed."""
         return self._replace(drives={**self.drives, joint: self.drives[joint]._replace(**changes)})
 
-    def with_sensors(self, channel: str | None, **changes) -> "Sheet":
-        """The sheet with one sensor changed, or all."""
+    def with_sensors(self, channel: str | None, **changes) -> "Content":
+        """The content with one sensor changed, or all."""
         return self._replace(
             sensors={
                 name: sensor._replace(**changes) if channel in (name, "all") else sensor

@@ -1,4 +1,4 @@
-"""The next experiment: which inputs, played on the machine, would answer the open questions best."""
+"""The next experiment: which inputs, played on the machine, determine best what a fit leaves open."""
 
 import warnings
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import drawn_paths, smooth
 from ..storage.log import Log, renamed, silent
+from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .questions import AbstractQuestion, Apart, Friction, Information, Parameters, Several, share
 from .rivals import Rivals
 from .search import EFFORT, Bench, Effort, Plan, evaluated, expected_information, search
 from .signals import Proposal, played, starts
@@ -52,9 +52,9 @@ class Design(NamedTuple):
     """Information of all sequences."""
     old: Information
     """Information of as much time of the old inputs."""
-    question: AbstractQuestion
+    question: AbstractCriterion
     rivals: tuple[Rivals, ...]
-    apart: Apart | None
+    apart: Discrimination | None
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
@@ -99,11 +99,11 @@ def design_experiment(
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
-    apart = Apart(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
+    apart = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
     slow = _slow(fit, visited)
     friction = _friction(fit, visited, slow)
-    criterion = _question(question, fitted, fit, friction, apart)
+    criterion = _criterion(question, fitted, fit, friction, apart)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
@@ -113,7 +113,7 @@ def design_experiment(
     count = float(np.sum(np.asarray(data.valid)[used]))
     bench = bench._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
-    quick = bench._replace(informed=not isinstance(criterion, Apart))
+    quick = bench._replace(informed=not isinstance(criterion, Discrimination))
     plan = search(quick, criterion, sequences, rng=rng, effort=effort, log=log)
     checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
     plan, trials = _checked(bench, checked, plan, effort, log)
@@ -139,8 +139,10 @@ def design_experiment(
     )
 
 
-def _question(name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Apart | None) -> AbstractQuestion:
-    """The question of that name, or all of those that there are."""
+def _criterion(
+    name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Discrimination | None
+) -> AbstractCriterion:
+    """The criterion of that name, or all of those that there are."""
     prior, there = fitted.m_step.prior, {}
     if fitted.rig.friction:
         there["friction"] = friction

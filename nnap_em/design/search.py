@@ -14,10 +14,10 @@ from ..data.dataset import Dataset
 from ..em.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
+from .criteria import AbstractCriterion, Information
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
-from .questions import AbstractQuestion, Information
 from .signals import Proposal, drawn, mutated, played, starts
 
 
@@ -55,7 +55,7 @@ class Bench(NamedTuple):
     t: Float[np.ndarray, " time"]
     key: PRNGKeyArray
     share: float = 1.0
-    """Share of the expected information that counts (`questions.share`)."""
+    """Share of the expected information that counts (`criteria.share`)."""
     informed: bool = True
     """True where information is computed, too: a search that only discriminates laws needs none."""
 
@@ -85,7 +85,7 @@ def expected_information(bench: Bench, seq: Dataset, x, start: Float[np.ndarray,
 
 def search(
     bench: Bench,
-    question: AbstractQuestion,
+    criterion: AbstractCriterion,
     count: int,
     *,
     rng: np.random.Generator,
@@ -99,18 +99,18 @@ def search(
     pool = _pool(bench, count, rng, effort, log)
     chosen, total = [], None
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
-        costs = question.cost(pool.expected if total is None else total + pool.expected)
+        costs = criterion.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
         one = pool.expected.of(chosen[-1])
         total = one if total is None else total + one
     plan = _of(pool, np.asarray(chosen))
-    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
+    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
-        if float(question.cost(plan.expected.sum())) <= question.least:
+        if float(criterion.cost(plan.expected.sum())) <= criterion.least:
             break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
-        plan = _bettered(bench, question, plan, rng, reach, effort)
-        cost = float(question.cost(plan.expected.sum()))
+        plan = _bettered(bench, criterion, plan, rng, reach, effort)
+        cost = float(criterion.cost(plan.expected.sum()))
         log(
             f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
         )
@@ -142,7 +142,7 @@ def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, lo
 
 
 def _bettered(
-    bench: Bench, question: AbstractQuestion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
+    bench: Bench, criterion: AbstractCriterion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
 ) -> Plan:
     """Every sequence replaced by the best of some like it, where that is better."""
     count = len(plan.proposal.family)
@@ -152,8 +152,8 @@ def _bettered(
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
         rest = _of(plan, np.arange(count) != slot).expected.sum()
-        costs = question.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
-        now = float(question.cost(plan.expected.sum()))
+        costs = criterion.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
+        now = float(criterion.cost(plan.expected.sum()))
         if len(mine) and np.nanmin(costs, initial=np.inf) < now:
             best = int(mine[np.nanargmin(costs)])
             plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),

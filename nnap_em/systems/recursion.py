@@ -131,26 +131,26 @@ def newton_euler(
         swing = add(apply(body.second, turns), cross(spin, apply(body.second, spin)))
         forces.append(force)
         moments.append(add(swing, cross(body.moment, rise)))
-    felt: list[Scalar] = [0.0] * len(frames)
+    joint_forces: list[Scalar] = [0.0] * len(frames)
     for i in reversed(range(len(frames))):
         frame, pose = frames[i], poses[i]
-        felt[i] = forces[i][2] if frame.slide else moments[i][2]
+        joint_forces[i] = forces[i][2] if frame.slide else moments[i][2]
         if (k := frame.before) >= 0:
             force = apply(pose.turn, forces[i])
             moments[k] = add(moments[k], add(apply(pose.turn, moments[i]), cross(pose.place, force)))
             forces[k] = add(forces[k], force)
-    return felt
+    return joint_forces
 
 
 def composite(frames: Sequence[Frame], poses: Sequence[Pose], bodies: Sequence[Inertia]) -> list[list[Scalar]]:
     """Mass matrix by rows; 0.0 where two joints stand on different branches."""
     n = len(frames)
-    composite = list(bodies)
+    subtrees = list(bodies)
     for i in reversed(range(n)):
         if (k := frames[i].before) >= 0:
-            composite[k] = united(composite[k], carried(composite[i], poses[i].place, poses[i].turn))
+            subtrees[k] = united(subtrees[k], carried(subtrees[i], poses[i].place, poses[i].turn))
     rows: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
-    for i, body in enumerate(composite):
+    for i, body in enumerate(subtrees):
         x, y, _ = body.moment
         if frames[i].slide:
             force, moment = (0.0, 0.0, body.mass), (y, times(-1.0, x), 0.0)

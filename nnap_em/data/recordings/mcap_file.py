@@ -205,5 +205,5 @@ def _cut(log: _Open) -> tuple[str, ...]:
     """Messages about a file that ends too early."""
     if log.frames.whole:
         return ()
-    lost = f"its last {log.frames.lost} bytes are no whole record" if log.frames.lost else "its summary is missing"
-    return (f"the file is cut short ({lost}): what is whole was read, {log.frames.chunks} chunks",)
+    reason = f"its last {log.frames.lost} bytes are no whole record" if log.frames.lost else "its summary is missing"
+    return (f"the file is cut short ({reason}): what is whole was read, {log.frames.chunks} chunks",)

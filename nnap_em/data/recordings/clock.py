@@ -19,7 +19,7 @@ class Clock(NamedTuple):
 
     t: Int[np.ndarray, " kept"]
     """ns."""
-    kept: Int[np.ndarray, " kept"]
+    used: Int[np.ndarray, " kept"]
     """Indices of the used messages, in the order of their times."""
     name: str
     notes: tuple[str, ...]

@@ -131,15 +131,15 @@ def newton_euler(
         swing = add(apply(body.second, turns), cross(spin, apply(body.second, spin)))
         forces.append(force)
         moments.append(add(swing, cross(body.moment, rise)))
-    joint_forces: list[Scalar] = [0.0] * len(frames)
+    loads: list[Scalar] = [0.0] * len(frames)
     for i in reversed(range(len(frames))):
         frame, pose = frames[i], poses[i]
-        joint_forces[i] = forces[i][2] if frame.slide else moments[i][2]
+        loads[i] = forces[i][2] if frame.slide else moments[i][2]
         if (k := frame.before) >= 0:
             force = apply(pose.turn, forces[i])
             moments[k] = add(moments[k], add(apply(pose.turn, moments[i]), cross(pose.place, force)))
             forces[k] = add(forces[k], force)
-    return joint_forces
+    return loads
 
 
 def composite(frames: Sequence[Frame], poses: Sequence[Pose], bodies: Sequence[Inertia]) -> list[list[Scalar]]:

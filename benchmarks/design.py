@@ -31,8 +31,8 @@ import nnap_em
 from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.limits import Bounds
+from nnap_em.design.criteria import after
 from nnap_em.design.experiment import Design, design_experiment
-from nnap_em.design.questions import after
 from nnap_em.design.rivals import Law, Rivals
 from nnap_em.diagnose.rivals import instead
 from nnap_em.em.identify import Identified, friction_table, identify

@@ -18,11 +18,11 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.design.criteria import Discrimination, Friction, Information, Several, after, share
 from nnap_em.design.experiment import design_experiment
 from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
 from nnap_em.design.limits import DesignError, Limits, limits_of
 from nnap_em.design.play import motions
-from nnap_em.design.questions import Apart, Friction, Information, Several, after, share
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
@@ -95,7 +95,7 @@ def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_a
     cov = half @ half.T
     expected = Information(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
     direct = np.sqrt(r @ np.linalg.solve(np.eye(9) + jac @ cov @ jac.T, r))
-    np.testing.assert_allclose(Apart((cov,)).distance(expected), [direct], rtol=1e-10)
+    np.testing.assert_allclose(Discrimination((cov,)).distance(expected), [direct], rtol=1e-10)
 
 
 def test_friction_near_rest_counts_as_much_as_all_the_rest():
@@ -210,8 +210,8 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     found = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(found.lowest) >= design.limits.lowest[None, None])
     assert np.all(np.asarray(found.highest) <= design.limits.highest[None, None])
-    assert isinstance(design.question, Several) and isinstance(design.question.questions[0], Friction)
-    whole, near = design.question.questions[0].weight
+    assert isinstance(design.question, Several) and isinstance(design.question.criteria[0], Friction)
+    whole, near = design.question.criteria[0].weight
     np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
     speed = np.abs(np.asarray(design.fit.nodes))
     assert speed[near > 0].max() <= design.slow[0] < speed[whole > 0].max()  # the slowest rows once more by themselves

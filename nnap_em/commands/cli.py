@@ -319,9 +319,9 @@ def _stoppable(log: Log) -> Iterator[Log]:
         if interrupted:
             raise KeyboardInterrupt
 
-    def dropped(lost: Any) -> None:
-        if not issubclass(lost.exc_type, KeyboardInterrupt):
-            unraisable(lost)
+    def dropped(raised: Any) -> None:
+        if not issubclass(raised.exc_type, KeyboardInterrupt):
+            unraisable(raised)
 
     unraisable = sys.unraisablehook
     ours = threading.current_thread() is threading.main_thread()

@@ -207,15 +207,15 @@ def go_on(args: argparse.Namespace, journal: Journal) -> str:
 
 
 @contextmanager
-def _reporting(kept: Callable[[], str]) -> Iterator[None]:
+def _reporting(message: Callable[[], str]) -> Iterator[None]:
     """Report the finished steps where a run is stopped or a file cannot be written."""
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(kept()) from None
+        raise KeyboardInterrupt(message()) from None
     except OSError as error:
         file = f"{error.filename}: " if error.filename else ""
-        raise Halted(f"{file}{error.strerror or error}; {kept()}") from error
+        raise Halted(f"{file}{error.strerror or error}; {message()}") from error
 
 
 @contextmanager

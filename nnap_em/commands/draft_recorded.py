@@ -29,11 +29,11 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
         names = ", ".join(topic.name for topic in topics) or "none"
         hint = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
-    made = drafted(path, columns_table(path, columns), system, specs)
+    draft = drafted(path, columns_table(path, columns), system, specs)
     lines = [f"# not used: {each}" for each in others(topics, columns)]
-    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in made.text]
+    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in draft.text]
     head = "\n[import.columns]    # where each column is in the log\n"
-    return made._replace(text=made.text + head + "\n".join(lines) + "\n")
+    return draft._replace(text=draft.text + head + "\n".join(lines) + "\n")
 
 
 def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:

@@ -38,10 +38,10 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         joins = i not in moved and (i in had or i in joined)
         carrier[i] = carrier[body.parent] if joins else i
         within[i] = within[body.parent].of(poses[i]) if joins else Pose(np.zeros(3), np.eye(3))
-    kept = [i for i in carrier if i >= 0 and carrier[i] == i]
-    number = {-1: -1, **{i: k for k, i in enumerate(kept)}}
+    carriers = [i for i in carrier if i >= 0 and carrier[i] == i]
+    number = {-1: -1, **{i: k for k, i in enumerate(carriers)}}
     bodies = []
-    for i in kept:
+    for i in carriers:
         body = machine.bodies[i]
         pose = within[body.parent].of(poses[i])
         parts = [(machine.bodies[k], within[k]) for k in carrier if k >= 0 and carrier[k] == i]

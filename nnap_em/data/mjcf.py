@@ -116,8 +116,8 @@ def _line(*joints: str) -> str:
 def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
     """Joints of rig.toml that the file does not have."""
     names = [model.joint(j).name for j in range(model.njnt)]
-    for key, names in (("joints", part.joints or ()), ("locked", part.locked)):
-        for name in names:
+    for key, declared in (("joints", part.joints or ()), ("locked", part.locked)):
+        for name in declared:
             if name not in names:
                 refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
     for j, name in enumerate(names):

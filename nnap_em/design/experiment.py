@@ -1,4 +1,4 @@
-"""The next experiment: which inputs, played on the machine, would answer the open questions best."""
+"""The next experiment: which inputs, played on the machine, determine best what a fit leaves open."""
 
 import warnings
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from ..em.identify import Identified
 from ..em.mstep import kept
 from ..em.predict import drawn_paths, smooth
 from ..storage.log import Log, renamed, silent
+from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .questions import AbstractQuestion, Apart, Friction, Information, Parameters, Several, share
 from .rivals import Rivals
-from .search import EFFORT, Bench, Effort, Plan, evaluated, expected_information, search
+from .search import EFFORT, Effort, Plan, Setup, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
 DRAWN = 32
@@ -52,9 +52,9 @@ class Design(NamedTuple):
     """Information of all sequences."""
     old: Information
     """Information of as much time of the old inputs."""
-    question: AbstractQuestion
+    question: AbstractCriterion
     rivals: tuple[Rivals, ...]
-    apart: Apart | None
+    apart: Discrimination | None
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
@@ -99,24 +99,24 @@ def design_experiment(
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
-    apart = Apart(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
+    apart = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
     slow = _slow(fit, visited)
     friction = _friction(fit, visited, slow)
-    criterion = _question(question, fitted, fit, friction, apart)
+    criterion = _criterion(question, fitted, fit, friction, apart)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
     t = fitted.rig.dt * np.arange(rows + 1)
-    bench = Bench(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
-    row = _row_of_logs(bench, data, path, used)
+    setup = Setup(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
+    row = _row_of_logs(setup, data, path, used)
     count = float(np.sum(np.asarray(data.valid)[used]))
-    bench = bench._replace(share=share(fit, count * row.information))
+    setup = setup._replace(share=share(fit, count * row.information))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
-    quick = bench._replace(informed=not isinstance(criterion, Apart))
+    quick = setup._replace(informed=not isinstance(criterion, Discrimination))
     plan = search(quick, criterion, sequences, rng=rng, effort=effort, log=log)
-    checked = bench._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
-    plan, trials = _checked(bench, checked, plan, effort, log)
+    checked = setup._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
+    plan, trials = _checked(setup, checked, plan, effort, log)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
     low, middle, high = np.quantile(np.asarray(trials.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
     return Design(
@@ -130,7 +130,7 @@ def design_experiment(
         high,
         fit,
         plan.expected.sum(),
-        row.times(bench.share * sequences * t.size),
+        row.times(setup.share * sequences * t.size),
         criterion,
         tuple(rivals),
         apart,
@@ -139,8 +139,10 @@ def design_experiment(
     )
 
 
-def _question(name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Apart | None) -> AbstractQuestion:
-    """The question of that name, or all of those that there are."""
+def _criterion(
+    name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Discrimination | None
+) -> AbstractCriterion:
+    """The criterion of that name, or all of those that there are."""
     prior, there = fitted.m_step.prior, {}
     if fitted.rig.friction:
         there["friction"] = friction
@@ -191,20 +193,20 @@ SHRINKS, LAST = 0.85, 12
 """Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
 
 
-def _checked(bench: Bench, checked: Bench, plan: Plan, effort: Effort, log: Log):
+def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log):
     """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
     proposal = Proposal(*map(np.array, plan.proposal))
     for _ in range(LAST):
-        u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-        trials = motions(checked.paths, bench.limits, bench.t, u, start, DRAWN_IN, key=checked.key)
-        ok = allowed(trials, bench.limits)
+        u, start = played(proposal, setup.limits, setup.t), starts(proposal, setup.limits)
+        trials = motions(checked.paths, setup.limits, setup.t, u, start, DRAWN_IN, key=checked.key)
+        ok = allowed(trials, setup.limits)
         if ok.all():
             break
         log(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
         proposal.shape[~ok, :, -1] *= SHRINKS
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
-    _, each = evaluated(bench, _padded(proposal, effort.batch), effort.few)
+    _, each = evaluated(setup, _padded(proposal, effort.batch), effort.few)
     return Plan(proposal, each.of(np.arange(len(proposal.family)))), trials
 
 
@@ -213,14 +215,14 @@ def _padded(proposal: Proposal, batch: int) -> Proposal:
     return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
 
 
-def _row_of_logs(bench: Bench, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:
+def _row_of_logs(setup: Setup, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:
     """Information of a row of the logs, the mean along their smoothed motions, as far as a new sequence is long."""
-    rows, free = bench.t.size, 2 * bench.fit.nodes.shape[0]
+    rows, free = setup.t.size, 2 * setup.fit.nodes.shape[0]
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
     short = rows - cut.t.shape[1]
     grow = lambda a, **how: np.pad(a, [(0, 0), (0, max(short, 0))] + [(0, 0)] * (a.ndim - 2), **how)  # noqa: E731
     t, u, y = (grow(a, mode="edge") for a in cut[:3])
     cut = Dataset(t, u, y, grow(cut.valid))
     x = grow(path[used, :rows], mode="edge")
-    each = expected_information(bench, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
+    each = expected_information(setup, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
     return each.sum().times(1.0 / max(float(cut.valid.sum()), 1.0))

@@ -14,10 +14,10 @@ from ..data.dataset import Dataset
 from ..em.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
+from .criteria import AbstractCriterion, Information
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
-from .questions import AbstractQuestion, Information
 from .signals import Proposal, drawn, mutated, played, starts
 
 
@@ -43,7 +43,7 @@ REACH = (0.3, 0.05)
 """Change of the numbers of a proposal in the first round and in the last."""
 
 
-class Bench(NamedTuple):
+class Setup(NamedTuple):
     """Constants on which motions and information of a proposal depend."""
 
     fit: Fit
@@ -55,7 +55,7 @@ class Bench(NamedTuple):
     t: Float[np.ndarray, " time"]
     key: PRNGKeyArray
     share: float = 1.0
-    """Share of the expected information that counts (`questions.share`)."""
+    """Share of the expected information that counts (`criteria.share`)."""
     informed: bool = True
     """True where information is computed, too: a search that only discriminates laws needs none."""
 
@@ -67,25 +67,25 @@ class Plan(NamedTuple):
     expected: Information
 
 
-@step(lambda bench, *_: (HERE, Information(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in bench.pairs))))
-def evaluated(bench: Bench, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
+@step(lambda setup, *_: (HERE, Information(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in setup.pairs))))
+def evaluated(setup: Setup, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
     """Proposals that stay inside the limits, and the information of each."""
-    u, start = played(proposal, bench.limits, bench.t), starts(proposal, bench.limits)
-    trials = motions(bench.paths, bench.limits, bench.t, u, start, few, key=bench.key)
-    seq = blank(bench.t, u, len(bench.fit.model.measured))
-    return allowed(trials, bench.limits), expected_information(bench, seq, trials.x, start).times(bench.share)
+    u, start = played(proposal, setup.limits, setup.t), starts(proposal, setup.limits)
+    trials = motions(setup.paths, setup.limits, setup.t, u, start, few, key=setup.key)
+    seq = blank(setup.t, u, len(setup.fit.model.measured))
+    return allowed(trials, setup.limits), expected_information(setup, seq, trials.x, start).times(setup.share)
 
 
-def expected_information(bench: Bench, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Information:
+def expected_information(setup: Setup, seq: Dataset, x, start: Float[np.ndarray, "proposal readable"]) -> Information:
     """Information of sequences along the motions x, and from `start` on about the rivals."""
-    pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in bench.pairs)
-    none = np.zeros((len(start), *bench.fit.cov.shape))
-    return Information(information(bench.fit, seq, x) if bench.informed else none, pairs)
+    pairs = tuple(contrast(rival, truth.model, seq, start) for rival, truth in setup.pairs)
+    none = np.zeros((len(start), *setup.fit.cov.shape))
+    return Information(information(setup.fit, seq, x) if setup.informed else none, pairs)
 
 
 def search(
-    bench: Bench,
-    question: AbstractQuestion,
+    setup: Setup,
+    criterion: AbstractCriterion,
     count: int,
     *,
     rng: np.random.Generator,
@@ -96,33 +96,33 @@ def search(
 
     Raises DesignError where hardly any proposal stays inside the limits.
     """
-    pool = _pool(bench, count, rng, effort, log)
+    pool = _pool(setup, count, rng, effort, log)
     chosen, total = [], None
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
-        costs = question.cost(pool.expected if total is None else total + pool.expected)
+        costs = criterion.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
         one = pool.expected.of(chosen[-1])
         total = one if total is None else total + one
     plan = _of(pool, np.asarray(chosen))
-    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(question.cost(plan.expected.sum())):.3f}")
+    log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
-        if float(question.cost(plan.expected.sum())) <= question.least:
+        if float(criterion.cost(plan.expected.sum())) <= criterion.least:
             break
         reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
-        plan = _bettered(bench, question, plan, rng, reach, effort)
-        cost = float(question.cost(plan.expected.sum()))
+        plan = _bettered(setup, criterion, plan, rng, reach, effort)
+        cost = float(criterion.cost(plan.expected.sum()))
         log(
             f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
         )
     return plan
 
 
-def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, log: Log) -> Plan:
+def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, log: Log) -> Plan:
     """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
-    inputs, states = bench.limits.low.size, bench.limits.first.size
+    inputs, states = setup.limits.low.size, setup.limits.first.size
     plans, waiting = [], drawn(rng, effort.batch, inputs, states)
     for _ in range(effort.tries):
-        ok, expected = evaluated(bench, waiting, effort.few)
+        ok, expected = evaluated(setup, waiting, effort.few)
         plans.append(_of(Plan(waiting, expected), ok))
         have = sum(len(plan.proposal.family) for plan in plans)
         log(f"{have} of {effort.pool} proposals inside the limits")
@@ -142,18 +142,18 @@ def _pool(bench: Bench, count: int, rng: np.random.Generator, effort: Effort, lo
 
 
 def _bettered(
-    bench: Bench, question: AbstractQuestion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
+    setup: Setup, criterion: AbstractCriterion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
 ) -> Plan:
     """Every sequence replaced by the best of some like it, where that is better."""
     count = len(plan.proposal.family)
     place = np.arange(effort.batch) % count
     other = mutated(rng, Proposal(*(a[place] for a in plan.proposal)), reach)
-    ok, expected = evaluated(bench, other, effort.few)
+    ok, expected = evaluated(setup, other, effort.few)
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
         rest = _of(plan, np.arange(count) != slot).expected.sum()
-        costs = question.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
-        now = float(question.cost(plan.expected.sum()))
+        costs = criterion.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
+        now = float(criterion.cost(plan.expected.sum()))
         if len(mine) and np.nanmin(costs, initial=np.inf) < now:
             best = int(mine[np.nanargmin(costs)])
             plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),

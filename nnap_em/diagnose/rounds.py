@@ -108,12 +108,12 @@ def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceMo
     A free function contains the named laws of its signals, and functions of fewer: as far as one of these is even with
     it the free one goes, else they go.
     """
-    kept: list[tuple[_Law, float]] = []
+    standing: list[tuple[_Law, float]] = []
     for law, value in sorted(zip(laws, values, strict=True), key=lambda pair: free_signals(pair[0].candidate.start)):
-        inside = [k for k in kept if contains(law.candidate.start, k[0].candidate.start, model.system)]
+        inside = [k for k in standing if contains(law.candidate.start, k[0].candidate.start, model.system)]
         if not any(other >= EQUIVALENT * value for _, other in inside):
-            kept = [k for k in kept if not any(k is other for other in inside)] + [(law, value)]
-    return [law for law, _ in kept]
+            standing = [k for k in standing if not any(k is other for other in inside)] + [(law, value)]
+    return [law for law, _ in standing]
 
 
 def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:

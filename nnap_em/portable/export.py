@@ -215,8 +215,8 @@ def _spread(fitted: Identified, weights: Weights) -> Float[np.ndarray, "phi rank
     jac = np.asarray(weights.jacobian(fitted.model.unknown, weights.read(fitted.model)))
     half = np.linalg.solve(np.linalg.cholesky(np.asarray(fitted.state.hessian)), jac.T).T
     left, size, _ = np.linalg.svd(half, full_matrices=False)
-    kept = size > 1e-6 * np.max(size, initial=1e-300)
-    return left[:, kept] * size[kept]
+    large = size > 1e-6 * np.max(size, initial=1e-300)
+    return left[:, large] * size[large]
 
 
 def literal(value: Any) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 
 from ..data.formats import write_csv
+from ..design.criteria import Information, after
 from ..design.experiment import Design
-from ..design.questions import Information, after
 from ..diagnose.keys import key_of, listed, words
 from ..numerics.digits import number
 from ..residual.residual import names_of

@@ -76,7 +76,7 @@ def write_diagnosis(
         "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
-        "looks": [_look(step, closed.before.rig.dt) for step in closed.steps],
+        "looks": [_round(step, closed.before.rig.dt) for step in closed.steps],
         "disagreements": [d._asdict() for d in disputed],
         "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
         "suspects": [suspect._asdict() for suspect in suspects],
@@ -167,7 +167,7 @@ def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> li
         return []
     first = next((step for step in steps if step.accepted), steps[0])
     chosen = named(words(first.accepted)) if first.accepted else None
-    entries = [(named(words(key)), promise) for key, promise in first.screened[:10]]
+    entries = [(named(words(key)), score) for key, score in first.screened[:10]]
     figure = screen_figure(entries, first.measure, chosen=chosen)
     caption = f"What each candidate promises, before any refit: {first.measure}."
     return [picture("details", "The first look", caption, figure)]
@@ -180,7 +180,7 @@ def _experiment(rig: Rig) -> list[str]:
     return ["nnap-em design FIT --out NEXT, FIT this folder: the inputs that would tell most, ready to be played."]
 
 
-def _look(step: Step, dt: float) -> dict[str, Any]:
+def _round(step: Step, dt: float) -> dict[str, Any]:
     return {
         "horizon_s": step.horizon * dt,
         "measure": step.measure,

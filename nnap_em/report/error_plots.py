@@ -85,8 +85,8 @@ def prediction_figure(
         ax.axvline(given, color="#555555", lw=1.0)
         ax.set_ylabel(f"{symbol(name)} [{names.unit(name)}]" + ("" if name in names.measured else "\nnot measured"))
     first = grid[0, 0]
-    label = first.text(given, 0.97, " prediction starts", transform=first.get_xaxis_transform(), va="top", fontsize=8)
-    label.set(clip_on=True, in_layout=False)  # it may stand behind the end of a short sequence
+    note = first.text(given, 0.97, " prediction starts", transform=first.get_xaxis_transform(), va="top", fontsize=8)
+    note.set(clip_on=True, in_layout=False)  # it may stand behind the end of a short sequence
     for ax in grid[-1]:
         ax.set(xlabel="time [s]", xlim=(float(t[0]), float(t[-1])))
     head(figure, title or f"One test sequence, predicted from its first {given:g} s", list(grid.ravel()))

@@ -45,7 +45,7 @@ def describe(
         "rows_used": rows,
         "rows_dropped": sum(log["rows"] for log in entries) - rows,
         "logs": entries,
-        "look": list(_look(logs, rig)),
+        "look": list(_remarks(logs, rig)),
         "seconds": seconds,
         "versions": versions(),
     }
@@ -83,7 +83,7 @@ def _topic(topic: TopicFacts) -> dict[str, Any]:
     return entry | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
 
 
-def _look(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
+def _remarks(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
     """Warnings for the owner before a fit."""
     for log in logs:
         for entry in log.delays:

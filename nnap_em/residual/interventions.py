@@ -115,7 +115,7 @@ class Places(NamedTuple):
     row: Int[np.ndarray, " place"]
     state: Float[np.ndarray, "place feature"]
     """All that a law may depend on, in units in which a distance of `NEAR` is small."""
-    views: tuple[Float[np.ndarray, "place feature"], ...]
+    subspaces: tuple[Float[np.ndarray, "place feature"], ...]
     """All that a law of one joint may depend on: its angle and rate; the input and rate."""
 
     def away(self, at: int, separation: int) -> Bool[np.ndarray, " place"]:
@@ -140,9 +140,9 @@ def places(residual: Residual, names: Names, dt: float) -> Places:
         np.stack([np.sin(x), np.cos(x)], axis=1) if turns else scaled(q[..., j : j + 1] - np.mean(x))
         for j, (x, turns) in enumerate(zip(q[seq, row].T, names.rotary, strict=True))
     ]
-    views = [np.concatenate([angle[j], v[:, j : j + 1]], axis=1) for j in range(dof)]
-    views += [np.stack([u[:, i], v[:, joint - 1]], axis=1) for i, joint in enumerate(names.joints)]
-    return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(views))
+    subspaces = [np.concatenate([angle[j], v[:, j : j + 1]], axis=1) for j in range(dof)]
+    subspaces += [np.stack([u[:, i], v[:, joint - 1]], axis=1) for i, joint in enumerate(names.joints)]
+    return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(subspaces))
 
 
 def neighbours(here: Places, separation: int) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
@@ -167,8 +167,8 @@ def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, separatio
     """The largest share of a force that acts wherever the signals of one joint are the same."""
     away = here.away(at, separation) & np.isfinite(mean)
     shares = [0.0]
-    for view in here.views:
-        distance = np.where(away, np.linalg.norm(view - view[at], axis=1), np.inf)
+    for subspace in here.subspaces:
+        distance = np.where(away, np.linalg.norm(subspace - subspace[at], axis=1), np.inf)
         order = np.argsort(distance)[:OTHERS]
         order = order[distance[order] < VIEW]
         if order.size > 2:

@@ -145,12 +145,12 @@ def newton_euler(
 def composite(frames: Sequence[Frame], poses: Sequence[Pose], bodies: Sequence[Inertia]) -> list[list[Scalar]]:
     """Mass matrix by rows; 0.0 where two joints stand on different branches."""
     n = len(frames)
-    composite = list(bodies)
+    subtrees = list(bodies)
     for i in reversed(range(n)):
         if (k := frames[i].before) >= 0:
-            composite[k] = united(composite[k], carried(composite[i], poses[i].place, poses[i].turn))
+            subtrees[k] = united(subtrees[k], carried(subtrees[i], poses[i].place, poses[i].turn))
     rows: list[list[Scalar]] = [[0.0] * n for _ in range(n)]
-    for i, body in enumerate(composite):
+    for i, body in enumerate(subtrees):
         x, y, _ = body.moment
         if frames[i].slide:
             force, moment = (0.0, 0.0, body.mass), (y, times(-1.0, x), 0.0)

@@ -19,7 +19,7 @@ class Clock(NamedTuple):
 
     t: Int[np.ndarray, " kept"]
     """ns."""
-    kept: Int[np.ndarray, " kept"]
+    used: Int[np.ndarray, " kept"]
     """Indices of the used messages, in the order of their times."""
     name: str
     notes: tuple[str, ...]
@@ -36,10 +36,10 @@ def choose(
     order = np.argsort(log, kind="stable")
     notes = []
     if stamp is not None:
-        odd = _odd(stamp[order], log[order])
-        if odd is None:
+        reason = _odd(stamp[order], log[order])
+        if reason is None:
             return _single(stamp[order], order, "header stamp", ())
-        notes.append(f"header stamps {odd}: log times are taken")
+        notes.append(f"header stamps {reason}: log times are taken")
     if log.size > 1 and log.min() == log.max():
         hint = "record with stamps, or write the topic with a header"
         refuse(path, where, f"has no stamps: all {log.size} messages are at {log[0] * 1e-9:g} s", hint)

@@ -56,7 +56,7 @@ class Frames:
         self.whole = True
         """False once the file ended inside a record, or without its summary."""
         self.chunks = 0
-        self.lost = 0
+        self.unread = 0
         """Bytes after the last whole record."""
 
     def batches(self, channels: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
@@ -101,7 +101,7 @@ class Frames:
                     yield code, position + 9, size
                     self.file.seek(position + 9 + size)
                     continue
-            self.whole, self.lost = False, self.end - position
+            self.whole, self.unread = False, self.end - position
             return
 
     def _chunk(self, chunk: tuple[int, int], index: Mapping[int, np.ndarray], channels) -> Iterator[Batch]:

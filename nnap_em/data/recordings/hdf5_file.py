@@ -29,10 +29,10 @@ def topics(path: Path) -> tuple[Topic, ...]:
         return tuple(topic for topic in every if topic.fields)
 
 
-def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """The numbers at these paths of these groups."""
     with _opened(path) as file:
-        return Recording(path, {topic: _track(path, file[topic], paths) for topic, paths in wanted.items()})
+        return Recording(path, {topic: _track(path, file[topic], paths) for topic, paths in fields.items()})
 
 
 def _topic(group: Any) -> Topic:
@@ -57,7 +57,7 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
     if axis.dtype.kind == "f" and not np.isfinite(axis[:]).all():
         refuse(path, f"data set {axis.name!r}", "holds times that are no numbers", "cut the rows without a time")
     clock = rising(path, f"data set {axis.name!r}", _nanoseconds(axis), axis.name.rpartition("/")[2])
-    values = {each: _column(group, each)[clock.kept] for each in paths}
+    values = {each: _column(group, each)[clock.used] for each in paths}
     return Track(clock.t, values, clock.name, clock.notes)
 
 

@@ -57,28 +57,28 @@ def topics(path: Path) -> tuple[Topic, ...]:
         return tuple(by_name.values())
 
 
-def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """The numbers at these paths of these topics, in the order of their times."""
     with _opened(path) as log:
-        parts: dict[str, list[_Part]] = {topic: [] for topic in wanted}
+        parts: dict[str, list[_Part]] = {topic: [] for topic in fields}
         codecs: dict[int, Codec] = {}
         stamps: dict[int, tuple[str, ...]] = {}
 
         def channels() -> set[int]:
-            return {number for number, channel in log.frames.channels.items() if channel.topic in wanted}
+            return {number for number, channel in log.frames.channels.items() if channel.topic in fields}
 
         for batch in log.frames.batches(channels):
             number, topic = batch.channel, log.frames.channels[batch.channel].topic
             if number not in codecs:
                 codecs[number] = _codec(log, number)
-            values, stamp = _decoded(log, batch, codecs[number], wanted[topic], stamps)
+            values, stamp = _decoded(log, batch, codecs[number], fields[topic], stamps)
             parts[topic].append(_Part(batch.t, stamp, values))
         notes = _cut(log)
     tracks = {}
     for topic, pieces in parts.items():
         if not pieces:
             refuse(path, f"topic {topic!r}", "has no messages", "name another topic, or take the log out")
-        tracks[topic] = _track(path, topic, wanted[topic], pieces)
+        tracks[topic] = _track(path, topic, fields[topic], pieces)
     return Recording(path, tracks, notes)
 
 
@@ -114,8 +114,8 @@ def _track(path: Path, topic: str, paths: Sequence[str], parts: list[_Part]) -> 
     columns = np.concatenate([part.values for part in parts], axis=1)
     parts.clear()
     clock = choose(path, topic, log, np.concatenate(stamps) if sum(map(len, stamps)) == log.size else None)
-    if clock.kept.size < log.size or (np.diff(clock.kept) != 1).any():
-        columns = columns[:, clock.kept]
+    if clock.used.size < log.size or (np.diff(clock.used) != 1).any():
+        columns = columns[:, clock.used]
     return Track(clock.t, dict(zip(paths, columns, strict=True)), clock.name, clock.notes)
 
 
@@ -205,5 +205,7 @@ def _cut(log: _Open) -> tuple[str, ...]:
     """Messages about a file that ends too early."""
     if log.frames.whole:
         return ()
-    lost = f"its last {log.frames.lost} bytes are no whole record" if log.frames.lost else "its summary is missing"
-    return (f"the file is cut short ({lost}): what is whole was read, {log.frames.chunks} chunks",)
+    reason = (
+        f"its last {log.frames.unread} bytes are no whole record" if log.frames.unread else "its summary is missing"
+    )
+    return (f"the file is cut short ({reason}): what is whole was read, {log.frames.chunks} chunks",)

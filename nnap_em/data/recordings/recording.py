@@ -56,7 +56,7 @@ class Reader(Protocol):
         """Topics of the file, without reading it all."""
         ...
 
-    def read(self, path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
+    def read(self, path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
         """The numbers at these paths of these topics, and nothing else."""
         ...
 

@@ -236,7 +236,7 @@ def _facts(
     typical = float(np.median(steps)) if steps.size else math.nan
     signal = Signal(topic.name, t, t)
     longest = longest_silence(signal, dt, plan.gap)
-    kept = steps[steps <= longest]
+    usual = steps[steps <= longest]
     return TopicFacts(
         topic.name,
         topic.kind,
@@ -246,8 +246,8 @@ def _facts(
         float(t[0]),
         float(t[-1]),
         1 / typical if typical > 0 else math.nan,
-        float(np.std(kept)) if kept.size else math.nan,
-        float(np.max(np.abs(kept - typical), initial=0.0)),
+        float(np.std(usual)) if usual.size else math.nan,
+        float(np.max(np.abs(usual - typical), initial=0.0)),
         tuple(gaps(signal, longest)),
         track.notes,
     )

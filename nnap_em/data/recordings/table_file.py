@@ -18,14 +18,14 @@ def topics(path: Path) -> tuple[Topic, ...]:
     return (Topic("", f"table, time in column {clock!r}", None, tuple(name for name in names if name != clock)),)
 
 
-def read(path: Path, wanted: Mapping[str, Sequence[str]]) -> Recording:
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     name = _clock(path, column_names(path))
-    table = read_table(path, (name,), wanted[""])
+    table = read_table(path, (name,), fields[""])
     scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
     t = np.round(table[:, 0] * scale * 1e9).astype(np.int64)
     clock = rising(path, f"column {name!r}", t, name)
-    values = {column: table[clock.kept, i] for i, column in enumerate(wanted[""], 1)}
+    values = {column: table[clock.used, i] for i, column in enumerate(fields[""], 1)}
     return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
 
 

@@ -60,7 +60,7 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     return 1.0 if wider(1.0) >= 0 or wider(1e-6) <= 0 else root_scalar(wider, bracket=(1e-6, 1.0)).root
 
 
-class AbstractQuestion(eqx.Module):
+class AbstractCriterion(eqx.Module):
     """A design criterion."""
 
     least: ClassVar[float] = -math.inf
@@ -71,7 +71,7 @@ class AbstractQuestion(eqx.Module):
         """The smaller, the better it is answered; one less is a factor e in a standard deviation."""
 
 
-class Friction(AbstractQuestion):
+class Friction(AbstractCriterion):
     """Width of the friction bands, the widest first: over all velocities, and once more near rest."""
 
     fit: Fit
@@ -89,7 +89,7 @@ class Friction(AbstractQuestion):
         return np.asarray(0.25 * np.mean(np.log(mean + 1e-30), axis=-1))
 
 
-class Parameters(AbstractQuestion):
+class Parameters(AbstractCriterion):
     """Uncertainty of some parameters: the mean of the logarithms of their standard deviations, in those of the
     prior.
     """
@@ -111,7 +111,7 @@ SURE = 9.0
 At 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md)."""
 
 
-class Apart(AbstractQuestion):
+class Discrimination(AbstractCriterion):
     """Discrimination between laws: the pair that is hardest to discriminate counts.
 
     A log-likelihood ratio is normal with mean d^2 / 2 and variance d^2, d the distance after everything that the rival
@@ -136,10 +136,10 @@ class Apart(AbstractQuestion):
         return np.asarray(0.5 * np.mean(SURE - far, axis=-1) + 0.5 * np.max(SURE - far, axis=-1))
 
 
-class Several(AbstractQuestion):
-    """More than one question, each as important."""
+class Several(AbstractCriterion):
+    """More than one criterion, each as important."""
 
-    questions: tuple[AbstractQuestion, ...]
+    criteria: tuple[AbstractCriterion, ...]
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        return np.asarray(np.sum([q.cost(expected) for q in self.questions], axis=0))
+        return np.asarray(np.sum([q.cost(expected) for q in self.criteria], axis=0))

@@ -117,6 +117,10 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
     mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
     assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
+    other = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.4), ("after", 0.21, 0.1))}
+    assert "of theta2 falls from 0.4 to 0.1 and that of theta1 rises" in verdict(found, error | other)
+    worse = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.1), ("after", 0.19, 0.2))}
+    assert "of theta2 does not fall with it (0.1 before, 0.2 after): do not trust" in verdict(found, error | worse)
     assert verdict(found, None) == "The model lacks a payload at joint 2."
     sized = found[0]._replace(parameters={"mass": Estimate(0.4567, 0.0123, "kg"), "centre_x": Estimate(0.1, 0.2, "m")})
     assert verdict([sized], None) == "The model lacks a payload at joint 2 (mass = 0.457 ± 0.012 kg)."

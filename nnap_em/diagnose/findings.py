@@ -125,6 +125,8 @@ def verdict(
     """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
     `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one where the search is
     not `complete`.
+
+    It names the column whose test error falls most, and trusts a finding where the geometric mean over all columns falls.
     """
     if not complete:
         first = verdict(found, error, failed, rivals, suspects) if found or rivals or suspects else "Nothing yet."
@@ -158,12 +160,15 @@ def verdict(
     ]
     if not ratios:
         return text + "."
-    column, before, after = ratios[0]
-    if after >= before:
+    growth = {c: math.log(max(a, 1e-300) / max(b, 1e-300)) for c, b, a in ratios}
+    ratios.sort(key=lambda entry: growth[entry[0]])
+    if sum(growth.values()) >= 0:
+        column, before, after = ratios[-1]
         return (
             f"The training data support {names}, but on test data the 1 s prediction error of {column} does not fall "
             f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
         )
+    column, before, after = ratios[0]
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."

@@ -126,7 +126,7 @@ def verdict(
     `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one where the search is
     not `complete`.
 
-    It names the column whose test error falls most, and trusts a finding where the geometric mean over all columns falls.
+    It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
     """
     if not complete:
         first = verdict(found, error, failed, rivals, suspects) if found or rivals or suspects else "Nothing yet."

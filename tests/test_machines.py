@@ -289,10 +289,10 @@ def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_pa
     prior = ParameterPrior(("link2.mass", "0.delay"), jnp.asarray([2.0, 0.0]), jnp.asarray([0.1, 0.01]))
     system = build_system(rig)
     model = SimpleNamespace(system=system, effects=(late,), parameter=system.parameter)
-    told = Information(np.zeros((4, 4)))
+    information = Information(np.zeros((4, 4)))
     fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
     design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
-    design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), told=told, old=told)
+    design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), expected=information, old=information)
     found = parameter_entries(design)
     assert {name: entry["unit"] for name, entry in found.items()} == {
         "link2.mass": "kg",

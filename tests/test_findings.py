@@ -103,9 +103,12 @@ def test_a_recording_that_disagrees_is_named():
     assert (told.name, told.joint, told.files) == ("motor_gain", 2, ["b.csv"])
     assert told.description == (
         "motor gain at joint 2 would remove 80% of the prediction error, "
-        "but b.csv says the opposite (up to 61% more error)"
+        "but b.csv shows the opposite (up to 61% more error)"
     )
     assert any("b.csv" in text for text in advice([], [told]))
+    both = _doubtful().last[-1].disputed[0]._replace(against=(0, 1))
+    (told,) = disputes(_doubtful()._replace(steps=(Step(ROWS, (), (), None, 3, disputed=(both,)),)), ("a.csv", "b.csv"))
+    assert "a.csv and b.csv show the opposite" in told.description
     assert not disputes(_closed(ARM), ("a.csv", "b.csv"))
 
 
@@ -147,7 +150,7 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
         ("dead_zone", 2),
         ("torsional_spring", 1),
     ]
-    assert "b.csv says the opposite" in html and "cannot tell what" in html
+    assert "b.csv shows the opposite" in html and "cannot tell what" in html
     assert [(each["name"], each["chance"]) for each in report["suspects"]] == [("motor_gain", 0.03)]
     assert "<h2>Suspects" in html.replace(' id="suspects"', "") and "chance removes up to 3%" in html
 

@@ -224,7 +224,7 @@ def test_a_ratio_of_errors_is_that_of_the_sequences_used():
     [((0, 1), "one one"), ((0, 2), "one paired"), ((0, 2), "one one"), ((2, 3), "paired one"), ((2, 3), "one paired")],
 )
 def test_all_measured_coordinates_must_be_white_or_where_none_is_measured_one_reading(measured, enough):
-    """Of a system of two coordinates: places 0 and 1 of what can be read are coordinates, 2 and 3 rates."""
+    """A system of two coordinates has these at places 0 and 1 of what can be read, and its rates at 2 and 3."""
     rng = np.random.default_rng(3)
     motion, white = np.sin(np.linspace(0, 20, 2000))[None], rng.normal(size=(1, 2000))
     one, paired = motion + 0.01 * white, motion + 0.005 * (white + np.roll(white, 1))

@@ -11,7 +11,9 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
 from nnap_em.effects import Scene
-from nnap_em.em.identify import identify
+from nnap_em.em.build import build_system, measure_scales
+from nnap_em.em.check import Along, memory
+from nnap_em.em.identify import begin, identify
 from nnap_em.em.store import load, save
 from nnap_em.model.dynamic_friction import SHAPES, DynamicFriction, hysteresis
 from nnap_em.report.contacts import contacts
@@ -162,6 +164,20 @@ def test_a_static_map_is_kept_where_there_is_no_memory():
     fitted = identify(_rig(), _logs(None, 0), key=jax.random.key(0))
     assert fitted.model.effects == ()
     assert fitted.memory.startswith("joint 1: the static map is kept, no memory")
+
+
+@pytest.mark.parametrize(("turns", "amplitude", "marks"), [(20, 0.5, "ok"), (19, 0.5, "look"), (20, 0.02, "look")])
+def test_check_counts_reversals_and_compares_the_noise_with_the_range(turns, amplitude, marks):
+    """A sine that reverses so often, its angle read with 6 mrad: below a tenth of a range of 1 rad, not of .04 rad."""
+    t = 0.02 * np.arange(1000)
+    rate = np.pi * turns / t[-1]
+    y = amplitude * np.stack([np.sin(rate * t), rate * np.cos(rate * t)], axis=-1)[None]
+    data = Dataset(t[None], np.zeros((1, 1000, 1)), y, np.ones((1, 1000), bool))
+    rig = _rig()
+    model, scales = begin(rig, data, key=jax.random.key(0)).model, measure_scales(rig, build_system(rig), data)
+    rig = replace(rig, noise_std={"theta1": 0.006, "dtheta1": 0.02})
+    (row,) = memory(rig, model, data, Along(y, *3 * [np.zeros(0)]), scales._replace(acceleration=np.zeros(1)))
+    assert row.mark == marks and f"joint 1: {turns} reversals" in row.text and "0.006 rad" in row.text
 
 
 def test_a_fit_with_memory_is_stored(fitted, tmp_path):

@@ -88,16 +88,16 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
     before, rows = context.before, context.data.t.shape[1]
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
     posterior = e_step(now.model, every, smoother, key=before.state.key)
-    followed = np.asarray(kept(posterior, every))
+    whole = np.asarray(kept(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    fit = SmoothedFit(context.declared, now, *both, followed, rows, context.pieces)
-    if followed.all():
-        return fit, followed
+    fit = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
+    if whole.all():
+        return fit, whole
     dof = len(now.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
     large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.large_kick)
     first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
-    row, used, cut = np.arange(every.t.shape[1]), followed, every
+    row, used, cut = np.arange(every.t.shape[1]), whole, every
     for later in context.effort.later:
         early = every.valid & jnp.asarray(row < first[:, None] + later)
         cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
@@ -105,7 +105,7 @@ def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[Smooth
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
-    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), followed
+    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
 def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:

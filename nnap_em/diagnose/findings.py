@@ -129,7 +129,11 @@ def verdict(
     It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
     """
     if not complete:
-        first = verdict(found, error, failed, rivals, suspects) if found or rivals or suspects else "Nothing yet."
+        first = (
+            verdict(found, error, failed, rivals, suspects)
+            if found or rivals or suspects
+            else "No effect was found yet."
+        )
         return f"{first} The search was not finished in the time given: more may be missing."
     if not found and rivals:
         return (
@@ -217,7 +221,7 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
             f"{words(dispute.key)} would remove {dispute.share:.0%} of the prediction error, but {listed(against)} "
-            f"{'says' if len(against) == 1 else 'log'} the opposite (up to {dispute.harm:.0%} more error)"
+            f"{'shows' if len(against) == 1 else 'show'} the opposite (up to {dispute.harm:.0%} more error)"
         )
         key = catalogue[name].key()
         out.append(Dispute(key, joint, channel, list(inputs), dispute.share, against, dispute.harm, text))

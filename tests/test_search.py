@@ -336,17 +336,23 @@ def test_one_step_errors_are_searched_where_the_fit_was_short():
 
 
 @pytest.mark.parametrize(
-    ("white", "innovations", "losses"),
-    [(True, True, [OneStep]), (True, False, [OneStep, MultiStep]), (False, True, [MultiStep])],
+    ("white", "innovations", "losses", "complete"),
+    [
+        (True, True, [OneStep], True),
+        (True, True, [OneStep], False),
+        (True, False, [OneStep, MultiStep], True),
+        (False, True, [MultiStep], True),
+    ],
 )
-def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, white, innovations, losses):
-    ran, cut = [], []
+def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, white, innovations, losses, complete):
+    """Equivalent laws are compared where they decided, and there was time to end the search."""
+    ran, cut, compared = [], [], []
 
     def run(context, now, state, lengths):
         ran.append(type(context.loss))
         one_step = isinstance(context.loss, OneStep)
         laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (now, state)
-        return search._Searched(*laws, [])
+        return search._Searched(*laws, [], complete)
 
     def white_innovations(fitted, data):
         assert fitted.m_step is not RULE  # of the outcome: what is missing colours those of the declared model
@@ -362,10 +368,11 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
-    monkeypatch.setattr(search, "compare_equivalents", lambda closed, data: closed)
+    monkeypatch.setattr(search, "compare_equivalents", lambda closed, data: compared.append(data) or closed)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     found = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert ran == losses and len(found.found) == (white and innovations)
+    assert bool(compared) == (white and innovations and complete) and found.complete == complete
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
 

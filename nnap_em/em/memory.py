@@ -324,7 +324,7 @@ def _judged(now: _Fit, trial: _Fit | None, data: Dataset) -> tuple[bool, str]:
     gain = float(np.sum((trial.loglik - now.loglik)[both]))
     before, after = (errors(followed(one.model, one.rule.prior, one.path, data), JUDGED) for one in (now, trial))
     falls = ratio(before, after, both)
-    reason = f"{gain:.3g} nat, squared multi-step error times {falls:.3g}"
+    reason = f"{gain:.3g} nat likelier, squared multi-step error {falls:.3g} times that of the static map"
     return bool(both.sum() == now.used.sum() and gain >= GAIN and falls < 1.0), reason
 
 

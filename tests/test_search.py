@@ -32,6 +32,7 @@ from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
 from nnap_em.model.state_space import with_effects
+from nnap_em.smoother.start import StartBank
 from nnap_em.storage.deadline import TimeUp, until
 from nnap_em.storage.journal import HERE, step
 
@@ -180,7 +181,7 @@ def _emstate(model, top: float) -> EMState:
 
 
 def _context(loss=MULTI, stages=None) -> SearchContext:
-    before = Identified(RIG, _emstate(MODEL, 0.0), RULE, None, None)
+    before = Identified(RIG, _emstate(MODEL, 0.0), RULE, StartBank((1, 1), (0,)), None)
     return SearchContext(before, stages or {9: (before.state, np.ones(6, bool))}, DATA, loss, EFFORT, lambda text: None)
 
 
@@ -355,6 +356,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
         return search._Searched(*laws, [], complete)
 
     def white_innovations(fitted, data):
+        assert fitted.smoother.second() is None  # branches are not chosen by a model that may lack something
         assert fitted.m_step is not RULE  # of the outcome: what is missing colours those of the declared model
         return innovations
 
@@ -362,7 +364,11 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
         cut.append(data)
         return fitted, data, (), ()
 
-    monkeypatch.setattr(search, "identify", lambda *_, **__: _context().before)
+    def identify(rig, data, *, key, smoother, watch):
+        before = _context().before
+        return before._replace(smoother=smoother(before.bank))
+
+    monkeypatch.setattr(search, "identify", identify)
     monkeypatch.setattr(search, "_search", run)
     monkeypatch.setattr(search, "quantised", lambda context, now: (now, None))
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
@@ -372,6 +378,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     found = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert ran == losses and len(found.found) == (white and innovations)
+    assert found.before.smoother.second() is not None and found.after.smoother.second() is not None
     assert bool(compared) == (white and innovations and complete) and found.complete == complete
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 

@@ -40,7 +40,7 @@ KIND = Kind(
 )
 
 
-LATER = ("/unsaid", "/m_step/rough", "/memory", "/bank/angles")
+LATER = ("/unsaid", "/m_step/rough", "/memory", "/bank/angles", "/smoother/branching")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 

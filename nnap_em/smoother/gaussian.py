@@ -28,6 +28,8 @@ class GaussianSmoother(AbstractSmoother):
     """Relinearisations about the smoothed path."""
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
+    branching: bool = eqx.field(static=True, default=True)
+    """False: one Gaussian only, also where an angle that is not read is wide."""
 
     @property
     def bytes_per_row(self) -> int:
@@ -39,8 +41,8 @@ class GaussianSmoother(AbstractSmoother):
         return dataclasses.replace(self, inflations=(1.0, 10.0, 100.0))
 
     def second(self) -> MixtureSmoother | None:
-        """The mixture, where an angle is not read."""
-        return MixtureSmoother(self.bank.angles, self.linearise) if self.bank.angles else None
+        """The mixture, where an angle is not read and more than one branch is to be followed."""
+        return MixtureSmoother(self.bank.angles, self.linearise) if self.branching and self.bank.angles else None
 
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""

@@ -16,7 +16,19 @@ from nnap_em.diagnose.losses import MultiStep
 from nnap_em.diagnose.propose import proposals, surroundings
 from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.em.multistep import Forks, errors, finish, followed, forks, grid_of, huber, ratio, robust_scale, weighed
+from nnap_em.em.multistep import (
+    Columns,
+    Forks,
+    errors,
+    finish,
+    followed,
+    forks,
+    grid_of,
+    huber,
+    ratio,
+    robust_scale,
+    weighed,
+)
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.shape import friction_prior
@@ -104,16 +116,22 @@ def test_columns_are_difference_quotients(question, known, name):
 
 
 def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
-    """Blocks of at most 40 columns, of which the last is filled up, and groups of one stack; in single precision."""
+    """Of a model that holds a free function, whose parameters are many under one name; in single precision."""
     _, q = question
-    candidates = _candidates(question, "torsional_spring") + _candidates(question, "cogging")
+    around = surroundings(question[0], q.model, q.data, q.path, ROWS)
+    free = next(c for c in catalogue["unknown_function"].candidates(around) if len(c.probes) > 5)
+    q = q._replace(now=q.now.plus(free.start, free))
+    candidates = [*_candidates(question, "torsional_spring", "cogging"), free]
+    probes = sum(len(c.probes) for c in candidates)
     whole = MultiStep().linearise(q, candidates)
-    assert sum(len(c.probes) for c in candidates) % 40
-    monkeypatch.setattr(columns_of, "BLOCK", 40)
-    parts = MultiStep().linearise(q, candidates)
-    for one, other in zip(parts, whole, strict=True):
+    monkeypatch.setattr(columns_of, "BLOCK", 5)
+    sizes = [part.force.shape[1] for part in columns_of.blocks(Columns(*2 * [np.zeros((1, probes, 3, 2))]))]
+    assert len(sizes) > 2 and max(sizes) <= 5 and max(sizes) - min(sizes) == 1 and sum(sizes) == probes
+    for one, other in zip(MultiStep().linearise(q, candidates), whole, strict=True):
         assert one.columns.shape == other.columns.shape
         np.testing.assert_allclose(one.columns, other.columns, rtol=1e-4, atol=1e-5 * np.abs(other.columns).max())
+    numbers = q.m_step.weights(q.model).nodes.size + q.m_step.prior.mean.size
+    assert all(one.columns.shape[-1] == numbers + probes for one in whole)
 
 
 def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):

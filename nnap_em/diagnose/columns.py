@@ -182,9 +182,7 @@ def candidate_columns(
 
 
 def blocks(columns: Columns) -> Iterator[Columns]:
-    """The columns in equal blocks of at most BLOCK, of which the last is filled up with zeros."""
-    size = columns.force.shape[1]
-    width = -(-size // max(1, -(-size // BLOCK)))
-    for first in range(0, max(size, 1), max(width, 1)):
-        part = [np.asarray(a)[:, first : first + width] for a in columns]
-        yield Columns(*(np.pad(a, [(0, 0), (0, width - a.shape[1]), (0, 0), (0, 0)]) for a in part))
+    """The columns in blocks of at most BLOCK, whose sizes differ by one: two programs at most."""
+    count = max(1, -(-columns.force.shape[1] // BLOCK))
+    for parts in zip(*(np.array_split(np.asarray(a), count, axis=1) for a in columns), strict=True):
+        yield Columns(*parts)

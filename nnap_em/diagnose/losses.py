@@ -119,13 +119,12 @@ class MultiStep(AbstractLoss):
             lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),
             every,
         )
-        size = len(weights.nodes.ravel()) + len(weights.prior.names) + sum(len(c.probes) for c in candidates)
         rows, weight = starts(model, data, every), weighed(predictions, fit.used)
         bands = [[every.index(h) for h in band] for band in self.bands]
         return tuple(
             Linearised(
                 _flat(predictions.error[:, :, band]),
-                _flat(predictions.columns[:, :, band, :, :size], 1),
+                _flat(predictions.columns[:, :, band], 1),
                 _flat(weight[:, :, band]),
                 float(np.mean(predictions.overlap[band])),
                 rows,

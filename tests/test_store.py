@@ -150,6 +150,22 @@ SMOOTHERS = {
 }
 
 
+@pytest.mark.parametrize("name", SMOOTHERS)
+def test_a_model_from_before_smoothers_branched_is_read(tmp_path, name):
+    rig = RIGS["arm"]
+    fitted = begin(rig, _data(rig), key=jax.random.key(5), smoother=SMOOTHERS[name])
+    save(tmp_path / "model.npz", fitted)
+
+    def older(header, arrays):
+        later = [place for place in header["settings"] if place.endswith(("/angles", "/branching"))]
+        assert len(later) == 3  # of the bank, of the smoother's, and whether it branches
+        for place in later:
+            del header["settings"][place]
+
+    _rewrite(tmp_path / "model.npz", older)
+    assert jax.tree.structure(load(tmp_path / "model.npz").smoother) == jax.tree.structure(fitted.smoother)
+
+
 @pytest.mark.parametrize("make", SMOOTHERS.values(), ids=SMOOTHERS)
 def test_a_stored_model_keeps_its_smoother(tmp_path, make):
     fitted = begin(RIGS["arm"], _data(RIGS["arm"]), key=jax.random.key(5), smoother=make)

@@ -40,7 +40,7 @@ KIND = Kind(
 )
 
 
-LATER = ("/unsaid", "/m_step/rough", "/memory", "/bank/angles", "/smoother/branching")
+LATER = ("/unsaid", "/m_step/rough", "/memory")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 
@@ -195,7 +195,9 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        later = place not in settings and ("/effects/" in place or place.endswith("/bank/angles"))  # its default
+        later = place not in settings and (
+            "/effects/" in place or place.endswith(("/angles", "/branching"))
+        )  # its default
         if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value

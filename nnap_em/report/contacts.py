@@ -82,8 +82,9 @@ def hysteresis_figure(found: Sequence[Contact], names: Names) -> Figure:
         angle, torque = np.asarray(contact.loop.angle), np.asarray(contact.loop.torque)
         half = len(angle) // 2 + 1
         for part in (slice(0, half), slice(half - 1, None)):
-            band(ax, angle[part], torque[part], contact.std[part], AFTER, "")
+            band(ax, angle[part], torque[part], contact.std[part], AFTER, "learned")
         place = names.coordinates[contact.joint - 1]
+        ax.locator_params(axis="x", nbins=5)
         ax.set_xlabel(f"{symbol(place)} about a point [{names.unit(place)}]")
         ax.set_ylabel(f"friction [{names.force_unit(contact.joint)}]")
         ax.set_title(names.joint(contact.joint).replace("j", "J", 1))

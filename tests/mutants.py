@@ -1023,8 +1023,8 @@ MUTANTS = (
     Mutant(
         "external disturbances sought in white noise",
         "diagnose/search.py",
-        "    if white_readings(data, before.model):\n        return search(",
-        "    if not white_readings(data, before.model):\n        return search(",
+        "    if white_readings(data, before.model):\n",
+        "    if not white_readings(data, before.model):\n",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
     Mutant(

@@ -301,5 +301,9 @@ def _unbranched(bank: StartBank) -> GaussianSmoother:
 
 def _branching(closed: Closed) -> Closed:
     """The outcome with the smoother of `identify`, by which states are smoothed and predicted."""
-    before, after = (fit._replace(smoother=CubatureSmoother(fit.bank)) for fit in (closed.before, closed.after))
-    return closed._replace(before=before, after=after)
+
+    def branched(fit: Identified) -> Identified:
+        return fit._replace(smoother=CubatureSmoother(fit.bank))
+
+    before = branched(closed.before)
+    return closed._replace(before=before, after=before if closed.after is closed.before else branched(closed.after))

@@ -8,7 +8,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.em.branches import APART, branches, modes
-from nnap_em.em.loop import e_step
+from nnap_em.em.loop import DIVERGED, _replaced, e_step
 from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother
@@ -189,6 +189,18 @@ def test_the_likelier_side_is_the_one_of_the_grid():
         np.testing.assert_allclose(found.loglik[i], loglik, atol=0.7)
         assert first.loglik[i] <= found.loglik[i]
     assert first.loglik[1] < found.loglik[1] - 5  # it was on the other side
+
+
+def test_a_second_path_that_diverged_is_not_taken():
+    """One nat to either side of the fall that a linearisation about another path may explain; no number is worse."""
+    model, data = _model(), _logs([1, -1, 1], 0)
+    first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
+    fall = jnp.asarray([DIVERGED - 1, DIVERGED + 1, jnp.nan])
+    second = first._replace(loglik=first.loglik - fall, state=jax.tree.map(lambda a: a + 1, first.state))
+    found = _replaced(first, second, np.arange(3))
+    moved = np.asarray(found.state.mean - first.state.mean)[:, 0, 0]
+    np.testing.assert_array_equal(moved, [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(found.loglik[1:], first.loglik[1:])
 
 
 def test_two_sides_that_nothing_decides_are_both_reported():

@@ -46,6 +46,14 @@ class EMState(NamedTuple):
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
 
 
+DIVERGED = 100.0
+"""Fall of the log-likelihood [nat] beyond which the relinearisations of a second smoother have diverged.
+
+That of the first one is of a model linearised about another path, and may be too high: by 72 on a real double pendulum
+whose second path was nearer to the encoder (.10 rad, .16 before).  On simulations diverged paths lost 360 and more.
+"""
+
+
 class FitError(RuntimeError):
     """EM cannot go on: every sequence is lost."""
 
@@ -112,9 +120,9 @@ def _likeliest_path(common, one) -> Posterior:
 
 @eqx.filter_jit
 def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
-    """`second` at the places `index` of `first`, where it is likelier."""
+    """`second` at the places `index` of `first`, where it has not diverged."""
     pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
-    known = second.loglik > first.loglik[index]
+    known = second.loglik > first.loglik[index] - DIVERGED
     second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
     return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 

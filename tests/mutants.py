@@ -1021,6 +1021,20 @@ MUTANTS = (
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
     Mutant(
+        "an angle that is read late has no hypotheses",
+        "em/build.py",
+        "scales.speed[joint] * late <= MOVED",
+        "scales.speed[joint] * late <= math.inf",
+        "test_start.py::test_an_angle_that_is_read_late_has_hypotheses",
+    ),
+    Mutant(
+        "a diverged path of the mixture is taken",
+        "em/loop.py",
+        "first.loglik[index] - DIVERGED",
+        "-jnp.inf",
+        "test_mixture.py::test_a_second_path_that_diverged_is_not_taken",
+    ),
+    Mutant(
         "external disturbances sought in white noise",
         "diagnose/search.py",
         "    if white_readings(data, before.model):\n",

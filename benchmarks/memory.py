@@ -1,6 +1,6 @@
 """Friction with memory against a static map: docs/results/memory.md.
 
-python benchmarks/memory.py [--cases lugre dahl bristle static] [--hidden] [--seeds 1]
+python benchmarks/memory.py [--cases lugre dahl bristle static] [--hidden] [--seeds 0]
 python benchmarks/memory.py --measured ../shared/data/measured
 
 The simulated acrobot and its friction laws are NumPy here and share no code with the library: at joint 1 LuGre [Canudas
@@ -276,7 +276,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", nargs="*", default=list(LAWS))
     parser.add_argument("--hidden", action="store_true")
-    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--measured", type=Path)
     parser.add_argument("--rigs", nargs="*", default=["xl330", "dfki_c0", "kr300"])
     args = parser.parse_args()
@@ -292,7 +292,7 @@ def main() -> None:
         return
     print("| case | seed | torque error at reversals, static [N m] | memory | ratio | 1 s error, static [rad] | memory "
           "| ratio | over that of the true law | time |\n" + "| --- " * 10 + "|")  # fmt: skip
-    for seed in range(args.seeds):
+    for seed in args.seeds:
         for name in args.cases:
             print(study(name, seed, args.hidden), flush=True)
 

@@ -58,7 +58,7 @@ class Identified(NamedTuple):
 
 
 class FrictionTable(NamedTuple):
-    """The learned map with its uncertainty, over the visited velocities."""
+    """Friction in steady sliding with its uncertainty, over the visited velocities: the learned map."""
 
     velocity: Float[Array, "dof node"]
     """[rad/s]"""
@@ -185,22 +185,36 @@ def nodes_between(
 
 
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
-    """The learned map at `velocity` [rad/s], its covariance linearised in the weights (Laplace)."""
+    """Friction in steady sliding at `velocity` [rad/s], its covariance linearised in the weights (Laplace).
+
+    It is the learned map, and below the knee of a contact with memory, where the map is a straight line, the contact's.
+    """
     weights = fitted.m_step.weights(fitted.model)
-    w, system = weights.read(fitted.model), fitted.model.system
-    units = tuple((system.unit(rate), system.force_unit(j)) for j, rate in enumerate(system.rates, 1))
-    return FrictionTable(velocity, *_friction(weights, fitted.model.unknown, w, fitted.state.hessian, velocity), units)
+    w, model = weights.read(fitted.model), fitted.model
+    units = tuple((model.system.unit(rate), model.system.force_unit(j)) for j, rate in enumerate(model.system.rates, 1))
+    contacts = model if fitted.rig.memory else None
+    return FrictionTable(
+        velocity, *_friction(weights, model.unknown, w, fitted.state.hessian, velocity, contacts), units
+    )
 
 
 @eqx.filter_jit
-def _friction(weights: Weights, unknown, w, hessian, velocity):
-    """Torque at `velocity`, and its covariance."""
+def _friction(weights: Weights, unknown, w, hessian, velocity, contacts: StateSpaceModel | None):
+    """Torque at `velocity`, and its covariance; with the effects of `contacts`."""
     here = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
     jac = here.jacobian(unknown, w)[: velocity.size]
+    torque = here.phi(unknown, w)[: velocity.size]
+    if contacts is not None and contacts.effects:
+        own = slice(w.shape[0] - weights.prior.size, None)
+
+        def sliding(z):
+            effects = weights.prior.write(contacts, z).effects
+            return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T.ravel()
+
+        torque, jac = torque + sliding(w[own]), jac.at[:, own].add(jax.jacfwd(sliding)(w[own]))
     half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True).T
     half = half.reshape(*velocity.shape, -1)
-    torque = here.phi(unknown, w)[: velocity.size].reshape(velocity.shape)
-    return torque, jnp.einsum("jaw,jbw->jab", half, half)
+    return torque.reshape(velocity.shape), jnp.einsum("jaw,jbw->jab", half, half)
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:

@@ -115,8 +115,16 @@ class DynamicFriction(JointEffect):
         v, s = self.own(scene.v), memory[0]
         winds = jnp.maximum(self._slope(s, v) * jnp.sign(v), 0.0) * jnp.sign(v)
         damper = jnp.exp(self.log_damping) * self._distance() * winds
-        steady = self.level(v) * jnp.clip(v / self.knee, -1.0, 1.0)
-        return self.at(scene, jnp.exp(self.log_level) * (steady - s) - damper)
+        return self.at(scene, jnp.exp(self.log_level) * (self.level(v) * self._line(v) - s) - damper)
+
+    def sliding(self, v):
+        """Below the knee the map is a straight line, and the state rests at the level of the rate."""
+        own = v[self.joint - 1]
+        torque = jnp.exp(self.log_level) * self.level(own) * (self._line(own) - jnp.sign(own))
+        return jnp.zeros_like(v).at[self.joint - 1].set(torque)
+
+    def _line(self, v: Scalar) -> Scalar:
+        return jnp.clip(v / self.knee, -1.0, 1.0)
 
 
 class Hysteresis(NamedTuple):

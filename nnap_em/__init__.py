@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from .diagnose.findings import Finding, findings
     from .diagnose.outcome import Closed
     from .diagnose.search import close_the_loop
-    from .em.branches import Branch, branches
-    from .em.check import CheckResult, check
-    from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
-    from .em.predict import Prediction, horizon_errors, predict, smooth
-    from .em.store import load, save
+    from .fit.branches import Branch, branches
+    from .fit.identify import Identified, friction_table, identify, parameter_table
+    from .fit.predict import Prediction, horizon_errors, predict, smooth
+    from .fit.store import load, save
+    from .identifiability.check import CheckResult, check
     from .model.friction import FrictionNetwork
     from .model.simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .model.state_space import StateSpaceModel
@@ -105,7 +105,7 @@ __all__ = [
     "write_urdf",
 ]
 _homes = {
-    "em.check": ("CheckResult", "check"),
+    "identifiability.check": ("CheckResult", "check"),
     "data.dataset": ("DataError", "Dataset", "pad"),
     "data.logs": ("DataWarning", "Logs", "read_logs"),
     "design.experiment": ("Design", "design_experiment"),
@@ -120,20 +120,20 @@ _homes = {
     "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
-    "em.branches": ("Branch", "branches"),
-    "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "fit.branches": ("Branch", "branches"),
+    "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),
     "numerics.parallel": ("all_devices", "over"),
     "smoother.particle": ("ParticleSmoother",),
-    "em.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
+    "fit.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
     "data.rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
     "model.simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother.gaussian": ("ExtendedKalmanSmoother",),
     "smoother.mixture": ("MixtureSmoother",),
     "smoother.posterior": ("Posterior",),
-    "em.store": ("load", "save"),
+    "fit.store": ("load", "save"),
     "systems": ("AbstractSystem", "register", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}

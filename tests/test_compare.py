@@ -22,8 +22,8 @@ from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.pooling import LEAST_VARIANCE, joint_test, pool
 from nnap_em.effects.base import one
 from nnap_em.effects.friction import LoadFriction
-from nnap_em.em.identify import Identified, identify
-from nnap_em.em.store import save
+from nnap_em.fit.identify import Identified, identify
+from nnap_em.fit.store import save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.report.comparison import describe, rows, table
 

@@ -12,12 +12,14 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnose import refit as refits
-from nnap_em.em import identify, loop, multistep, stated
-from nnap_em.em.identify import Identified
+from nnap_em.em import loop
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import ScoringMStep
-from nnap_em.em.multistep import Followed, Forks
+from nnap_em.fit import identify
+from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.prediction_error import multistep, stated
+from nnap_em.prediction_error.multistep import Followed, Forks
 
 MODEL, RULE = slide()
 DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))

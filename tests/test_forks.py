@@ -16,7 +16,11 @@ from nnap_em.diagnose.losses import MultiStep
 from nnap_em.diagnose.propose import proposals, surroundings
 from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.em.multistep import (
+from nnap_em.em.prior import ParameterPrior
+from nnap_em.model.simulate import paper_model
+from nnap_em.model.state_space import with_effects
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.prediction_error.multistep import (
     Columns,
     Forks,
     errors,
@@ -29,12 +33,8 @@ from nnap_em.em.multistep import (
     robust_scale,
     weighed,
 )
-from nnap_em.em.noise import third_differences, white_readings
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.shape import friction_prior
-from nnap_em.model.simulate import paper_model
-from nnap_em.model.state_space import with_effects
-from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.prediction_error.noise import third_differences, white_readings
+from nnap_em.prediction_error.shape import friction_prior
 
 ROWS = 60
 

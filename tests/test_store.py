@@ -17,9 +17,9 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.em.identify import Identified, begin
-from nnap_em.em.predict import smooth
-from nnap_em.em.store import fingerprint, load, read, save
+from nnap_em.fit.identify import Identified, begin
+from nnap_em.fit.predict import smooth
+from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother

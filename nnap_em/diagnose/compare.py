@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 
 from ..data.formats import read_table
 from ..data.machine import unpacked
-from ..em.identify import Identified, friction_table, nodes_between, parameter_table
-from ..em.store import model_file, read
+from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
+from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, UNITS, fit_law
 from ..residual.statistics import holm

@@ -17,7 +17,10 @@ from jaxtyping import Array, Float, Int
 from ..data.dataset import Dataset
 from ..effects import Candidate
 from ..em.local import locals_along
-from ..em.multistep import (
+from ..em.quadratic import friction_columns, whitened_sensitivities
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.parallel import each, turns
+from ..prediction_error.multistep import (
     HORIZONS,
     JUDGED,
     SOON,
@@ -31,9 +34,6 @@ from ..em.multistep import (
     starts,
     weighed,
 )
-from ..em.quadratic import friction_columns, whitened_sensitivities
-from ..model.state_space import Inputs, StateSpaceModel
-from ..numerics.parallel import each, turns
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
 from .refit import Trial

@@ -68,15 +68,14 @@ def late(seed: int) -> list[dict[str, object]]:
     velocity, count = visited(train.x)
     torque = jax.vmap(truth.unknown)(velocity.T).T
     out = []
-    for rows, name in ((0, "mixture"), (LATE, "one Gaussian"), (LATE, "mixture")):
+    for rows in (0, LATE):
         data = train.data._replace(y=train.data.y.at[:, :rows].set(jnp.nan))
-        smoother = lambda _, name=name: CubatureSmoother(SMOOTHERS[name])  # noqa: E731
-        fitted = identify(paper_rig(0.5), data, key=jax.random.key(seed), smoother=smoother)
+        fitted = identify(paper_rig(0.5), data, key=jax.random.key(seed))
         error = nrmse(friction_table(fitted, velocity).torque - torque, torque, count)
         state = smooth(fitted, data).state.mean
         theta2 = np.sqrt(np.mean(np.asarray(state - train.x)[..., 1] ** 2, axis=1))
         out.append({
-            "seed": seed, "late by [s]": rows * truth.dt, "smoother": name,
+            "seed": seed, "late by [s]": rows * truth.dt,
             "friction error": ", ".join(f"{e:.4f}" for e in error),
             "theta2, median RMSE [rad]": f"{np.median(theta2):.3f}",
             "on another branch": f"{np.sum(theta2 > LOST)} of {len(theta2)}",

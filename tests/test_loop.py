@@ -14,6 +14,7 @@ from nnap_em.commands import cli
 from nnap_em.diagnose.findings import Estimate, Finding, verdict
 from nnap_em.effects import catalogue
 from nnap_em.effects.base import Curve
+from nnap_em.effects.function import Axis
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
@@ -128,7 +129,14 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
         effect=catalogue["air_drag"](jnp.zeros(())),
         curve=Curve("x", "rad", 1, "N m", False, *np.asarray([[0.0, 1.0], [-1.0, 2.0], [0.1, 0.1]])),
     )
-    assert verdict([drawn], None) == "The model lacks air drag (3 N m from trough to peak)."
+    assert verdict([drawn], None) == "The model lacks air drag (3.0 N m from trough to peak)."
+    axis = Axis(("theta2",), jnp.asarray(-1.0), jnp.asarray(1.0), False, 4)
+    free = drawn._replace(effect=catalogue["unknown_function"](jnp.zeros(4), (axis,), joint=2))
+    assert verdict([free], None) == (
+        "The model lacks a torque at joint 2 that depends on theta2 (3.0 N m from trough to peak)."
+    )
+    rail = free._replace(curve=drawn.curve._replace(unit="N", mean=np.asarray([-3e3, 3.19e3])))
+    assert "a force at joint 2 that depends on theta2 (6200 N from trough to peak)" in verdict([rail], None)
     several = [Finding(catalogue["payload"](jnp.zeros(()), joint=j), {}, {}, (), "") for j in (1, 2, 1)]
     assert verdict(several, error).startswith(
         "The model lacks a payload at joint 1, a payload at joint 2 and a payload at joint"

@@ -14,7 +14,7 @@ from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..fit.identify import Identified, friction_table
-from ..numerics.digits import with_std
+from ..numerics.digits import number, with_std
 from ..systems import AbstractSystem
 from .hypothesis import blocks
 from .keys import Key, key_of, listed, remainder_of, with_article, words
@@ -181,9 +181,14 @@ def verdict(
 def _sized(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
     name, curve = with_article(key_of(finding.effect)), finding.curve
-    for symbol, number in finding.parameters.items():
-        return f"{name} ({symbol} = {with_std(number.value, number.std)} {number.unit}".rstrip(" -") + ")"
-    return f"{name} ({np.ptp(curve.mean):.2g} {curve.unit} from trough to peak)" if curve else name
+    for symbol, estimate in finding.parameters.items():
+        return f"{name} ({symbol} = {with_std(estimate.value, estimate.std)} {estimate.unit}".rstrip(" -") + ")"
+    if curve is None:
+        return name
+    if not finding.effect.named:
+        kind, inputs = "force" if curve.unit == "N" else "torque", listed(finding.effect.inputs_named())
+        name = f"a {kind} at joint {finding.effect.joint} that depends on {inputs}"
+    return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
 
 
 def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:

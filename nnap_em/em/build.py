@@ -187,7 +187,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     )
     estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
     mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, shape=model.log_q)
-    return Problem(model, mstep, start_bank(model, states, rig, system))
+    return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
 
 
 def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
@@ -209,25 +209,51 @@ def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
     )
 
 
+MOVED = 0.1
+"""Standard deviation of an angle at the start, and its motion before its first reading, from which on one hypothesis
+is not enough [rad]."""
 FEW, MOST = 25, 325
 """Hypotheses of the rates of joints that are read, and of all states, at most: two rows of readings determine such a
 rate as well, and n joints would have 5^n of them."""
 
 
-def start_bank(model: StateSpaceModel, states: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:
-    """Hypotheses for each unmeasured state that the prior leaves wide: angles beyond .1 rad, rates that move as far.
+def read_at_start(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> tuple[str, ...]:
+    """Measured states, but not angles whose first reading in a sequence is so late that they may have moved `MOVED`."""
+    rows = np.sum(np.asarray(data.valid), axis=1)
+    out = []
+    for i, name in enumerate(rig.measured):
+        read = np.isfinite(np.asarray(data.y)[..., i])
+        late = rig.dt * np.max(np.where(read.any(axis=1), read.argmax(axis=1), rows))
+        joint = system.coordinates.index(name) if name in system.coordinates else None
+        if joint is None or not system.angles[joint] or scales.speed[joint] * late <= MOVED:
+            out.append(name)
+    return tuple(out)
 
-    None for the rates of joints that are read, where they would be more than `FEW`, or all more than `MOST`.
+
+def start_bank(
+    model: StateSpaceModel, states: tuple[str, ...], read: tuple[str, ...], rig: Rig, system: AbstractSystem
+) -> StartBank:
+    """Hypotheses for each state that is not `read` at the start and that the prior leaves wide.
+
+    None for the rates of joints that are measured, where they would be more than `FEW`, or all more than `MOST`; then
+    none for what is measured.
     """
     spread = np.sqrt(np.diag(np.asarray(model.start.cov)))
     dof = len(system.coordinates)
-    counts = []
-    for i, name in enumerate(states):
-        wide = spread[i] * (0.2 if i >= dof else 1.0) > 0.1
-        counts.append((5 if i >= dof else 13) if wide and name not in rig.measured and system.angles[i % dof] else 1)
-    read = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
-    if math.prod(counts[i] for i in read) > FEW or math.prod(counts) > MOST:
-        counts = [1 if i in read else count for i, count in enumerate(counts)]
+    measured = [dof + joint for joint, name in enumerate(system.coordinates) if name in rig.measured]
+
+    def hypotheses(known: tuple[str, ...]) -> list[int]:
+        counts = []
+        for i, name in enumerate(states):
+            wide = spread[i] * (0.2 if i >= dof else 1.0) > MOVED
+            counts.append((5 if i >= dof else 13) if wide and name not in known and system.angles[i % dof] else 1)
+        if math.prod(counts[i] for i in measured) > FEW or math.prod(counts) > MOST:
+            counts = [1 if i in measured else count for i, count in enumerate(counts)]
+        return counts
+
+    counts = hypotheses(read)
+    if math.prod(counts) > MOST:
+        counts = hypotheses(rig.measured)
     angles = tuple(j for j, is_angle in enumerate(system.angles) if is_angle)
     unread = any(system.coordinates[j] not in rig.measured for j in angles)
     return StartBank(tuple(counts), angles if unread else ())

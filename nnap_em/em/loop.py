@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
-from ..numerics.parallel import each
+from ..numerics.parallel import each, turns
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, kept
@@ -89,11 +89,9 @@ def _seconded(model: AbstractModel, data: Dataset, second: AbstractBranching | N
     some = beyond(first, second)
     if second is None or not some.size:
         return first
-    size = min(len(data.t), 1 << int(some.size - 1).bit_length())  # few sizes: a program for each
-    index = np.resize(some, size)
-    batch = jax.tree.map(lambda a: a[index], (data, first.state))
-    together = max(1, second.room // (data.t.shape[1] * second.bytes_per_row))
-    return _replaced(first, each(_likeliest_path, (model, second), batch, together=together), index)
+    for few, batch in turns(len(some), *jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))):
+        first = _replaced(first, each(_likeliest_path, (model, second), batch), some[few])
+    return first
 
 
 def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:
@@ -114,9 +112,9 @@ def _likeliest_path(common, one) -> Posterior:
 
 @eqx.filter_jit
 def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
-    """`second` at the places `index` of `first`, but where it is no number."""
+    """`second` at the places `index` of `first`, where it is likelier."""
     pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
-    known = jnp.isfinite(second.loglik)
+    known = second.loglik > first.loglik[index]
     second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
     return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 

@@ -46,7 +46,7 @@ class GaussianSmoother(AbstractSmoother):
 
     def tries(self) -> "list[_Loosened]":
         """One for each of the first passes."""
-        once = dataclasses.replace(self, inflations=(1.0,))
+        once = dataclasses.replace(self, inflations=(1.0,), branching=False)  # one program, with `second` or without
         return [_Loosened(once, jnp.asarray(math.log(factor), float)) for factor in self.inflations]
 
     def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .comparison.compare import CompareError, Comparison, compare
     from .data.dataset import DataError, Dataset, pad
     from .data.logs import DataWarning, Logs, read_logs
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .design.experiment import Design, design_experiment
     from .design.limits import DesignError
-    from .diagnose.compare import CompareError, Comparison, compare
     from .diagnose.findings import Finding, findings
     from .diagnose.outcome import Closed
     from .diagnose.search import close_the_loop
@@ -110,7 +110,7 @@ _homes = {
     "data.logs": ("DataWarning", "Logs", "read_logs"),
     "design.experiment": ("Design", "design_experiment"),
     "design.limits": ("DesignError",),
-    "diagnose.compare": ("CompareError", "Comparison", "compare"),
+    "comparison.compare": ("CompareError", "Comparison", "compare"),
     "diagnose.findings": ("Finding", "findings"),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),

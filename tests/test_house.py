@@ -11,8 +11,8 @@ from shell import ROOT
 import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "recordings", "systems", "effects", "model", "smoother", "em",
-           "prediction_error", "fit", "identifiability", "residual", "curves", "diagnose", "design", "report",
-           "portable", "draft", "commands")  # fmt: skip
+           "prediction_error", "fit", "identifiability", "residual", "curves", "diagnose", "comparison", "design",
+           "report", "portable", "draft", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ..comparison.compare import CompareError
 from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..design.limits import DesignError
-from ..diagnose.compare import CompareError
 from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
 from ..fit.identify import Identified

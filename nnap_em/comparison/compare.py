@@ -12,14 +12,14 @@ from jaxtyping import Bool, Float
 
 from ..data.formats import read_table
 from ..data.machine import unpacked
+from ..diagnose.findings import covariance, estimates
+from ..diagnose.hypothesis import blocks
+from ..diagnose.keys import Key, key_of, listed, words
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, UNITS, fit_law
 from ..residual.statistics import holm
-from .findings import covariance, estimates
-from .hypothesis import blocks
-from .keys import Key, key_of, listed, words
 from .pooling import JointTest, Pooled, joint_test, pool
 
 CHANGED = 0.01

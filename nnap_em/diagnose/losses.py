@@ -2,6 +2,10 @@
 
 Each loss gives its errors and their derivatives by friction, parameters and candidates in one form, on which the one
 screen of `screen.py` works.
+
+A smoothed path has absorbed part of a missing force as process noise.  The errors are therefore innovations and
+open-loop errors of the filter, and every derivative passes through the same gains: what the filter takes out of the
+errors is taken out of the columns, too.
 """
 
 from abc import abstractmethod

@@ -69,7 +69,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv --clear .venv
 
 .venv/.demo: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .
+	$(PIP) --editable '.[examples]'
 	@touch $@
 
 .venv/.test: pyproject.toml constraints.txt | $(BIN)/python

@@ -15,8 +15,8 @@ import equinox as eqx
 import jax
 
 from nnap_em import Identified, compare, identify
+from nnap_em.comparison.compare import CHANGED
 from nnap_em.data.rig import Declared
-from nnap_em.diagnose.compare import CHANGED
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel
 

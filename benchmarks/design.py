@@ -35,7 +35,7 @@ from nnap_em.design.criteria import after
 from nnap_em.design.experiment import Design, design_experiment
 from nnap_em.design.rivals import Law, Rivals
 from nnap_em.diagnose.rivals import instead
-from nnap_em.em.identify import Identified, friction_table, identify
+from nnap_em.fit.identify import Identified, friction_table, identify
 from nnap_em.storage.files import cores, replace_text
 
 SEQUENCES = 6

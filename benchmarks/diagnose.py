@@ -33,7 +33,7 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnose.findings import entry, findings
 from nnap_em.diagnose.search import close_the_loop
-from nnap_em.em.predict import horizon_errors, predict
+from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.storage.files import replace_text
 from nnap_em.systems import specs
 

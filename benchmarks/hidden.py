@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from identify import nrmse, paper_rig, visited
 
-from nnap_em.em.identify import friction_table, identify
 from nnap_em.em.loop import e_step
-from nnap_em.em.predict import smooth
+from nnap_em.fit.identify import friction_table, identify
+from nnap_em.fit.predict import smooth
 from nnap_em.model.simulate import paper_experiment, paper_model, simulate
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.start import StartBank

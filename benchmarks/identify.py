@@ -22,11 +22,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.identify import Identified, begin, friction_table, identify
 from nnap_em.em.local import local, readings_at
 from nnap_em.em.loop import Schedule, e_step, em_step
-from nnap_em.em.predict import predict
 from nnap_em.em.quadratic import quadratic
+from nnap_em.fit.identify import Identified, begin, friction_table, identify
+from nnap_em.fit.predict import predict
 from nnap_em.model.friction import FixedFriction
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nnap_em.data.machine import packed, states
-from nnap_em.data.mjcf import read_machine
+from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.ode import integrate
 from nnap_em.systems import AbstractSystem, systems

@@ -19,8 +19,8 @@ import numpy as np
 
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.em.identify import identify, parameter_table
-from nnap_em.em.predict import predict, smooth
+from nnap_em.fit.identify import identify, parameter_table
+from nnap_em.fit.predict import predict, smooth
 from nnap_em.systems import specs
 
 RIGS = ("dfki_c1_joint1", "dfki_c0_joint1", "dfki_a0_joint1", "dfki_c1", "dfki_c0")

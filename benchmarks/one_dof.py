@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.identify import friction_table, identify
+from nnap_em.fit.identify import friction_table, identify
 from nnap_em.model.simulate import examples, sweep_experiment
 
 

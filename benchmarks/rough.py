@@ -30,8 +30,8 @@ from nnap_em.commands.common import set_up
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import Logs, read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.em.identify import friction_table, identify
-from nnap_em.em.predict import HORIZONS, horizon_errors, predict
+from nnap_em.fit.identify import friction_table, identify
+from nnap_em.fit.predict import HORIZONS, horizon_errors, predict
 from nnap_em.systems import specs
 
 CASES = {

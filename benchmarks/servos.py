@@ -26,7 +26,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.diagnose.findings import findings
 from nnap_em.diagnose.search import close_the_loop
-from nnap_em.em.identify import Identified, identify, parameter_table
+from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.systems import specs
 
 jax.config.update("jax_enable_x64", True)

@@ -33,8 +33,8 @@ from mujoco import rollout, sysid
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, read_rig
-from nnap_em.em.identify import Identified, identify
-from nnap_em.em.predict import predict
+from nnap_em.fit.identify import Identified, identify
+from nnap_em.fit.predict import predict
 from nnap_em.systems import specs
 from nnap_em.systems.arm import TwoLinkArm
 

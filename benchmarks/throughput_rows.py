@@ -27,8 +27,8 @@ from common_work import (
 from limits import c_case, transition_case
 from peers import cuthbert_case, cuthbert_exact, cuthbert_mcmc, dynamax_case, natural_transition, particles_case
 
-from nnap_em.em.identify import begin
 from nnap_em.em.loop import e_step, em_step
+from nnap_em.fit.identify import begin
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import Inputs
 from nnap_em.numerics.parallel import use_every_device

@@ -25,7 +25,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build
 from nnap_em.em.loop import EMState, Schedule, e_step, fit, start_state
 from nnap_em.em.mstep import AbstractMStep
-from nnap_em.em.predict import given_samples
+from nnap_em.fit.predict import given_samples
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import Experiment, paper_experiment, paper_model
 from nnap_em.numerics.parallel import use_every_device

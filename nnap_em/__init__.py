@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .comparison.compare import CompareError, Comparison, compare
     from .data.dataset import DataError, Dataset, pad
     from .data.logs import DataWarning, Logs, read_logs
     from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
     from .design.experiment import Design, design_experiment
     from .design.limits import DesignError
-    from .diagnose.compare import CompareError, Comparison, compare
     from .diagnose.findings import Finding, findings
     from .diagnose.outcome import Closed
     from .diagnose.search import close_the_loop
-    from .em.branches import Branch, branches
-    from .em.check import CheckResult, check
-    from .em.identify import Identified, friction_table, identify, parameter_table
     from .em.loop import EMState, FitError, Schedule
-    from .em.predict import Prediction, horizon_errors, predict, smooth
-    from .em.store import load, save
+    from .fit.branches import Branch, branches
+    from .fit.identify import Identified, friction_table, identify, parameter_table
+    from .fit.predict import Prediction, horizon_errors, predict, smooth
+    from .fit.store import load, save
+    from .identifiability.check import CheckResult, check
     from .model.friction import FrictionNetwork
     from .model.simulate import Experiment, examples, paper_experiment, paper_model, simulate
     from .model.state_space import StateSpaceModel
@@ -105,12 +105,12 @@ __all__ = [
     "write_urdf",
 ]
 _homes = {
-    "em.check": ("CheckResult", "check"),
+    "identifiability.check": ("CheckResult", "check"),
     "data.dataset": ("DataError", "Dataset", "pad"),
     "data.logs": ("DataWarning", "Logs", "read_logs"),
     "design.experiment": ("Design", "design_experiment"),
     "design.limits": ("DesignError",),
-    "diagnose.compare": ("CompareError", "Comparison", "compare"),
+    "comparison.compare": ("CompareError", "Comparison", "compare"),
     "diagnose.findings": ("Finding", "findings"),
     "em.loop": ("EMState", "FitError", "Schedule"),
     "portable.export": ("ExportError", "export"),
@@ -120,20 +120,20 @@ _homes = {
     "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
-    "em.branches": ("Branch", "branches"),
-    "em.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "fit.branches": ("Branch", "branches"),
+    "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),
     "numerics.parallel": ("all_devices", "over"),
     "smoother.particle": ("ParticleSmoother",),
-    "em.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
+    "fit.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
     "data.rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
     "model.simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
     "smoother.gaussian": ("ExtendedKalmanSmoother",),
     "smoother.mixture": ("MixtureSmoother",),
     "smoother.posterior": ("Posterior",),
-    "em.store": ("load", "save"),
+    "fit.store": ("load", "save"),
     "systems": ("AbstractSystem", "register", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}

@@ -23,7 +23,7 @@ from nnap_em.commands import identify as identify_command
 from nnap_em.commands import smooth as smooth_command
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.em.store import load, read
+from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
 from nnap_em.report import tables
 from nnap_em.residual.residual import residual
@@ -118,7 +118,7 @@ def test_public_names_are_what_they_say():
         assert not isinstance(value, type(sys)), f"{name} is a module"
         assert name in dir(nnap_em)
     from nnap_em import identify
-    from nnap_em.em.identify import identify as same
+    from nnap_em.fit.identify import identify as same
 
     assert identify is same
     with pytest.raises(AttributeError, match="no attribute 'identity'"):

@@ -26,10 +26,10 @@ from nnap_em.design.play import motions
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
-from nnap_em.em.identify import identify, parameter_table
-from nnap_em.em.predict import drawn_paths
-from nnap_em.em.store import load
 from nnap_em.em.weights import Weights
+from nnap_em.fit.identify import identify, parameter_table
+from nnap_em.fit.predict import drawn_paths
+from nnap_em.fit.store import load
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.design_plots import motion_figure
 from nnap_em.residual.residual import names_of
@@ -329,7 +329,7 @@ def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys)
         .replace("friction of 1 joint and m to", "fitted to")
         or "8 sequences" in json.loads((out / "report.json").read_text())["verdict"]
     )
-    from nnap_em.em.store import read
+    from nnap_em.fit.store import read
 
     assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]
     again = _run("design", out, "--out", tmp_path / "next", "--seconds", 0.1, "--quiet")

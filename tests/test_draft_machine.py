@@ -8,10 +8,10 @@ import pytest
 from recorders import JOINTS, MULTI, arrays, joint_states, ns, ros2, write_mcap
 
 from nnap_em.commands import cli
-from nnap_em.commands.draft_machine import draft_machine
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.draft.from_machine import draft_machine
 from nnap_em.systems import specs
 
 T = 0.004 * np.arange(2000)

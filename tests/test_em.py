@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.identify import Identified, begin, friction_table, identify
 from nnap_em.em.loop import FitError, Schedule
+from nnap_em.fit.identify import Identified, begin, friction_table, identify
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import Experiment, examples, simulate, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel

@@ -18,9 +18,9 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import AbstractEffect, catalogue
-from nnap_em.em.identify import Identified, begin, friction_table, parameter_table, phi_samples
-from nnap_em.em.predict import predict, smooth
-from nnap_em.em.store import save
+from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table, phi_samples
+from nnap_em.fit.predict import predict, smooth
+from nnap_em.fit.store import save
 from nnap_em.portable import unroll
 from nnap_em.portable.export import ExportError, export, parameters, predictor, stablehlo
 

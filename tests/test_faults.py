@@ -30,8 +30,8 @@ from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.effects import catalogue
-from nnap_em.em.identify import Identified
-from nnap_em.em.store import load
+from nnap_em.fit.identify import Identified
+from nnap_em.fit.store import load
 from nnap_em.storage import files, journal
 from nnap_em.storage.files import StoreError, sweep
 from nnap_em.storage.journal import HERE, Journal, digest, keeping, step

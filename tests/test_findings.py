@@ -17,7 +17,7 @@ from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed, Disputed, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
-from nnap_em.em.identify import begin
+from nnap_em.fit.identify import begin
 from nnap_em.report.diagnosis import write_diagnosis
 
 ROWS = 60

@@ -8,8 +8,11 @@ import pytest
 from prose import in_package, mistakes
 from shell import ROOT
 
-FOLDERS = ("numerics", "storage", "data", "systems", "effects", "model", "smoother", "em", "residual", "curves",
-           "diagnose", "design", "report", "portable", "commands")  # fmt: skip
+import nnap_em
+
+FOLDERS = ("numerics", "storage", "data", "machines", "recordings", "systems", "effects", "model", "smoother", "em",
+           "prediction_error", "fit", "identifiability", "residual", "curves", "diagnose", "comparison", "design",
+           "report", "portable", "draft", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 
@@ -35,6 +38,11 @@ def test_every_folder_is_in_the_order():
     there = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
     assert there == set(FOLDERS)
     assert tuple(re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "README.md").read_text())) == FOLDERS
+
+
+def test_no_folder_has_the_name_of_a_public_function():
+    """Its import would replace the function as an attribute of the package."""
+    assert not set(FOLDERS) & set(nnap_em.__all__)
 
 
 def test_no_test_imports_another():

@@ -11,10 +11,10 @@ from nnap_em.commands import cli
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
-from nnap_em.data.recordings.delays import Pair, delay
-from nnap_em.data.recordings.segments import cut
-from nnap_em.data.recordings.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.data.rig import read_rig
+from nnap_em.recordings.delays import Pair, delay
+from nnap_em.recordings.segments import cut
+from nnap_em.recordings.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.systems import specs
 
 DT = 0.01
@@ -413,8 +413,8 @@ def test_a_name_that_stands_twice_is_asked_for(tmp_path, capsys):
 
 def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
     """As the coordinates of a machine that was read from its file are."""
-    from nnap_em.data.recordings.columns import resolve
-    from nnap_em.data.recordings.files import reader
+    from nnap_em.recordings.columns import resolve
+    from nnap_em.recordings.files import reader
 
     joints = joint_states(("shoulder", "elbow"), *[np.ones((300, 2))] * 3)
     path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(T), joints)})

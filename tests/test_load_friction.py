@@ -12,7 +12,7 @@ from nnap_em import close_the_loop, findings
 from nnap_em.effects import Around, fields
 from nnap_em.effects.base import a
 from nnap_em.effects.friction import LoadFriction
-from nnap_em.em.identify import begin
+from nnap_em.fit.identify import begin
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 
 KNEE = 0.1

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from machines import arm
 
-from nnap_em.data.mjcf import MachineError, Part, read_machine
 from nnap_em.data.rig import RigError, RigWarning, read_rig, write_rig
 from nnap_em.em.build import build_system
+from nnap_em.machines.mjcf import MachineError, Part, read_machine
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]

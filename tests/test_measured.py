@@ -11,8 +11,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.em.build import build
-from nnap_em.em.identify import identify
 from nnap_em.em.loop import e_step
+from nnap_em.fit.identify import identify
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.systems import specs
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.em.branches import APART, branches, modes
 from nnap_em.em.loop import DIVERGED, _replaced, e_step
+from nnap_em.fit.branches import APART, branches, modes
 from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother

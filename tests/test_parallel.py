@@ -77,7 +77,7 @@ jax.config.update("jax_num_cpu_devices", 4)
 import equinox as eqx
 import numpy as np
 from nnap_em.em.loop import fit
-from nnap_em.em.identify import begin
+from nnap_em.fit.identify import begin
 from nnap_em.numerics.parallel import AXIS, over
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig

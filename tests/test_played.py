@@ -15,12 +15,12 @@ import pytest
 from helpers import optimised
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.mjcf import MachineError, read_machine
 from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.effects.function import Axis, InputAxis, UnknownFunction
 from nnap_em.effects.periodic import PeriodicForce
-from nnap_em.em.identify import Identified, begin
+from nnap_em.fit.identify import Identified, begin
+from nnap_em.machines.mjcf import MachineError, read_machine
 from nnap_em.portable.c99 import torques, write_c
 from nnap_em.portable.draws import write_draws
 from nnap_em.portable.export import ExportError

@@ -10,8 +10,8 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.effects.base import Curve
-from nnap_em.em.identify import FrictionTable
-from nnap_em.em.predict import Prediction
+from nnap_em.fit.identify import FrictionTable
+from nnap_em.fit.predict import Prediction
 from nnap_em.report.diagnosis import _prediction_pictures
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure

@@ -10,8 +10,8 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.identify import Identified, begin, friction_table, phi_samples
-from nnap_em.em.predict import Prediction, given_samples, horizon_errors, predict, smooth, smoothed_states
+from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
+from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, predict, smooth, smoothed_states
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics import parallel

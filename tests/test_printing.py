@@ -10,8 +10,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.em.identify import begin
-from nnap_em.em.predict import Prediction
+from nnap_em.fit.identify import begin
+from nnap_em.fit.predict import Prediction
 
 RIG = Rig(
     "bench", "pendulum",

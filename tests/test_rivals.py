@@ -12,7 +12,7 @@ from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed
 from nnap_em.diagnose.rivals import compare_equivalents, instead, possible
 from nnap_em.diagnose.verdict import EQUIVALENT_NATS
-from nnap_em.em.identify import identify
+from nnap_em.fit.identify import identify
 from nnap_em.systems import specs
 
 GAIN = 0.7

@@ -16,7 +16,7 @@ from nnap_em.diagnose.screen import overlaps, project, screen
 from nnap_em.diagnose.smoothed import SmoothedFit
 from nnap_em.effects import catalogue
 from nnap_em.em.local import local
-from nnap_em.em.memory import extended
+from nnap_em.fit.memory import extended
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.kalman import CUBATURE, kalman_filter

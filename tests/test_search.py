@@ -29,8 +29,8 @@ from nnap_em.diagnose.trial import Refit, certainty
 from nnap_em.diagnose.verdict import Share
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
-from nnap_em.em.identify import Identified
 from nnap_em.em.loop import EMState
+from nnap_em.fit.identify import Identified
 from nnap_em.model.state_space import with_effects
 from nnap_em.smoother.start import StartBank
 from nnap_em.storage.deadline import TimeUp, until

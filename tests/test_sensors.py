@@ -19,21 +19,20 @@ from machine_files import errors
 from machines import arm
 
 from nnap_em import identify
-from nnap_em.commands.draft_machine import _sensors, draft_machine
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
-from nnap_em.data.mjcf import read_machine
-from nnap_em.data.recordings.recording import Topic
 from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.draft.from_machine import _sensors, draft_machine
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
-from nnap_em.em.identify import begin, phi_samples
 from nnap_em.em.local import local, readings_at
 from nnap_em.em.mstep import _shaken
-from nnap_em.em.predict import horizon_errors, predict
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
-from nnap_em.em.store import load, save
+from nnap_em.fit.identify import begin, phi_samples
+from nnap_em.fit.predict import horizon_errors, predict
+from nnap_em.fit.store import load, save
+from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
@@ -42,6 +41,7 @@ from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.portable.export import parameters, predictor
 from nnap_em.portable.mjcf import write_mjcf
+from nnap_em.recordings.recording import Topic
 from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.smoother.start import StartBank

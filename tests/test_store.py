@@ -17,9 +17,9 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.em.identify import Identified, begin
-from nnap_em.em.predict import smooth
-from nnap_em.em.store import fingerprint, load, read, save
+from nnap_em.fit.identify import Identified, begin
+from nnap_em.fit.predict import smooth
+from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
@@ -112,6 +112,20 @@ def test_a_payload_of_a_file_from_before_it_had_a_centre_is_read(tmp_path):
     _rewrite(path, older)
     (effect,) = load(path).model.effects
     assert float(effect.values()["mass"]) == 0.04 and effect.moment is None
+
+
+def test_the_size_of_the_discrepancy_is_read_under_its_old_name(tmp_path):
+    path, rig = tmp_path / "model.npz", RIGS["slide"]
+    save(path, begin(rig, _data(rig), key=jax.random.key(5))._replace(discrepancy=0.25))
+
+    def older(header, arrays):
+        header["leaves"]["/unsaid"] = header["leaves"].pop("/discrepancy")
+
+    _rewrite(path, older)
+    fitted = load(path)
+    assert fitted.discrepancy == 0.25
+    with pytest.warns(DeprecationWarning, match="discrepancy"):
+        assert fitted.unsaid == 0.25
 
 
 @pytest.mark.parametrize("name", RIGS)

@@ -16,12 +16,12 @@ from machine_files import CASES, errors, friction, recorded
 
 from nnap_em import identify
 from nnap_em.data.machine import unpacked
-from nnap_em.data.mjcf import read_machine
 from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.effects.body import Payload
 from nnap_em.effects.position import Cogging, TorsionalSpring
-from nnap_em.em.identify import Identified, begin
-from nnap_em.em.store import load, save
+from nnap_em.fit.identify import Identified, begin
+from nnap_em.fit.store import load, save
+from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import declared, paper_model
 from nnap_em.portable.export import ExportError, export
 from nnap_em.portable.friction import friction_form
@@ -58,7 +58,7 @@ sys.modules["mujoco"] = None
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from nnap_em.em.store import load
+from nnap_em.fit.store import load
 fitted = load(sys.argv[1])
 x = np.asarray([0.1, 0.4, -0.3, 1.0])
 u = fitted.model.inputs(__import__("nnap_em").Dataset(np.zeros(1), np.ones((1, 1)), np.zeros((1, 1)), np.ones(1, bool)))

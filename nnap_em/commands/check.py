@@ -4,7 +4,7 @@ import argparse
 
 import jax
 
-from ..em.check import BAD, check
+from ..identifiability.check import BAD, check
 from ..storage.log import Log
 from .common import read_bench
 

@@ -17,6 +17,8 @@ from typing import Any, TypeVar
 from .. import __version__
 from ..storage.log import Log, silent
 
+_MODULES = {"import": "import_logs"}
+"""Modules that cannot be called like their command: `import` is a word of Python."""
 _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
@@ -288,7 +290,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()
-            run = importlib.import_module(f".{args.command}", __package__).run
+            run = importlib.import_module(f".{_MODULES.get(args.command, args.command)}", __package__).run
             with common.profiled(getattr(args, "profile", False)):
                 return run(args, log) or 0
     except KeyboardInterrupt as stopped:

@@ -14,23 +14,23 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ..comparison.compare import CompareError
 from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
-from ..data.recordings.mcap_writer import Channel
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..design.limits import DesignError
-from ..diagnose.compare import CompareError
 from ..em.build import build_system, measure_scales
-from ..em.check import BAD, torques
-from ..em.identify import Identified
 from ..em.loop import FitError
-from ..em.predict import GIVEN
-from ..em.store import fingerprint
+from ..fit.identify import Identified
+from ..fit.predict import GIVEN
+from ..fit.store import fingerprint
+from ..identifiability.check import BAD, torques
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
 from ..portable.export import ExportError
+from ..recordings.mcap_writer import Channel
 from ..residual.residual import names_of
 from ..storage.cache import Cache
 from ..storage.files import StoreError, cores, sweep

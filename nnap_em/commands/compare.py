@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..diagnose.compare import compare
+from ..comparison.compare import compare
 from ..report.comparison import table, write_comparison
 from ..storage.log import Log
 

@@ -12,8 +12,8 @@ from ..data.rig import read_rig
 from ..design.experiment import design_experiment
 from ..design.limits import DesignError
 from ..design.rivals import Law, open_pairs, rivals
-from ..em.identify import Identified
-from ..em.store import Stored, fingerprint, model_file, read
+from ..fit.identify import Identified
+from ..fit.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
 from ..storage.log import Log
 from ..systems import specs

@@ -8,7 +8,7 @@ import jax
 
 from ..diagnose.findings import findings
 from ..diagnose.search import close_the_loop
-from ..em.store import fingerprint, save
+from ..fit.store import fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
 from .common import go_on, read_bench, resumable, warn_of_torques

@@ -4,7 +4,7 @@ import argparse
 
 import jax
 
-from ..em.store import load, model_file
+from ..fit.store import load, model_file
 from ..portable.c99 import write_c
 from ..portable.draws import TABLE, write_draws
 from ..portable.export import export

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.rig import Rig
-from ..em.identify import MakeSmoother, Watch, identify
 from ..em.loop import EMState
-from ..em.store import MODEL, fingerprint, save
+from ..fit.identify import MakeSmoother, Watch, identify
+from ..fit.store import MODEL, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS

@@ -3,12 +3,12 @@
 import argparse
 
 from ..data.dataset import DataError
+from ..draft.from_log import draft
+from ..draft.from_machine import draft_machine
+from ..draft.from_topics import draft_recorded
 from ..storage.files import replace_text
 from ..storage.log import Log
 from ..systems import specs
-from .draft import draft
-from .draft_machine import draft_machine
-from .draft_recorded import draft_recorded
 
 
 def run(args: argparse.Namespace, log: Log) -> None:

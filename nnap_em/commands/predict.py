@@ -6,9 +6,9 @@ import jax
 import numpy as np
 
 from ..data.logs import read_logs
-from ..data.recordings.mcap_writer import require_mcap, write_mcap
-from ..em.predict import predict
-from ..em.store import load, model_file
+from ..fit.predict import predict
+from ..fit.store import load, model_file
+from ..recordings.mcap_writer import require_mcap, write_mcap
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
 

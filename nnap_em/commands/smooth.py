@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from ..data.logs import Logs, read_logs
-from ..data.recordings.mcap_writer import Channel, require_mcap, write_mcap
-from ..em.branches import Branch, branches
-from ..em.identify import Identified
-from ..em.predict import smoothed_states
-from ..em.store import load, model_file
+from ..fit.branches import Branch, branches
+from ..fit.identify import Identified
+from ..fit.predict import smoothed_states
+from ..fit.store import load, model_file
+from ..recordings.mcap_writer import Channel, require_mcap, write_mcap
 from ..residual.residual import names_of, residual
 from ..storage.log import Log
 from .common import log_of, states_of, write_states

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..em.identify import Identified
 from ..em.mstep import kept
-from ..em.predict import drawn_paths, smooth
+from ..fit.identify import Identified
+from ..fit.predict import drawn_paths, smooth
 from ..storage.log import Log, renamed, silent
 from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
 from .information import Fit, known

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..em.predict import Paths
+from ..fit.predict import Paths
 from ..numerics.parallel import each
 from .limits import Limits
 

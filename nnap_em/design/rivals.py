@@ -8,7 +8,7 @@ from ..data.dataset import Dataset
 from ..diagnose.keys import key_of, words
 from ..diagnose.rivals import instead, possible
 from ..effects import AbstractEffect
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..storage.log import Log, silent
 from .limits import DesignError
 

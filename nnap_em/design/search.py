@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..em.predict import Paths
+from ..fit.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
 from .criteria import AbstractCriterion, Information

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..data.dataset import Dataset, horizon
-from ..em.identify import Identified
 from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
 from ..em.mstep import kept
-from ..em.multistep import JUDGED, errors, followed, ratio
+from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
+from ..prediction_error.multistep import JUDGED, errors, followed, ratio
 from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
-from ..em.identify import Identified, friction_table
+from ..fit.identify import Identified, friction_table
 from ..numerics.digits import number, with_std
 from ..systems import AbstractSystem
 from .hypothesis import blocks

@@ -2,6 +2,10 @@
 
 Each loss gives its errors and their derivatives by friction, parameters and candidates in one form, on which the one
 screen of `screen.py` works.
+
+A smoothed path has absorbed part of a missing force as process noise.  The errors are therefore innovations and
+open-loop errors of the filter, and every derivative passes through the same gains: what the filter takes out of the
+errors is taken out of the columns, too.
 """
 
 from abc import abstractmethod
@@ -17,23 +21,23 @@ from jaxtyping import Array, Float, Int
 from ..data.dataset import Dataset
 from ..effects import Candidate
 from ..em.local import locals_along
-from ..em.multistep import (
+from ..em.quadratic import friction_columns, whitened_sensitivities
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.parallel import each, turns
+from ..prediction_error.multistep import (
     HORIZONS,
     JUDGED,
-    SOON,
+    SHORT_HORIZONS,
     Followed,
     errors,
     finish,
     followed,
-    forks,
+    open_loop,
     ratio,
     read_columns,
     starts,
     weighed,
 )
-from ..em.quadratic import friction_columns, whitened_sensitivities
-from ..model.state_space import Inputs, StateSpaceModel
-from ..numerics.parallel import each, turns
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
 from .refit import Trial
@@ -97,8 +101,8 @@ class MultiStep(AbstractLoss):
     bars: ClassVar[Bars] = MULTI_STEP
     measure: ClassVar[str] = "share of the squared multi-step error"
     predicts: ClassVar[bool] = True
-    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SOON))
-    judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SOON))
+    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SHORT_HORIZONS))
+    judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SHORT_HORIZONS))
     """Horizons [s] at which a law that a band shows is judged after its refit."""
 
     def left(self, fit: SmoothedFit) -> float:
@@ -113,7 +117,7 @@ class MultiStep(AbstractLoss):
         track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
         along = candidate_columns(_machine(fit), candidates)
         every = tuple(sorted(set(sum(self.bands, ()))))
-        predictions = forks(
+        predictions = open_loop(
             followed(model, weights.prior, path, data),
             weights,
             lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),

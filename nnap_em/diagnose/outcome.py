@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..residual.interventions import Intervention
 from .hypothesis import Found
 from .keys import Key

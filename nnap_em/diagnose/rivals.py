@@ -9,8 +9,8 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
-from ..em.identify import Identified, finished
-from ..em.memory import extended
+from ..fit.identify import Identified, finished
+from ..fit.memory import extended
 from ..storage.log import silent
 from .context import EFFORT, SearchContext, extend, smooth
 from .hypothesis import Hypothesis

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..effects import Candidate, flat
-from ..em.shape import friction_prior
+from ..prediction_error.shape import friction_prior
 from ..storage.journal import HERE, step
 from .folds import members, parts
 from .keys import free_signals

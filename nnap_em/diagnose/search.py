@@ -14,11 +14,11 @@ from scipy import stats
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..em.identify import Identified, finished, identify
 from ..em.loop import EMState, FitError
-from ..em.noise import white_readings
+from ..fit.identify import Identified, finished, identify
 from ..model.state_space import StateSpaceModel
 from ..numerics.programs import release_programs
+from ..prediction_error.noise import white_readings
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
 from ..smoother.gaussian import CubatureSmoother, GaussianSmoother

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import AbstractEffect, Candidate, flat
-from ..em.memory import extended
+from ..fit.memory import extended
 from ..numerics.gaussian import Gaussian
 from .findings import estimates
 from .hypothesis import Hypothesis, blocks

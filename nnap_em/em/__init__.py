@@ -1,1 +1,1 @@
-"""E-step, M-step and their loop; identify, check, predict and store."""
+"""Expectation-Maximisation: first model, E-step, M-step and their loop."""

@@ -1,7 +1,8 @@
 """Expectation-Maximisation: E-step and M-step in turn, over a growing horizon, until nothing changes.
 
-A wrong model loses a hidden chaotic joint within a second or two and a fit to a lost track is worthless; so the first
-epochs see the head of every sequence only, and the horizon grows as the model improves.
+Under a wrong model the smoother of a hidden chaotic joint diverges within a second or two, and a fit to a diverged path
+is worthless: the first epochs see the head of every sequence only, and the horizon grows as the model improves.
+Likelihoods are compared at one horizon only.
 """
 
 import math
@@ -157,6 +158,7 @@ def em_step(
 
     Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
     horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
+    `step` keeps the result in the journal of a command, from which `--resume` continues; elsewhere it does nothing.
     """
     posterior = (_alone if growing else e_step)(model, data, smoother, key=key)
     model, info = m_step(model, posterior, data)
@@ -216,7 +218,11 @@ def fit(
 
 
 def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EMState:
-    """Accept the model that was tried, or go back to the best one and try a shorter way from there."""
+    """Accept the model that was tried, or go back to the best one and try a shorter way from there.
+
+    Half a nat a sequence is allowed: likelihoods of linearised and of sampled smoothers are not exact.  A sequence that
+    was left out under the best model does not count; one that diverges under the new model counts against it.
+    """
     loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
     mean = float(np.mean(loglik[used]))
     if np.nanmean(loglik - state.top) >= -0.5:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .. import __version__
 from ..effects import AbstractEffect
 from ..effects.base import Scene
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..systems.tree import Tree

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from .. import __version__
 from ..effects import AbstractEffect
 from ..effects.base import Scene
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_text
 from .export import ExportError, unrolled

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..data.formats import write_csv
-from ..em.identify import Identified, friction_table
-from ..em.predict import drawn_paths
+from ..fit.identify import Identified, friction_table
+from ..fit.predict import drawn_paths
 from ..systems.tree import Tree
 from .friction import FrictionForm, declared_friction, even_nodes, friction_form
 from .mjcf import write_model

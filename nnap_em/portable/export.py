@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from .. import __version__
 from ..effects import AbstractEffect
-from ..em.identify import Identified, friction_table, parameter_table
 from ..em.weights import Weights
+from ..fit.identify import Identified, friction_table, parameter_table
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..report.tables import write_json

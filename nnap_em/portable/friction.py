@@ -8,7 +8,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from ..em.identify import Identified, friction_table
+from ..fit.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from ..systems.tree import KNEE, Tree
 

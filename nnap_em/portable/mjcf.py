@@ -12,7 +12,7 @@ import numpy as np
 from .. import __version__
 from ..data.machine import Joint
 from ..effects import AbstractEffect
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_text

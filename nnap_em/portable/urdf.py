@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import __version__
 from ..data.machine import Joint
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .content import Content, Drive, JointContent

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Number
-from ..diagnose.pooling import JointTest, Pooled
+from ..comparison.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Number
+from ..comparison.pooling import JointTest, Pooled
 from ..numerics.digits import number, with_std
 from ..storage.files import replace_text
 from .compare_plots import comparison_figure

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from ..diagnose.findings import Estimate, covariance, estimates, filled
 from ..diagnose.hypothesis import blocks
 from ..effects import flat
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from ..model.dynamic_friction import DynamicFriction, Hysteresis, hysteresis
 from ..numerics.digits import with_std
 from ..residual.residual import Names

@@ -14,8 +14,8 @@ from ..diagnose.findings import Finding, advice, disputes, entry, friction_chang
 from ..diagnose.keys import Key, key_of, words
 from ..diagnose.outcome import Closed, Step
 from ..effects import catalogue
-from ..em.identify import FrictionTable, friction_table
-from ..em.predict import GIVEN, Prediction
+from ..fit.identify import FrictionTable, friction_table
+from ..fit.predict import GIVEN, Prediction
 from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.logs import Logs
 from ..data.servo import TORQUE
-from ..em.identifiability import identifiability, sentences
-from ..em.identify import FrictionTable, Identified, parameter_table
-from ..em.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
+from ..fit.identify import FrictionTable, Identified, parameter_table
+from ..fit.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
+from ..identifiability.identifiability import identifiability, sentences
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
 from .tables import INNER
 

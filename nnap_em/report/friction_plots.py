@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ..em.identify import FrictionTable
+from ..fit.identify import FrictionTable
 from ..residual.residual import Names
 from .style import ACROSS, AFTER, BEFORE, band, density, head, limits, panels, styled, symbol
 

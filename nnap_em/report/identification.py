@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..diagnose.keys import listed
-from ..em.identify import FrictionTable, Identified, friction_table
-from ..em.predict import smooth
+from ..fit.identify import FrictionTable, Identified, friction_table
+from ..fit.predict import smooth
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
 from ..storage.log import Log

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ..data.recordings.declared import Plan
-from ..data.recordings.delays import Delay
-from ..data.recordings.resample import Resampled, TopicFacts
 from ..data.rig import Rig
 from ..numerics.digits import number
+from ..recordings.declared import Plan
+from ..recordings.delays import Delay
+from ..recordings.resample import Resampled, TopicFacts
 from ..storage.files import replace_text
 from .document import versions
 from .import_plot import timeline

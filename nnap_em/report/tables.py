@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.formats import write_csv
-from ..em.identify import nodes_between
+from ..fit.identify import nodes_between
 from ..storage.files import replace_text
 
 INNER = (0.5, 99.5)

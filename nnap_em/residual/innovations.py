@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import Dataset
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from .residual import Names, Residual, residual
 from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, whiteness
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from ..data.dataset import Dataset
 from ..em.build import measure_scales
-from ..em.identify import Identified
+from ..fit.identify import Identified
 from .residual import Names, Residual, names_of, residual
 
 WIDTHS = (0.2, 0.4, 0.8)

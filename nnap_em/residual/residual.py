@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
 from ..data.units import force_unit, joint_called, state_unit
-from ..em.identify import Identified
 from ..em.mstep import kept
-from ..em.predict import smooth
+from ..fit.identify import Identified
+from ..fit.predict import smooth
 from ..model import hooks
 from ..model.base import prepare
 from ..model.state_space import with_effects

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
-from ..em.identify import Identified
 from ..em.loop import FitError
+from ..fit.identify import Identified
 from .interventions import LEVEL, MORE, Intervention, in_order, interventions, overlap
 
 MARGIN, LEAST = 0.1, 0.5

@@ -25,9 +25,12 @@ class GaussianSmoother(AbstractSmoother):
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses compete."""
     iterations: int = eqx.field(static=True, default=1)
-    """Relinearisations about the smoothed path."""
+    """Relinearisations about the smoothed path: Gauss-Newton steps on the path.  Every epoch of EM begins anew with the
+    first pass; the mixture, which compares the likelihoods of paths, takes four."""
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
-    """Process noise of the first pass over that of the model: a looser filter keeps a track that a tight one loses."""
+    """Process noise of the first pass over that of the model: a looser filter follows where a tight one diverges.
+
+    It decides only where the second pass linearises; that pass and its likelihood have the noise of the model."""
     branching: bool = eqx.field(static=True, default=True)
     """False: one Gaussian only, also where an angle that is not read is wide."""
 

@@ -13,7 +13,12 @@ from ..numerics.gaussian import Gaussian
 
 
 class Posterior(NamedTuple):
-    """The smoothing distribution: its marginals, and equal-weight nodes of p(x_k, x_{k+1} | y) for every step."""
+    """The smoothing distribution: its marginals, and equal-weight nodes of p(x_k, x_{k+1} | y) for every step.
+
+    An M-step takes expectations of functions that are not linear (friction at the velocity of a step) under the
+    distribution of neighbouring states.  Means over nodes serve paths of particles and cubature points of a Gaussian
+    alike; the lag-one covariance is that of `prev` and `next`.
+    """
 
     state: Gaussian
     prev: Float[Array, "*seq steps node state"]
@@ -23,6 +28,8 @@ class Posterior(NamedTuple):
     excess: Float[Array, "*seq steps state state"]
     """Covariance of a kick beyond the process noise, where the smoother's transition is an approximation."""
     loglik: Float[Array, "*seq"]
+    """Log-likelihood of the readings: for Gaussian smoothers that of the model linearised about the smoothed path, for
+    particles an estimate of that of the model itself; values of the two kinds are not compared."""
     ess: Float[Array, "*seq"]
     """Mean effective sample size of a particle smoother; infinite where nothing is sampled."""
     width: Float[Array, "*seq"] | None = None

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from ..data.from_file import declare
 from ..data.rig import SystemSpec
+from ..machines.from_file import declare
 from . import acrobot, pendubot, pendulum, slide, tree
 from .base import AbstractSystem
 

@@ -1,0 +1,55 @@
+"""nnap-em import: logs as machines write them, brought to one grid as a data set."""
+
+import argparse
+import os
+import re
+import time
+import tomllib
+from pathlib import Path
+
+from ..data.rig import read_rig, toml_text
+from ..em.build import build_system
+from ..recordings.declared import read_plan
+from ..recordings.folder import completed, places, write_sequences
+from ..recordings.resample import Resampled, resample
+from ..report.imported import describe, write_page
+from ..storage.files import replace_text, whole_folder
+from ..storage.log import Log
+from ..systems import specs
+
+
+def run(args: argparse.Namespace, log: Log) -> None:
+    """Write the data set, whole or not at all."""
+    began = time.perf_counter()
+    with whole_folder(args.out) as part:
+        rig = read_rig(args.rig, specs)
+        plan = read_plan(args.rig, (*rig.input_columns, *rig.measured))
+        shifts = dict(args.shift)
+        logs = []
+        for path in args.logs:
+            logs.append(resample(path, rig, build_system(rig).states, plan, shifts))
+            log(f"{path}: {_summary(logs[-1])}")
+        files = places(logs, args.test)
+        write_sequences(part, logs, files, rig)
+        text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
+        replace_text(part / "rig.toml", completed(text, logs[0].addresses))
+        document = describe(logs, files, rig, plan, shifts, seconds=time.perf_counter() - began)
+        write_page(part, document)
+    for line in document["look"]:
+        log(f"look at this: {line}")
+    test = sum(file.startswith("test/") for file in files)
+    log(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
+
+
+def _reaching(text: str, here: Path, out: Path) -> str:
+    """A rig.toml that finds its machine file, which stays where it is, from another folder."""
+    file = tomllib.loads(text)["model"].get("file")
+    if file is None:
+        return text
+    path = toml_text(os.path.relpath(here / file, out))
+    return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
+
+
+def _summary(log: Resampled) -> str:
+    used = [stretch for stretch in log.sequences if not stretch.why]
+    return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

@@ -1,0 +1,187 @@
+"""A first rig.toml for a machine in a file, from what its names and those of a log have in common."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.dataset import DataError
+from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
+from ..data.rig import SystemSpec, toml_text
+from ..data.servo import TORQUE
+from ..machines.mjcf import read_machine
+from ..recordings.files import reader
+from ..recordings.recording import Address, Topic
+from .from_log import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
+from .from_topics import COMMAND, columns_table, commands, others
+
+
+def draft_machine(path: Path, model: Path, home: Path) -> Draft:
+    """The rig.toml in the folder `home` for the log `path` of the machine in `model`.
+
+    Raises DataError where the log cannot be read or no joint of the machine is in it, MachineError for `model`.
+    """
+    machine = read_machine(model)
+    topics = reader(path).topics(path)
+    columns, inputs = _joints(machine, topics), _inputs(machine, topics)
+    if not columns:
+        names = ", ".join(joint.name for joint in machine.joints)
+        hint = "write rig.toml by hand, with [import.columns]"
+        raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
+    columns |= (sensed := _sensors(machine, topics))
+    named, sensors = tuple(columns), tuple(sensor for sensor in machine.sensors if sensor.name in sensed)
+    machine = machine._replace(states=_called(machine, named), sensors=sensors)
+    spec, text = SystemSpec(machine.states, (), {}, len(machine.joints)), packed(machine)
+    everything = columns | {column: at for column, (at, _) in inputs.items()}
+    table = _table(path, everything)
+    lines = [
+        *_model(machine, os.path.relpath(model, home)),
+        *_driven(machine, {column: joint for column, (_, joint) in inputs.items()}),
+        *sampling(table, [meaning("time")] if "time" in table else []),
+        *measurement(table, named, spec, lambda name: machine_unit(text, name)),
+        *_addresses(topics, everything),
+    ]
+    return Draft("\n".join([HEAD.format(name=toml_text(model.stem)), *lines]) + "\n", ())
+
+
+def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
+    """The states, by the sensors whose columns are there."""
+    names, dof = list(states(machine.joints)), len(machine.joints)
+    for sensor in machine.joint_sensors:
+        if sensor.name in columns:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
+    return tuple(names)
+
+
+def _fields(topics: Sequence[Topic]) -> list[tuple[Address, str]]:
+    """Everything that is there, with its last word."""
+    return [(Address(t.name, field), field.rpartition(".")[2]) for t in topics for field in t.fields]
+
+
+def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
+    """Address of the first name that exists."""
+    return next((at for name in names for at, word in fields if word == name), None)
+
+
+def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
+    """Columns of angles and rates, and where they are: by name, or else as theta1 or q0 in the order of the joints."""
+    fields, out = _fields(topics), {}
+    kinds = _kinds(fields)
+    for rate, (d, array, kind) in enumerate((("", "position", "theta"), ("d", "velocity", "dtheta"))):
+        for i, joint in enumerate(machine.joints):
+            own = [sensor.name for sensor in machine.joint_sensors if (sensor.joint, sensor.rate) == (i, bool(rate))]
+            at = _first(fields, [d + joint.name, f"{array}[{joint.name}]"])
+            if at is None and (sensor := next((name for name in own if _first(fields, [name])), None)):
+                out[sensor] = _first(fields, [sensor])
+            elif at := at or kinds.get(f"{kind}{i + 1}"):
+                out[d + joint.name] = at
+    return out
+
+
+_IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
+"""Names of readings in a ROS message of an inertial sensor."""
+
+
+def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
+    """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
+    every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
+    for sensor in machine.sensors:
+        alone = sum(other.kind == sensor.kind for other in machine.sensors) == 3
+        usual = f"{_IMU[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in _IMU else sensor.name
+        at = [at for at in every if at.path == sensor.name] or [at for at in every if at.path == usual]
+        if sensor.kind in SENSE_UNITS and len(at) == 1:
+            out[sensor.name] = at[0]
+    return out
+
+
+def _kinds(fields: Sequence[tuple[Address, str]]) -> dict[str, Address]:
+    """Meanings of names that are not in the file: `theta2`, and `input2` for a torque."""
+    columns = from_one([meaning(re.sub(r"\[(\d+)\]$", r"\1", word)) for _, word in fields])
+    out: dict[str, Address] = {}
+    for column, (at, _) in zip(columns, fields, strict=True):
+        number = "" if column.kind != "input" or column.number is None else str(column.number)
+        out.setdefault(column.kind + number, at)
+    return out
+
+
+def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Address, str]]:
+    """Columns of torques, where they are, and the joint of each: of the motors, or of joints where there are none.
+
+    A measured effort is the torque of a motor, and no command of a servo.
+    """
+    fields, order = _fields(topics), commands(topics)
+    kinds, servos = _kinds(fields), {motor.name for motor in machine.motors if motor.kind != TORQUE}
+    motors = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
+    motors = motors or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]
+    out: dict[str, tuple[Address, str]] = {}
+    for i, (name, joint) in enumerate(motors):
+        own = [name] if name in servos else [name, f"effort[{name}]"]
+        at = _first(fields, own) or (order[i] if len(order) == len(motors) else None)
+        at = at or next((at for at, word in fields if joint in word and COMMAND.search(word)), None)
+        if name not in servos:
+            at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(motors) == 1 else None)
+        if at is not None:
+            out[name] = at, joint
+    return out
+
+
+def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
+    """Some of the log on uniform rows; of a CSV file its own."""
+    if path.suffix.lower() != ".csv":
+        return columns_table(path, columns)
+    given = numbers(path)
+    time = next((given[name] for name in given if meaning(name).kind == "time"), None)
+    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in columns.items()}
+
+
+def _model(machine: Machine, file: str) -> Iterator[str]:
+    yield from ("[model]", 'type = "mjcf"', f"file = {toml_text(file)}    # MJCF or URDF")
+    yield 'friction = "unknown"    # learned in every joint; "none": damping and frictionloss of the file'
+    yield from (
+        "",
+        "[model.uncertain]    # what of the file is not trusted: take the # of a line away, and say how far",
+    )
+    for body in machine.bodies:
+        if body.mass > 0:
+            yield f"# {body.name}.mass = {{ std = {0.1 * body.mass:.2g} }}    # kg; {body.mass:.4g} in the file"
+    for joint in machine.joints:
+        unit = "kg" if joint.slide else "kg m^2"
+        size = f"{joint.armature:.4g} in the file" if joint.armature else "0 in the file: inertia of the rotor, geared"
+        yield f"# {joint.name}.armature = {{ std = {joint.armature or 0.01:.2g} }}    # {unit}; {size}"
+
+
+def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
+    """The inputs; no lines where they are the motors of the file."""
+    if machine.motors and len(joints) == len(machine.motors):
+        yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
+        yield from _servos(machine)
+        return
+    mark = "" if joints else "# "
+    columns = f"[{', '.join(map(toml_text, joints))}]" if joints else "..."
+    yield from ("", "[input]", f"{mark}columns = {columns}    # N m, or N on a slide")
+    if not machine.motors:
+        places = f"[{', '.join(map(toml_text, joints.values()))}]" if joints else "..."
+        yield f"{mark}joints = {places}    # the joint that each drives"
+
+
+def _servos(machine: Machine) -> Iterator[str]:
+    """Lines with the numbers of servos of the file that may be uncertain."""
+    for motor in machine.motors:
+        if motor.kind == TORQUE:
+            continue
+        numbers = ", ".join(f"{key} = {value:.4g}" for key, value in motor.numbers if value)
+        yield f"# [input.{toml_text(motor.name)}]    # the goal of a {motor.kind} servo; in the file {numbers}"
+        yield from (f"# {key} = {{ mean = {x:.4g}, std = {0.2 * abs(x):.2g} }}" for key, x in motor.numbers if x)
+        yield "# delay = { mean = 0.01, std = 0.01 }    # s"
+
+
+def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
+    """Addresses of columns that have another name in the log."""
+    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if str(at) != name]
+    if lines:
+        yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
+        yield from (f"# not used: {each}" for each in others(topics, columns))
+        yield from lines

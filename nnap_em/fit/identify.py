@@ -1,0 +1,235 @@
+"""Identification: from a declared rig and its logs to a fitted model in one call."""
+
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..data.rig import Declared, Rig
+from ..data.units import quantities
+from ..effects import AbstractEffect
+from ..em.build import build, build_system
+from ..em.loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
+from ..em.mstep import ScoringMStep, kept
+from ..em.scale import holding, not_identifiable
+from ..em.weights import Weights
+from ..model.state_space import StateSpaceModel, with_effects
+from ..prediction_error.multistep import FALLS, JUDGED, errors, finish, followed, ratio
+from ..prediction_error.noise import white_readings
+from ..prediction_error.stated import widened
+from ..smoother.gaussian import CubatureSmoother
+from ..smoother.posterior import AbstractSmoother
+from ..smoother.start import StartBank
+from .memory import remember
+
+MakeSmoother = Callable[[StartBank], AbstractSmoother]
+Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
+
+
+class Identified(NamedTuple):
+    """A fitted model with what is needed to use it, to judge it and to go on fitting."""
+
+    rig: Rig
+    state: EMState
+    m_step: ScoringMStep
+    bank: StartBank
+    """Hypotheses of the start."""
+    smoother: AbstractSmoother
+    """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
+    discrepancy: float = 0.0
+    """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
+    memory: str = ""
+    """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
+
+    @property
+    def unsaid(self) -> float:
+        """Old name of `discrepancy`."""
+        warnings.warn("Identified.unsaid is now Identified.discrepancy", DeprecationWarning, stacklevel=2)
+        return self.discrepancy
+
+    @property
+    def model(self) -> StateSpaceModel:
+        """The likeliest model."""
+        return cast(StateSpaceModel, self.state.best)
+
+    def __str__(self) -> str:
+        estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
+        found = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
+        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{found}\n  {self.model}"
+
+
+class FrictionTable(NamedTuple):
+    """Friction in steady sliding with its uncertainty, over the visited velocities: the learned map."""
+
+    velocity: Float[Array, "dof node"]
+    """[rad/s]"""
+    torque: Float[Array, "dof node"]
+    """[N m]"""
+    cov: Float[Array, "dof node node"]
+    """Covariance of the torque over the nodes of a joint [N^2 m^2]."""
+    units: tuple[tuple[str, str], ...]
+    """Units of velocity and torque of every joint: on a slide they are m/s and N."""
+
+    @property
+    def std(self) -> Float[Array, "dof node"]:
+        """Standard deviation of the torque [N m]."""
+        return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
+
+    def __str__(self) -> str:
+        lines = ["FrictionTable"]
+        joints = zip(self.velocity, self.torque, self.std, self.units, strict=True)
+        for j, (v, t, s, (rate, force)) in enumerate(joints, 1):
+            over = f"over {v.min():.3g} to {v.max():.3g} {rate}"
+            lines.append(f"joint {j}: {t.min():.3g} to {t.max():.3g} {force} {over}, std up to {s.max():.2g} {force}")
+        return "\n  ".join(lines)
+
+
+def begin(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    smoother: MakeSmoother = CubatureSmoother,
+    effects: tuple[AbstractEffect, ...] = (),
+) -> Identified:
+    """The problem before the first epoch; `effects` join the model as they are."""
+    key_build, key_fit = jax.random.split(key)
+    model, rule, bank = build(rig, data, key=key_build)
+    full = with_effects(model, effects)
+    rule = eqx.tree_at(lambda m: m.shape, rule, full.log_q)
+    return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
+
+
+def identify(
+    rig: Rig,
+    data: Dataset,
+    *,
+    key: PRNGKeyArray,
+    smoother: MakeSmoother | None = None,
+    epochs: int = 20,
+    schedule: Schedule = SCHEDULE,
+    start: Identified | None = None,
+    watch: Watch = lambda state, seen, used: None,
+) -> Identified:
+    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start`.
+
+    Without a `smoother` it is that of `start`, or the cubature smoother.
+    Raises FitError when no sequence can be followed.
+    """
+    if start is None:
+        rig = holding(rig, not_identifiable(rig, build_system(rig), data))
+    now = begin(rig, data, key=key) if start is None else start
+    now = now if smoother is None else now._replace(smoother=smoother(now.bank))
+    state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)
+    now = now._replace(state=state)
+    if rig.memory and start is None:
+        found = remember(state, now.m_step, now.smoother, data, epochs=epochs, watch=watch)
+        now = now._replace(state=found.state, m_step=found.m_step, memory="\n".join(found.sentences))
+    return finished(now, data)
+
+
+PARTS = 2
+"""Parts of the sequences that are left out in turn to see whether multi-step errors should be fitted."""
+
+
+def finished(fitted: Identified, data: Dataset) -> Identified:
+    """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
+
+    Only where the noise of the readings is not that of the model: elsewhere one-step likelihood is efficient, and its
+    curvature is its precision.
+    """
+    data = jax.device_put(data)
+    if white_readings(data, fitted.model):
+        return fitted
+    posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+    path, used = posterior.state, np.asarray(kept(posterior, data))
+    if used.sum() < PARTS:
+        return fitted
+    part = np.where(used, np.cumsum(used) % PARTS, -1)
+    before, falls = errors(followed(fitted.model, fitted.m_step.prior, path, data), JUDGED), []
+    for out in range(PARTS):
+        trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out), shaped=True)
+        falls.append(ratio(before, errors(trial, JUDGED), part == out))
+    if np.mean(falls) < 1 - FALLS:
+        model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+        _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
+        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
+    now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
+    stated = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
+    return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
+
+
+def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    """Deviations of node torques [N m] and parameters from the mode, drawn from the Laplace posterior.
+
+    Linearised in the network's weights, which are hardly determined one by one while the torque is
+    [Immer, Korzepa & Bauer 2021, AISTATS].
+    """
+    weights = fitted.m_step.weights(fitted.model)
+    return _drawn(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian, count, key)
+
+
+@eqx.filter_jit
+def _drawn(weights: Weights, unknown, w, hessian, count: int, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    jac = weights.jacobian(unknown, w)
+    unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
+    return (jac @ jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, unit, lower=False)).T
+
+
+def nodes_between(
+    low: Float[np.ndarray, " dof"], high: Float[np.ndarray, " dof"], count: int
+) -> Float[np.ndarray, "dof node"]:
+    """Velocities from `low` to `high` of each joint, dense near rest, where friction bends."""
+    knee = np.maximum(0.01 * np.maximum(np.abs(low), np.abs(high)), 1e-12)
+    return (knee * np.sinh(np.linspace(np.arcsinh(low / knee), np.arcsinh(high / knee), count))).T
+
+
+def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
+    """Friction in steady sliding at `velocity` [rad/s], its covariance linearised in the weights (Laplace).
+
+    It is the learned map, and below the knee of a contact with memory, where the map is a straight line, the contact's.
+    """
+    weights = fitted.m_step.weights(fitted.model)
+    w, model = weights.read(fitted.model), fitted.model
+    units = tuple((model.system.unit(rate), model.system.force_unit(j)) for j, rate in enumerate(model.system.rates, 1))
+    contacts = model if fitted.rig.memory else None
+    return FrictionTable(
+        velocity, *_friction(weights, model.unknown, w, fitted.state.hessian, velocity, contacts), units
+    )
+
+
+@eqx.filter_jit
+def _friction(weights: Weights, unknown, w, hessian, velocity, contacts: StateSpaceModel | None):
+    """Torque at `velocity`, and its covariance; with the effects of `contacts`."""
+    here = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
+    jac = here.jacobian(unknown, w)[: velocity.size]
+    torque = here.phi(unknown, w)[: velocity.size]
+    if contacts is not None and contacts.effects:
+        own = slice(w.shape[0] - weights.prior.size, None)
+
+        def sliding(z):
+            effects = weights.prior.write(contacts, z).effects
+            return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T.ravel()
+
+        torque, jac = torque + sliding(w[own]), jac.at[:, own].add(jax.jacfwd(sliding)(w[own]))
+    half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True).T
+    half = half.reshape(*velocity.shape, -1)
+    return torque.reshape(velocity.shape), jnp.einsum("jaw,jbw->jab", half, half)
+
+
+def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
+    """Estimated physical parameters: value and standard deviation in the unit of `rig.toml`."""
+    prior = fitted.m_step.prior
+    if not prior.names:
+        return {}
+    cov = jnp.linalg.inv(fitted.state.hessian)[-prior.size :, -prior.size :]
+    std = prior.std * jnp.sqrt(jnp.diag(cov))
+    value = prior.mean + prior.std * prior.read(fitted.model)
+    return {n: (float(v), float(s)) for n, v, s in zip(prior.declared, value, std, strict=False)}

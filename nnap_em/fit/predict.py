@@ -1,0 +1,182 @@
+"""Open-loop prediction: the distribution of the state after the last measurement that may be used."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset, fill_missing
+from ..em.loop import e_step
+from ..em.prior import ParameterPrior
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian, cholesky, lower
+from ..numerics.parallel import each
+from ..prediction_error.stated import of_states
+from ..smoother.posterior import AbstractSmoother, Posterior
+from .identify import Identified, phi_samples
+
+GIVEN = 1.0  # s of readings before a reported error
+HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+"""Horizons [s] of the reported errors."""
+
+
+class Prediction(NamedTuple):
+    """Mean and standard deviation of the noise-free state, and of sensors beside it, for every row of the data.
+
+    What is measured is as its sensor would read it: with a biased sensor the bias is in.
+    """
+
+    mean: Float[Array, "seq time readable"]
+    std: Float[Array, "seq time readable"]
+    ahead: Bool[Array, "seq time"]
+    """Rows later than the given time; the others are smoothed."""
+
+    def __str__(self) -> str:
+        ahead = np.asarray(self.ahead)
+        std = ", ".join(f"{x:.2g}" for x in np.sqrt(np.nanmean(np.asarray(self.std)[ahead] ** 2, axis=0)))
+        amount = f"{len(ahead)} sequences, {ahead.sum()} rows ahead"
+        return f"Prediction: {amount}; std of the states there [rad and rad/s, or m and m/s]: {std}"
+
+
+def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
+    """Rows with time <= first time + given [s], to a microsecond."""
+    t = np.asarray(data.t, np.float64)
+    return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
+
+
+def smooth(fitted: Identified, data: Dataset) -> Posterior:
+    """p(x_k | all y) of every sequence by the smoother of the fit; one that draws gives the same each time."""
+    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+
+
+def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
+    """Smoothed states of one sequence as `model.shown` has them."""
+
+    def one(mean, cov, u):
+        rows = jax.jacfwd(model.shown)(mean, u)
+        return Gaussian(model.shown(mean, u), rows @ cov @ rows.T)
+
+    return jax.vmap(one)(state.mean, state.cov, model.inputs(seq))
+
+
+def _shown(model, one) -> Gaussian:
+    state, seq = one
+    return show(model, state, seq)
+
+
+class Paths(NamedTuple):
+    """Models drawn from the posterior: what the sample paths of all sequences have in common."""
+
+    model: StateSpaceModel
+    prior: ParameterPrior
+    nodes: Float[Array, "dof node"]
+    tables: Float[Array, "path dof node"]
+    """Friction of each path beyond that of the model."""
+    parameters: Float[Array, "path parameter"]
+
+    def inputs(self, seq: Dataset) -> Inputs:
+        """External inputs of one sequence, by row and path."""
+        return jax.vmap(lambda p: self.prior.write(self.model, p).inputs(seq), out_axes=1)(self.parameters)
+
+    def advance(self, x: Float[Array, "path state"], u: Inputs):
+        """The mean of the next state of every path, and the present one as it is shown."""
+        dof = self.nodes.shape[0]
+
+        def one(x, u, table, parameters):
+            force = jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table)
+            now = self.prior.write(self.model, parameters)
+            return now.transition(x, u, force), now.shown(x, u, force)
+
+        return jax.vmap(one)(x, u, self.tables, self.parameters)
+
+
+def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
+    """`count` models from the posterior of friction and parameters."""
+    model, prior = fitted.model, fitted.m_step.prior
+    nodes = fitted.m_step.weights(model).nodes
+    deviations = phi_samples(fitted, count, key=key)
+    tables = deviations[:, : nodes.size].reshape(-1, *nodes.shape)
+    return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
+
+
+def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Array, "time readable"]]:
+    """Sample paths from the last known row on, each with its own start, friction, parameters and process noise."""
+    model, tables = common.model, common.tables
+    (mean, cov), seq, known, key = one
+    u = common.inputs(seq)
+    rows, last = jnp.arange(mean.shape[0]), jnp.sum(known) - 1
+    key_start, key_noise = jax.random.split(key)
+    shape = (tables.shape[0], mean.shape[-1])
+    spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
+    start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
+    kick = jax.random.normal(key_noise, (mean.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
+
+    def step(x, slices):
+        k, u, kick = slices
+        following, shown = common.advance(x, u)
+        x = jnp.where(k >= last, following + kick, x)
+        return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
+
+    _, (m, s) = jax.lax.scan(step, start, (rows, u, kick))
+    ahead = (rows > last)[:, None]
+    past = show(model, Gaussian(mean, cov), seq)
+    std = jnp.sqrt(jnp.diagonal(past.cov, axis1=1, axis2=2))
+    return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
+
+
+DRAWN = 32
+"""Number of models drawn for the dependence of a smoothed state on the model."""
+
+
+def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
+    """Smoothed states in the coordinates of `Prediction`, with the uncertainty of the model in their covariance.
+
+    A hidden joint hangs on the model alone: on two real double pendulums the smoother's own standard deviation held the
+    angle within two in 55 and 65 % of the rows, this one in 83 and 87 %.
+    """
+    data = jax.device_put(data)
+    path, key = smooth(fitted, data).state, jax.random.key(1)
+    phi = phi_samples(fitted, DRAWN, key=key)
+    more = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key)
+    return each(_shown, fitted.model, (path._replace(cov=path.cov + more), data))
+
+
+def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:
+    """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
+
+    Uncertainty of the present state, of friction and parameters, and process noise are in it; measurement noise is
+    not.
+    """
+    known = given_samples(data, given)
+    posterior = smooth(fitted, data._replace(valid=known))
+    key_draw, key_roll = jax.random.split(key)
+    common = drawn_paths(fitted, samples, key=key_draw)
+    sequences, rows = data.t.shape
+    numbers = rows * samples * (posterior.state.mean.shape[-1] + data.u.shape[-1])
+    together = max(1, AbstractSmoother.room // (32 * numbers))  # noise, inputs and what draws them
+    batch = posterior.state, data, known, jax.random.split(key_roll, sequences)
+    mean, std = each(_roll, common, batch, together=together)
+    return Prediction(mean, std, jnp.asarray(np.asarray(data.valid) & ~known))
+
+
+def horizon_errors(
+    prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = HORIZONS
+) -> dict[str, list[float]]:
+    """RMS of prediction minus reading over (given, given + horizon], per measured column; NaN where no data."""
+    y, observed = (np.asarray(a) for a in fill_missing(jnp.asarray(data.y)))
+    since = np.asarray(data.t) - np.asarray(data.t)[:, :1] - given
+    system = fitted.model.system
+    out = {}
+    for i, (name, state) in enumerate(zip(fitted.rig.measured, fitted.model.measured, strict=True)):
+        error = np.asarray(prediction.mean)[..., state] - y[..., i]
+        if state < len(system.angles) and system.angles[state]:
+            error = (error + np.pi) % (2 * np.pi) - np.pi
+        inside = observed[..., i] & np.asarray(prediction.ahead)
+        rms = []
+        for horizon in horizons:
+            e = error[inside & (since <= horizon + 1e-6)]
+            rms.append(float(np.sqrt(np.mean(e**2))) if e.size else float("nan"))
+        out[name] = rms
+    return out

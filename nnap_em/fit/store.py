@@ -1,0 +1,273 @@
+"""A fitted model as one file: loading gives the same numbers to the last bit.
+
+The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the rig, the
+settings and the plain numbers.  No code is stored; loading builds the model anew from the rig and puts the numbers in.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import __version__
+from ..data.dataset import Dataset
+from ..data.limits import Bounds
+from ..data.rig import Declared, Rig
+from ..effects import catalogue, parts
+from ..model.dynamic_friction import DynamicFriction
+from ..smoother import kinds
+from ..smoother.gaussian import CubatureSmoother
+from ..storage.files import Kind, read_arrays, refuse, write_arrays
+from ..storage.leaves import describe, name_of, plain, restore, tuples
+from ..systems import systems
+from .identify import Identified, begin
+
+_GIVE = "give the model.npz that `nnap-em identify` wrote"
+KIND = Kind(
+    "nnap_em fitted model",
+    1,
+    "model",
+    _GIVE,
+    f"{_GIVE}, from a copy that is whole",
+    "identify again, or use the version that wrote it",
+    "use another copy, or identify again",
+)
+
+
+LATER = ("/discrepancy", "/m_step/rough", "/memory")
+"""Numbers that files from before they were kept do not have: as a new fit begins with."""
+
+
+RENAMED = {"/unsaid": "/discrepancy"}
+"""Plain numbers that files of before hold under another name."""
+
+
+MODEL, AFTER = "model.npz", "after.npz"
+"""Files of an identification and of a diagnosis."""
+
+
+class Stored(NamedTuple):
+    """Content of a model file."""
+
+    fitted: Identified
+    fingerprint: str
+    """Digest of the training data; empty if it was not given."""
+    notes: dict[str, Any]
+    """Whatever the writer wished to keep, as JSON."""
+
+
+def model_file(path: Path) -> Path:
+    """The model that is meant by a file, or by the folder of an identification or of a diagnosis."""
+    if not path.is_dir():
+        return path
+    return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
+
+
+def fingerprint(data: Dataset) -> str:
+    """SHA-256 of the content of `data`, to recognise the same data later."""
+    digest = hashlib.sha256()
+    for part in data:
+        array = np.ascontiguousarray(part)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def save(
+    path: Path | str, fitted: Identified, *, fingerprint: str = "", notes: Mapping[str, Any] | None = None
+) -> None:
+    """Write `fitted` to one file, whole or not at all.
+
+    Raises StoreError if it could not be loaded again: if it is of another structure than `identify` makes.
+    """
+    path = Path(path)
+    arrays: dict[str, np.ndarray] = {}
+    leaves: dict[str, dict[str, Any]] = {}
+    settings: dict[str, Any] = {}
+
+    def leaf(place: str, value: Any) -> Any:
+        try:
+            leaves[place], array = describe(value)
+        except TypeError as error:
+            refuse(path, f"{place} is a {error}", "arrays, numbers and named functions can be stored")
+        if array is not None:
+            arrays[place] = array
+        return value
+
+    def setting(place: str, value: Any) -> Any:
+        if plain(value):
+            settings[place] = value
+        return value
+
+    _rebuild(_tree(fitted), "", leaf, setting)
+    header = {
+        "rig": dataclasses.asdict(fitted.rig),
+        "effects": [_sketch(path, effect) for effect in fitted.model.effects],
+        "smoother": _sketch(path, fitted.smoother),
+        "leaves": leaves,
+        "settings": settings,
+        "fingerprint": fingerprint,
+        "notes": dict(notes or {}),
+    }
+    _assemble(path, {"version": __version__, **header}, arrays)
+    write_arrays(path, KIND, header, arrays)
+
+
+def load(path: Path | str) -> Identified:
+    """The fitted model in `path`, with the numbers that were saved.
+
+    Raises StoreError if the file is damaged, foreign, or of another version.
+    """
+    return read(Path(path)).fitted
+
+
+def read(path: Path) -> Stored:
+    """All that `path` holds.
+
+    Raises StoreError if the file is damaged, foreign, or of another version.
+    """
+    header, arrays = read_arrays(path, KIND)
+    try:
+        return Stored(_assemble(path, header, arrays), header["fingerprint"], header["notes"])
+    except (KeyError, TypeError, AttributeError) as error:
+        refuse(path, f"its header lacks something ({error!r})", "identify again with this version")
+
+
+def _tree(fitted: Identified) -> dict[str, Any]:
+    return {name: value for name, value in fitted._asdict().items() if name != "rig"}
+
+
+def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Callable[[str, Any], Any]) -> Any:
+    """`node` anew, with `leaf` applied to what is data in it and `setting` to what is static."""
+    if isinstance(node, eqx.Module):
+        made = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
+        for field in dataclasses.fields(node):
+            here, value = f"{place}/{field.name}", getattr(node, field.name)
+            static = field.metadata.get("static", False)
+            object.__setattr__(
+                made, field.name, setting(here, value) if static else _rebuild(value, here, leaf, setting)
+            )
+        return made
+    if isinstance(node, Mapping):
+        return {name: _rebuild(value, f"{place}/{name}", leaf, setting) for name, value in node.items()}
+    names = getattr(node, "_fields", None)
+    if isinstance(node, tuple) and names is not None:
+        named = zip(names, node, strict=True)
+        return type(node)(*(_rebuild(value, f"{place}/{name}", leaf, setting) for name, value in named))
+    if isinstance(node, tuple | list):
+        return type(node)(_rebuild(value, f"{place}/{i}", leaf, setting) for i, value in enumerate(node))
+    return leaf(place, node)
+
+
+def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Identified:
+    """The model that `header` and `arrays` describe, on the skeleton that its rig gives."""
+    rig = _rig(header["rig"])
+    if rig.system not in systems:
+        refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
+    leaves, settings = (
+        {RENAMED.get(place, place): entry for place, entry in header["leaves"].items()},
+        header["settings"],
+    )
+    wide = any(array.dtype == np.float64 for array in arrays.values())
+    if wide and jnp.zeros(()).dtype != np.float64:
+        refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
+    seen = set()
+
+    def differs(place: str, found: str) -> None:
+        made = f"it was written by nnap_em {header['version']}, this is {__version__}"
+        refuse(path, f"another structure at {place.strip('/')}: {found} ({made})", "identify again with this version")
+
+    def leaf(place: str, value: Any) -> Any:
+        if place not in leaves:
+            # numbers that effects and models have had since
+            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest"))
+            later = place in LATER or (since and value is None)
+            return value if later else differs(place, "missing in the file")
+        seen.add(place)
+        kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
+        if kind == "code":
+            if name_of(value) != of:
+                differs(place, f"{of!r} in the file")
+        elif kind == "plain":
+            pass
+        elif array is None or callable(value) or (value is not None and kind != "key" and np.ndim(value) != array.ndim):
+            differs(place, "of another shape" if array is not None else "no array in the file")
+        return restore(leaves[place], array, value)
+
+    def setting(place: str, value: Any) -> Any:
+        seen.add(place)
+        later = place not in settings and (
+            "/effects/" in place or place.endswith(("/angles", "/branching"))
+        )  # its default
+        if plain(value) != (place in settings) and not later:
+            differs(place, "a setting that only one of the two has")
+        return tuples(settings[place]) if place in settings else value
+
+    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts, DynamicFriction)}
+    effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header.get("effects", []))
+    tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
+    del tree["smoother"]
+    if "smoother" in header:
+        tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
+    tree = _rebuild(tree, "", leaf, setting)
+    tree.setdefault("smoother", CubatureSmoother(tree["bank"]))  # of files from before smoothers were kept
+    for place in (*leaves, *settings):
+        if place not in seen:
+            differs(place, "unknown here")
+    return Identified(rig=rig, **tree)
+
+
+def _sketch(path: Path, node: Any) -> Any:
+    """The structure of an effect or a smoother as JSON: modules by name, arrays by their number of axes."""
+    if isinstance(node, eqx.Module):
+        kind = type(node)
+        parts = {f.name: _sketch(path, getattr(node, f.name)) for f in dataclasses.fields(node)}
+        return {"kind": kind.__name__, "parts": parts}
+    if isinstance(node, tuple) and not plain(node):
+        return {"items": [_sketch(path, item) for item in node]}
+    if not (eqx.is_array(node) or plain(node)):
+        refuse(path, f"an effect or smoother has a {type(node).__name__}", "modules, arrays and numbers can be stored")
+    return {"axes": np.ndim(node)} if eqx.is_array(node) else {"plain": node}
+
+
+def _drawn(path: Path, sketch: Mapping[str, Any], noun: str, known: Mapping[str, type]) -> Any:
+    """An effect or smoother of that structure, of `known` kinds, to put the numbers in."""
+    if "kind" in sketch:
+        if sketch["kind"] not in known:
+            refuse(path, f"its {noun} {sketch['kind']!r} is not known here", "first import what adds it")
+        made = object.__new__(known[sketch["kind"]])
+        for name, part in sketch["parts"].items():
+            object.__setattr__(made, name, _drawn(path, part, noun, known))
+        return made
+    if "items" in sketch:
+        return tuple(_drawn(path, item, noun, known) for item in sketch["items"])
+    return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else tuples(sketch["plain"])
+
+
+def _rig(entries: Mapping[str, Any]) -> Rig:
+    def declared(table: Mapping[str, Any]) -> dict[str, Declared]:
+        return {name: Declared(**pair) for name, pair in table.items()}
+
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
+    }
+    values["parameters"], values["start"] = declared(entries["parameters"]), declared(entries["start"])
+    pairs = {
+        part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries.get("limits", {}).items()
+    }
+    values["limits"] = Bounds(**pairs)
+    return Rig(**values)
+
+
+def _blank(rig: Rig, rows: int = 32) -> Dataset:
+    """Logs of the right shape, of which nothing is left when the numbers are in."""
+    t = rig.dt * np.arange(rows)
+    swing = np.sin(t / t[-1])[None, :, None]
+    u, y = (np.repeat(swing, n, axis=2) for n in (len(rig.input_columns), len(rig.measured)))
+    return Dataset(t[None], u, y, np.ones((1, rows), bool))

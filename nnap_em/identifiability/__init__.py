@@ -1,0 +1,1 @@
+"""Test of what the logs can identify."""

@@ -1,0 +1,398 @@
+"""Test of whether logs can identify what is declared, before EM: one line per subject, ok, look or bad."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from ..data.dataset import Array, Dataset, horizon
+from ..data.logs import Logs
+from ..data.rig import Rig, RigError
+from ..data.servo import TORQUE
+from ..em.build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
+from ..em.scale import not_identifiable
+from ..em.servos import MOST_STEPS, build_servos, steps_of_sample
+from ..fit.identify import begin
+from ..model.base import prepare
+from ..model.friction import NoFriction
+from ..model.state_space import StateSpaceModel
+from ..numerics.parallel import each
+from ..smoother.posterior import AbstractSmoother
+from ..systems import AbstractSystem
+from .identifiability import identifiability, sentences
+from .stops import at_stops
+
+OK, LOOK, BAD = "ok", "look", "bad"
+SEQUENCES, SECONDS = 6, 1.0
+"""Number and length of the sequences smoothed with the first model: a wrong one loses a hidden joint later on."""
+POSES = 256
+"""Rows of the logs, evenly over them, in which the loads of joints are taken."""
+REVERSALS = 20
+"""Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
+distance over which friction turns and its size."""
+_WIDTH = 1.0  # s, of the readings that must determine the state
+
+
+class CheckResult(NamedTuple):
+    """Result of one check of a data set, in plain words."""
+
+    mark: str
+    """`ok`, `look` (it may do, but look at it) or `bad` (a fit would be in vain)."""
+    subject: str
+    text: str
+
+
+class Along(NamedTuple):
+    """The declared physics along the logs, friction left out, as the first model smooths them."""
+
+    x: Float[np.ndarray, "seq time state"]
+    transition: Float[np.ndarray, "seq time state state"]
+    """Jacobian of the next state."""
+    reading: Float[np.ndarray, "seq time obs state"]
+    """Jacobian of the reading."""
+    rate: Float[np.ndarray, "seq time state state"]
+    """Jacobian of the time derivative of the state [1/s]."""
+
+
+def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[CheckResult]:
+    """Results of all checks of a data set, or what is missing where there is too little of it; nothing is fitted."""
+    data = Dataset(*(np.asarray(part) for part in train.data))
+    amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
+    if amount[0].mark == BAD:
+        return amount
+    try:
+        problem = begin(rig, data, key=key)
+    except RigError:
+        return [CheckResult(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
+    system = problem.model.system
+    if stiff := list(_stiff(rig, system)):
+        return [*amount, *stiff]
+    scales = measure_scales(rig, system, data)
+    model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
+    rows = min(data.valid.shape[1], round(SECONDS / rig.dt) + 1)
+    head = Dataset(*(part[:SEQUENCES, :rows] for part in horizon(data, rows)))
+    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
+    return [
+        *amount,
+        *_sampling(rig, along, scales),
+        *_noise(rig, model, data),
+        *torques(rig, system, data, scales),
+        *_motion(rig, model, data, along),
+        *(memory(rig, model, data, along, scales) if rig.memory else ()),
+        *_observability(model, along, np.asarray(head.valid)),
+    ]
+
+
+def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:
+    """The parts of Along of one sequence."""
+    model, smoother = common
+    prepared, still = prepare(model, seq), jnp.zeros(len(model.system.coordinates))
+    x, u = smoother(model, prepared, key=jax.random.key(0)).state.mean, prepared.inputs
+    slopes = (model.transition, model.emission, lambda x, u: model.rate(x, u, still))
+    return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
+
+
+def _mark(look: object, bad: object = False) -> str:
+    return BAD if bad else LOOK if look else OK
+
+
+def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
+    rows = data.valid.sum(axis=1)
+    few = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
+    short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
+    long = "cut them into sequences of some seconds" if rows.max() * rig.dt > 20 else ""
+    little = "more would make the curve surer" if rows.sum() < 1000 else ""
+    mark = _mark(short or long or little, few)
+    amount = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
+    yield CheckResult(mark, "length", "; ".join(filter(None, (amount, few or little, short, long))))
+    if test is None:
+        yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
+    else:
+        yield CheckResult(OK, "test", f"{len(test.files)} test sequences, none of them in train")
+
+
+def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
+    y, valid = np.asarray(train.data.y), np.asarray(train.data.valid)
+    for i, name in enumerate(rig.measured):
+        gone = np.isnan(y[..., i]) & valid
+        share = gone.sum() / valid.sum()
+        worst = int(np.argmax(gone.sum(axis=1) / valid.sum(axis=1)))
+        text = f"{name}: {100 * share:.0f} % of the samples are missing"
+        text += f", most in {train.files[worst]}" if share else ""
+        yield CheckResult(_mark(share > 0.2, share > 0.75), "missing", text)
+
+
+def _rough(train: Logs) -> Iterator[CheckResult]:
+    """Readings masked on reading, and their share of each column."""
+    total = int(np.asarray(train.data.valid).sum())
+    for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
+        here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
+        count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
+        text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
+        yield CheckResult(
+            _mark(True, count > 0.3 * total),
+            "rough",
+            f"{text}, most in {max(here, key=lambda entry: entry.amount).file}",
+        )
+
+
+def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
+    """Samples per period of the fastest eigenvalue, and how much a velocity changes between two."""
+    rate = along.rate[:, ::10].reshape(-1, *along.rate.shape[-2:])
+    fastest = np.max(np.abs(np.linalg.eigvals(rate[np.isfinite(rate).all(axis=(1, 2))])), initial=0.0)
+    turn = float(np.max(scales.acceleration * rig.dt / scales.speed))
+    period = 2 * np.pi / max(float(fastest), 1e-9)
+    per = period / rig.dt
+    text = f"the fastest motion of the declared model takes {period:.2g} s, {per:.0f} samples; " if period < 1e6 else ""
+    text += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
+    mark = _mark(per < 10 or turn > 0.1, per < 5 or turn > 0.3)
+    hint = "" if mark == OK else "; sample faster, or look at the units of dt and of the parameters"
+    yield CheckResult(mark, "sampling", text + hint)
+
+
+def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
+    for i, name in enumerate(rig.measured):
+        unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
+        seen, spread = reading_noise(signal), float(np.nanstd(signal))
+        declared = rig.noise_std.get(name)
+        loud = max(seen, declared or 0.0) > 0.3 * spread
+        alone = name not in model.system.sensors  # of three axes one may sense nothing
+        drowned = "; the motion hardly rises above it: move more, or look at the units" if loud else ""
+        if declared is None:
+            text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
+            yield CheckResult(_mark(loud, loud and alone), "noise", text)
+            continue
+        ratio = seen / declared
+        how = f"{name}: declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
+        tame = "; the log was filtered, or less is true" if ratio < 0.1 else ""
+        wild = "; declare more, or leave it out to have it estimated" if ratio > 3 else ""
+        mark = _mark(tame or wild or loud, (loud and alone) or ratio > 30)
+        yield CheckResult(mark, "noise", how + tame + wild + drowned)
+
+
+def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
+    """The inputs against gravity and inertia of the declared bodies."""
+    mass, gravity = _loads_along(rig, system, data)
+    needed = gravity + mass * scales.acceleration
+    servos = build_servos(rig)
+    yield from drives(rig, system, data, needed, gravity)
+    inputs = np.moveaxis(np.asarray(data.u), -1, 0)
+    for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
+        if rig.kinds[name] != TORQUE:
+            continue
+        unit = system.force_unit(joint)
+        given = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
+        ratio = given / needed[joint - 1]
+        text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
+        odd = ratio > 30 or 0 < ratio < 1e-3
+        text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
+        yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
+    for text in at_stops(rig, data):
+        yield CheckResult(LOOK, "range", text)
+    for text in sentences(identifiability(rig, system, servos)):
+        yield CheckResult(LOOK, "untold", text)
+    kept = not_identifiable(rig, system, data)
+    if kept:
+        values = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
+        text = (
+            "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
+            f"kept as declared is {values}, and all else is relative to that"
+        )
+        yield CheckResult(_mark(True, False), "scale", text)
+
+
+def drives(
+    rig: Rig,
+    system: AbstractSystem,
+    data: Dataset,
+    needed: Float[np.ndarray, " dof"],
+    gravity: Float[np.ndarray, " dof"],
+) -> Iterator[CheckResult]:
+    """Limits and delays of the declared servos against the logs."""
+    servos, length = build_servos(rig), float(data.valid.sum(axis=1).min()) * rig.dt
+    for i, (servo, joint) in enumerate(zip(servos, rig.input_joints, strict=False)):
+        name, unit = servo.column, system.force_unit(joint)
+        if not servo.feeds_back:
+            continue
+        limit, gear = float(servo.values.get("limit", np.inf)), abs(system.gears[i])
+        weight, whole = gravity[joint - 1] / gear, needed[joint - 1] / gear
+        text = f"{name}: a {servo.kind} servo"
+        text += f", limited to {limit:.3g} {unit}; " if np.isfinite(limit) else "; "
+        text += f"gravity and inertia of joint {joint} ask for {whole:.3g}, gravity alone for {weight:.3g} {unit}"
+        low, delay = limit < 0.9 * weight, float(servo.values.get("delay", 0.0))
+        if low:
+            text += f": the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
+        if late := delay > 0.2 * length:
+            text += f"; a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
+        yield CheckResult(_mark(low or limit < whole or late, limit < 0.5 * weight), "servo", text)
+        if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
+            yield CheckResult(
+                LOOK, "servo", f"{name}: its command never changes, so that it shows no gain and no delay"
+            )
+
+
+def _stiff(rig: Rig, system: AbstractSystem) -> Iterator[CheckResult]:
+    """A servo that no integration step of a sample can follow."""
+    steps = steps_of_sample(system, build_servos(rig), rig.dt)
+    if steps > MOST_STEPS:
+        text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
+        yield CheckResult(BAD, "servo", f"{text}: look at the units of its gains, or sample faster")
+
+
+def _loads_along(
+    rig: Rig, system: AbstractSystem, data: Dataset
+) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
+    """Mean inertia and largest gravity of every joint in the poses of the logs [kg m^2 and N m, or kg and N].
+
+    A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
+    """
+    y, valid = np.asarray(data.y), np.asarray(data.valid)
+    read = [(i, rig.measured.index(name)) for i, name in enumerate(system.coordinates) if name in rig.measured]
+    seen = y[..., [column for _, column in read]][valid]
+    seen = seen[np.isfinite(seen).all(axis=1)]
+    seen = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else np.zeros((POSES, len(read)))
+    turn = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.coordinates)))
+    q = np.where(system.angles, turn, 0.0)
+    q[:, [joint for joint, _ in read]] = seen
+    mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
+    return np.mean(mass, axis=0), np.percentile(np.abs(gravity), 99, axis=0)
+
+
+@eqx.filter_jit
+def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, Array]:
+    """Inertia and gravity of every joint in some poses."""
+    still = jnp.zeros(q.shape[1])
+    return jax.vmap(lambda q: (jnp.diag(system.mass(q)), system.bias(q, still)))(q)
+
+
+def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[CheckResult]:
+    """Velocities that each joint visits: range, both directions, passages through rest."""
+    dof = len(model.system.coordinates)
+    for joint in range(dof):
+        name, unit = model.system.rates[joint], model.system.unit(model.system.rates[joint])
+        v, seen = _velocity(rig, model, data, along, joint)
+        low, high = np.nanpercentile(v, [1, 99])
+        top = max(-low, high)
+        inner = v[np.isfinite(v)]
+        noise = rig.noise_std.get(name, 0.0) if name in rig.measured else 0.0
+        if top <= 3 * noise or top < 1e-9:
+            yield CheckResult(
+                BAD, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
+            )
+            continue
+        rest = float(np.mean(np.abs(inner) < 0.05 * top))
+        bands = np.histogram(inner, np.linspace(-top, top, 21))[0]
+        covered = float(np.mean(bands >= 5))
+        turns = int(sum(_turns(row, 0.05 * top) for row in v))
+        text = f"joint {joint + 1}{seen}: {low:.3g} to {high:.3g} {unit}, {100 * covered:.0f} % of that range covered, "
+        text += f"{100 * rest:.0f} % of the time near rest, {turns} changes of direction"
+        hints = [
+            (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
+            (turns < 4, "too few turns to tell Coulomb friction"),
+            (rest > 0.8, "it rests most of the time"),
+            (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
+        ]
+        given = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(given and rig.friction), "motion", "; ".join([text, *given]))
+
+
+def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales: Scales) -> Iterator[CheckResult]:
+    """Reversals, and the shortest presliding distance that the samples and readings resolve, of every joint."""
+    system = model.system
+    for joint, name in enumerate(system.coordinates):
+        v, hidden = _velocity(rig, model, data, along, joint)
+        q = np.asarray(data.y)[..., rig.measured.index(name)] if name in rig.measured else along.x[..., joint]
+        low, high = np.nanpercentile(q, [1, 99])
+        top = float(np.nanpercentile(np.abs(v), 99))
+        turns = int(sum(_turns(row, 0.02 * top) for row in v))
+        travel = 2 * float(scales.acceleration[joint]) * rig.dt**2
+        noise = rig.noise_std.get(name, 0.0)
+        least, unit = max(travel, noise), system.unit(name)
+        cause = "the noise of its reading" if noise > travel else "its travel over two samples after a reversal"
+        text = (
+            f"joint {joint + 1}{hidden}: {turns} reversals; a presliding distance below {least:.2g} {unit}, {cause}, "
+        )
+        text += "looks like a static map"
+        hints = [
+            (
+                turns < REVERSALS,
+                f"fewer than {REVERSALS} reversals: move it to and fro, slowly and with small amplitudes",
+            ),
+            (least > 0.1 * (high - low), "that is more than a tenth of its range: sample faster, or move more gently"),
+        ]
+        given = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(given), "memory", "; ".join([text, *given]))
+
+
+def _velocity(
+    rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, joint: int
+) -> tuple[Float[np.ndarray, "seq time"], str]:
+    """Velocities of a joint, NaN where there is none, and where they come from."""
+    rate, position = model.system.rates[joint], model.system.coordinates[joint]
+    if rate in rig.measured:
+        return np.asarray(data.y)[..., rig.measured.index(rate)], ""
+    if position in rig.measured:
+        y = np.asarray(data.y)[..., rig.measured.index(position)]
+        v = (y[:, LAG:] - y[:, :-LAG]) / (LAG * rig.dt)
+        if np.isfinite(v).any():
+            return v, ""
+    x = along.x[..., len(model.system.coordinates) + joint]
+    return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
+
+
+def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
+    """Changes of direction, noise near rest left out."""
+    sign = np.sign(v[np.abs(v) > dead])
+    return int(np.count_nonzero(np.diff(sign)))
+
+
+def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[CheckResult]:
+    """Observability of the state from readings alone, by the Gramian sum Phi' C' R^-1 C Phi along the logs.
+
+    [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
+    """
+    names = model.system.coordinates + model.system.rates
+    dof, rows = len(model.system.coordinates), max(2, round(_WIDTH / model.dt))
+    x = along.x.reshape(-1, len(names))
+    scale = np.maximum(np.nanstd(x, axis=0), 1e-12)
+    noise = np.exp(0.5 * np.asarray(model.log_r))
+    grams = []
+    for i in range(len(along.x)):
+        last = min(rows, int(valid[i].sum()))
+        if last >= 2 and np.isfinite(along.transition[i, :last]).all():
+            grams.append(gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale))
+    if not grams:
+        yield CheckResult(
+            BAD, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
+        )
+        return
+    values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
+    known = np.median([np.sqrt(np.diag(np.linalg.inv(gram + np.eye(len(names))))) for gram in grams], axis=0)
+    rank = int(np.sum(values > 1))
+    condition = np.log10(values[-1] / max(values[0], 1e-300 * values[-1]))
+    dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
+    weak = [name for name, share in zip(names, known, strict=True) if 0.2 < share <= 0.5]
+    spoilt = any(name in names[dof:] for name in dark)
+    text = f"{_WIDTH:g} s of readings tell {rank} of {len(names)} directions of the state (condition 1e{condition:.0f})"
+    text += f"; they do not tell {', '.join(dark)}" if dark else ""
+    text += f"; they hardly tell {', '.join(weak)}" if weak else ""
+    text += ": measure more of the state, or move so that the hidden joint shakes the rest" if spoilt else ""
+    yield CheckResult(_mark(dark or weak, spoilt), "states", text)
+
+
+def gramian(
+    transition: Float[np.ndarray, "time state state"],
+    reading: Float[np.ndarray, "time obs state"],
+    scale: Float[np.ndarray, " state"],
+) -> Float[np.ndarray, "state state"]:
+    """Observability Gramian of a linear time-varying model, of the first state in units of `scale`."""
+    total, phi = np.zeros((len(scale),) * 2), np.diag(scale)
+    for a, c in zip(transition, reading, strict=True):
+        seen = c @ phi
+        total += seen.T @ seen
+        phi = a @ phi
+    return total

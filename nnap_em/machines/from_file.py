@@ -1,0 +1,192 @@
+"""Declaration in rig.toml of a machine from a file: names, inputs, and uncertain numbers."""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
+from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
+from ..data.servo import TORQUE, Drive, read_drives
+from ..data.servo import keys as drive_keys
+from ..data.servo import named as drive_numbers
+from .mjcf import Part, read_machine
+
+OF_JOINT = ("armature", "stiffness")
+_FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
+_UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
+
+
+def declare(root: Any) -> Declaration:
+    """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
+    model = root.table("model")
+    model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
+    if not isinstance(model.items.get("file"), str) or not model.items["file"]:
+        model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
+    part = _part(model)
+    machine = read_machine(root.path.parent / str(model.items["file"]), part)
+    possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
+    machine = machine._replace(
+        file=str(model.items["file"]),
+        states=_states(machine, root),
+        rubs=model.items.get("friction") == "none",
+        sensors=tuple(_sensors(machine, root)),
+        part=None if part.whole else (part.joints, tuple(part.locked.items())),
+    )
+    _warn_of_left_out(root, machine)
+    columns, joints, motored = _inputs(machine, root)
+    motors = {motor.name: motor for motor in machine.motors} if motored else {}
+    given = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
+    drives = read_drives(root.table("input", absent={}), columns, given)
+    gears = tuple(_gear(motors.get(column), drives[column]) for column in columns)
+    spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
+    parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
+    machine = packed(machine._replace(gears=gears, motored=motored))
+    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives))
+
+
+def _gear(motor: Motor | None, drive: Drive) -> float:
+    """Gear of the motor of the file; 1 for an input of another kind in rig.toml, which acts on the joint itself."""
+    return 1.0 if motor is None or (drive.kind != TORQUE and motor.kind != drive.kind) else motor.gear
+
+
+def _part(model: Any) -> Part:
+    """The joints of `[model] joints`, and the values of `[model] locked`."""
+    joints = model.items.get("joints")
+    if joints is not None:
+        if not (isinstance(joints, list) and joints and all(type(name) is str for name in joints)):
+            model.refuse("joints", hint='write the names of the joints that move, joints = ["joint1", "joint2"]')
+        joints = tuple(dict.fromkeys(joints))
+    locked = model.table("locked", absent={})
+    for name in locked.items:
+        locked.number(name)
+        if joints and name in joints:
+            locked.refuse(name, "it is among the joints that move", "take it out of one of the two")
+    return Part(joints, {name: locked.number(name) for name in locked.items})
+
+
+def _warn_of_left_out(root: Any, machine: Machine) -> None:
+    """Friction of the file has no part where it is learned."""
+    names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
+    if names and not machine.rubs:
+        problem = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {machine.file}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
+
+
+def _states(machine: Machine, root: Any) -> tuple[str, ...]:
+    """Every joint by its name, or by that of the sensor whose column is measured."""
+    names, dof = list(states(machine.joints)), len(machine.joints)
+    columns = root.table("measurement").items.get("columns")
+    for sensor in machine.joint_sensors:
+        if isinstance(columns, list) and sensor.name in columns:
+            names[sensor.joint + dof * sensor.rate] = sensor.name
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
+    return tuple(names)
+
+
+def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
+    """The components of sensors that are measured."""
+    table = root.table("measurement")
+    columns = table.items.get("columns")
+    for column in columns if isinstance(columns, list) else ():
+        for sensor in machine.sensors:
+            if sensor.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
+                continue
+            if sensor.kind not in SENSE_UNITS:
+                hint = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
+                table.refuse("columns", f"{column!r} is of a sensor of type {sensor.kind}", hint)
+            if sensor.name == column:
+                yield sensor
+
+
+def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
+    """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
+    motors = {motor.name: motor for motor in machine.motors}
+    if not motors and "input" not in root.items:
+        problem = f"{machine.file} has no actuator"
+        hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", problem, hint)
+    table = root.table("input", absent={})
+    table.check((), drive_keys(table))
+    columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
+    for column in columns:
+        if column in ("time", *machine.states):
+            hint = "give the motor another name than the joint's, or name torque columns and joints in [input]"
+            table.refuse("columns", f"{column!r} is a state, and no torque or command", hint)
+    if "joints" in table.items:
+        joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
+        if len(joints) != len(columns):
+            table.refuse("joints", f"found {len(joints)} joints for {len(columns)} columns")
+        motored = False
+    else:
+        for column in columns:
+            if column not in motors:
+                hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+                table.refuse("columns", f"{column!r} is no motor of {machine.file}", hint)
+        joints = tuple(motors[column].joint + 1 for column in columns)
+        motored = True
+    for joint in joints:
+        if joints.count(joint) > 1:
+            problem = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
+            problem += f", {machine.joints[joint - 1].name!r}"
+            table.refuse("columns", problem, "name one of them in [input] columns, and log their sum")
+    return columns, joints, motored
+
+
+def _place(machine: Machine, table: Any, joint: Any) -> int:
+    names = [one.name for one in machine.joints]
+    if isinstance(joint, str):
+        return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))
+    if not isinstance(joint, int) or not 1 <= joint <= len(names):
+        table.refuse("joints", None, f"write names of joints, or numbers from 1 to {len(names)}: {', '.join(names)}")
+    return joint
+
+
+def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
+    """Every number of [model.uncertain], its mean that of the file where none is written."""
+    table = model.table("uncertain", absent={})
+    bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
+    given = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
+    given |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
+    owners = [one.name for one in (*machine.bodies, *machine.joints)]
+    for name, value in flat(table.items):
+        owner, _, own = name.partition(".")
+        if owner not in owners:
+            table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
+        if name not in given:
+            known = [key.partition(".")[2] for key in given if key.partition(".")[0] == owner]
+            table.refuse(name, f"{owner!r} has no {own!r}" if own else "names no number", nearest(own, known))
+        declared = _declared(table, name, value, given[name])
+        if owner in bodies:
+            bodies[owner][own] = declared.mean
+        yield name, declared
+    for body, values in bodies.items():
+        if any(name.startswith(f"{body}.") for name, _ in flat(table.items)):
+            _check_inertia(table, body, values)
+
+
+def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
+    """Raise RigError unless some distribution of mass has the declared inertia."""
+    inertia = np.empty((3, 3))
+    for (i, j), what in zip(PAIRS, OF_BODY[4:], strict=True):
+        inertia[i, j] = inertia[j, i] = values[what]
+    low, middle, high = np.linalg.eigvalsh(inertia)
+    if low + middle < (1 - 1e-9) * high:
+        problem = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
+        table.refuse(f"{body}.inertia", problem, "write means of which the largest is at most the sum of the others")
+
+
+def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
+    pair = value if isinstance(value, dict) else {"mean": value, "std": 0.0}
+    numbers = [pair.get("mean", mean), pair.get("std")]
+    if set(pair) - {"mean", "std"} or not all(type(x) in (int, float) and abs(x) < float("inf") for x in numbers):
+        table.refuse(name, f"found {value!r}", _UNCERTAIN)
+    if numbers[1] < 0:
+        table.refuse(name, f"found std = {numbers[1]}", "write a standard deviation of 0 (trusted) or more")
+    own = name.partition(".")[2]
+    if (own in ("mass", *OF_JOINT) and numbers[0] < 0) or (own == "mass" and not numbers[0]):
+        table.refuse(name, f"found mean = {numbers[0]}", "write a number above 0")
+    return Declared(float(numbers[0]), float(numbers[1]))

@@ -1,0 +1,1 @@
+"""Multi-step prediction errors, a fit to them, and the covariance that they require."""

@@ -1,0 +1,340 @@
+"""Multi-step prediction errors, how everything that is estimated would move them, and a fit to them.
+
+The filter is forked at regular starts and the model runs on alone from there.  The sensitivities are those of the
+filter up to the start and of the open loop from there on, so that the errors are linear in what is estimated.
+"""
+
+import itertools
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..data.dataset import Dataset
+from ..em.local import locals_along
+from ..em.mstep import ScoringMStep
+from ..em.prior import ParameterPrior
+from ..em.quadratic import Local, friction_columns, reading_columns
+from ..em.weights import Weights
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each, turns
+from ..smoother.kalman import CUBATURE, kalman_filter
+from .shape import friction_prior
+
+HORIZONS = (0.25, 0.5)
+"""Horizons [s] at which errors are looked at."""
+JUDGED = (*HORIZONS, 1.0)
+"""Horizons [s] at which a model is judged: what only bends the first half second fails later."""
+SHORT_HORIZONS = (0.05, 0.1)
+"""Horizons [s] over which even a fast machine remains predictable."""
+SPACING = 0.05
+"""Time [s] between starts."""
+WIDE = 0.1
+"""Spread over which slopes are taken, in rms speeds: as wide as predictions err."""
+HUBER = 2.0
+"""Errors of more robust standard deviations weigh less."""
+
+
+class Columns(NamedTuple):
+    """Additions along a path."""
+
+    force: Float[Array | np.ndarray, "*seq column time dof"]
+    """Generalised force held over the step [N m]."""
+    reading: Float[Array | np.ndarray, "*seq column time obs"]
+
+
+class Grid(eqx.Module):
+    """Rows between starts, and rows from a start to every horizon."""
+
+    stride: int = eqx.field(static=True)
+    ages: tuple[int, ...] = eqx.field(static=True)
+
+    def starts(self, rows: int) -> Int[np.ndarray, " start"]:
+        """Rows at which a sequence of `rows` samples is forked."""
+        return np.arange(self.stride, rows - self.ages[-1], self.stride)
+
+
+class OpenLoop(NamedTuple):
+    """Errors after every start, at every horizon, and the sensitivity of the predictions."""
+
+    error: Float[np.ndarray, "seq start horizon obs"]
+    """Reading minus open-loop prediction [rad, or m]; NaN where there is none."""
+    columns: Float[np.ndarray, "seq start horizon obs column"]
+    """Derivatives by friction nodes, by parameters, then by the extra columns."""
+    overlap: Float[np.ndarray, " horizon"]
+    """Number of predictions that cover one moment."""
+
+
+def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+    """Starts and horizons on logs of `rows` samples; where these are short the horizons are too."""
+    stride = max(1, round(SPACING / dt))
+    longest = max(1, rows // 3 // stride)
+    return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
+
+
+def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Int[np.ndarray, " start"]:
+    """Rows at which all sequences are forked."""
+    return _grid(model, data, horizons).starts(data.t.shape[1])
+
+
+def channels(model: StateSpaceModel) -> tuple[int, ...]:
+    """Places in y of what is looked at: measured coordinates and sensors, or where there are none all."""
+    rates = range(dof := len(model.system.coordinates), 2 * dof)
+    return tuple(i for i, s in enumerate(model.measured) if s not in rates) or tuple(range(len(model.measured)))
+
+
+class Followed(NamedTuple):
+    """A model along smoothed paths, and the filter about them: what its multi-step errors begin from."""
+
+    model: StateSpaceModel
+    data: Dataset
+    linear: Local
+    middle: Float[Array, "seq time state"]
+    """States halfway between a path and its next state by the model."""
+    state: Float[Array, "seq time state"]
+    """Filtered means."""
+    gain: Float[Array, "seq time obs state"]
+
+
+def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Followed:
+    """`model` along the paths of all sequences."""
+    linear, exact = _wide(model, prior, path, data)
+    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), linear)
+    return Followed(model, data, linear, 0.5 * (path.mean + exact), state, gain)
+
+
+def open_loop(
+    along: Followed,
+    weights: Weights,
+    extra: Callable[[Int[np.ndarray, " some"]], Iterable[Columns]] | None = None,
+    horizons: tuple[float, ...] = HORIZONS,
+) -> OpenLoop:
+    """Multi-step errors of all sequences and their derivatives; `extra` returns blocks of more columns of some.
+
+    Columns of all sequences, or of all candidates at six joints, would be gigabytes.
+    """
+    (rows, obs), dof = along.data.y.shape[1:], len(along.model.system.coordinates)
+    grid = _grid(along.model, along.data, horizons)
+
+    def none(some) -> Iterable[Columns]:
+        yield Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
+
+    columns, see = [], channels(along.model)
+    for some, part in turns(len(along.state), along.linear, along.gain, along.middle):
+        found: list[np.ndarray] = []
+        for block in (extra or none)(some):
+            sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]
+            own = sens.shape[-1] - block.force.shape[1]
+            found.append(sens[..., own if found else 0 :])  # those of what is estimated once
+        columns.append(np.concatenate(found, axis=-1))
+    overlap = np.asarray(grid.ages) / grid.stride
+    return OpenLoop(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
+
+
+def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
+    """The errors alone [rad, or m]; NaN where there is none."""
+    grid = _grid(along.model, along.data, horizons)
+    found = each(_errors, (along.model, grid), (along.state, along.linear.seq))
+    return np.asarray(found)[..., channels(along.model)]
+
+
+def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+    return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons)
+
+
+def _wide(
+    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset
+) -> tuple[Local, Float[Array, "seq time state"]]:
+    """The model along its paths, with slopes as wide as predictions err, through the exact transition; and that."""
+    dof = len(model.system.coordinates)
+    rates = jnp.where(data.valid[..., None], path.mean[..., dof : 2 * dof], jnp.nan)
+    rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
+    spread = jnp.concatenate([WIDE * HORIZONS[0] * rms, WIDE * rms, jnp.full(path.mean.shape[-1] - 2 * dof, 1e-6)])
+    wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
+    linear = locals_along(model, prior, wide, data, CUBATURE)
+    exact = each(_exact, model, (path.mean, linear.seq.inputs))
+    offset = exact - jnp.einsum("stij,stj->sti", linear.affine.matrix, path.mean)
+    affine = linear.affine._replace(offset=offset, noise=jnp.zeros_like(linear.affine.noise))
+    return linear._replace(affine=affine), exact
+
+
+def _exact(model: StateSpaceModel, one) -> Float[Array, "time state"]:
+    """The transition along a path."""
+    return jax.vmap(model.transition)(*one)
+
+
+def _filtered(common, linear: Local):
+    """Filtered means and gains of one sequence about its path."""
+    log_q, log_r, start = common
+    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
+    return filtered.state.mean, filtered.gain
+
+
+def _errors(common, one) -> Float[Array, "start horizon obs"]:
+    """Open-loop errors of one sequence."""
+    (model, grid), (state, seq) = common, one
+    starts = grid.starts(state.shape[0])
+    row = lambda k: jax.tree.map(lambda a: a[k], seq.inputs)  # noqa: E731
+
+    def step(x, h):
+        x = jax.vmap(model.transition)(x, row(starts + h))
+        return x, jax.vmap(model.emission)(x, row(starts + h + 1))
+
+    _, read = jax.lax.scan(step, state[starts], jnp.arange(grid.ages[-1]))
+    known = jnp.where(seq.observed, seq.y, jnp.nan)
+    return jnp.stack([known[starts + age] - read[age - 1] for age in grid.ages], axis=1)
+
+
+def read_columns(
+    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], found: Columns
+) -> Float[Array, "time obs column"]:
+    """Change of the readings of one sequence by friction nodes, parameters and the columns `found`."""
+    dof = nodes.shape[0]
+    own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], linear), jnp.moveaxis(found.reading, 0, -1)
+    if linear.reading_by_force is not None:
+        read = read + jnp.einsum("tod,ctd->toc", linear.reading_by_force, found.force)
+    return jnp.concatenate([own, read], axis=-1)
+
+
+def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
+    """Change of the predictions of one sequence by every column."""
+    (nodes, grid), (linear, gain, middle, found) = common, one
+    single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
+    dof = nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], linear.by_force)
+    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
+    read = read_columns(nodes, linear, middle, found)
+    push = jnp.where(
+        linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter, moved], axis=-1), 0.0
+    )
+    matrix, rows, gain, push, read = single((linear.affine.matrix, linear.reading.rows, gain, push, read))
+
+    def absorb(s, slices):
+        matrix, rows, gain, push, read = slices
+        for i in range(rows.shape[0]):  # one reading at a time, as in the filter
+            s = s - gain[i][:, None] * (rows[i] @ s + read[i])[None]
+        return matrix @ s + push, s
+
+    _, known = jax.lax.scan(absorb, jnp.zeros_like(push[0]), (matrix, rows, gain, push, read))
+    starts = grid.starts(push.shape[0])
+
+    def fork(one):
+        s, start = one
+        out = []
+        for first, last in itertools.pairwise((0, *grid.ages)):
+            step = lambda s, h: (matrix[start + h] @ s + push[start + h], None)  # noqa: E731
+            s, _ = jax.lax.scan(step, s, jnp.arange(first, last))
+            out.append(rows[start + last] @ s + read[start + last])
+        return jnp.stack(out)
+
+    return jax.lax.map(fork, (known[starts], jnp.asarray(starts)))
+
+
+# --- how large
+
+
+def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "seq 1 horizon obs"]:
+    """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error.
+
+    It is the geometric mean of a sequence's own and that of all: with that of all, a few recordings with large errors
+    decide alone; with its own, one with hardly any motion counts as much as any.
+    """
+    if not error.size:
+        return np.ones((error.shape[0], 1, *error.shape[2:]))
+    size = np.ma.masked_invalid(np.abs(error))
+    whole, own = (np.ma.median(size, axis=over, keepdims=True) for over in ((0, 1), 1))
+    whole = np.ma.filled(whole, 1 / 1.4826)
+    own = np.where(np.ma.getmaskarray(own), whole, np.ma.filled(own, 1.0))
+    return 1.4826 * np.sqrt(whole * own) + 1e-12
+
+
+def huber(error, scale):
+    """Squared error in scales, beyond HUBER of them a straight line [Huber 1964]; what runs away counts as 30."""
+    size = np.minimum(np.abs(error) / scale, 30.0)
+    return np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER))
+
+
+def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
+    """Squared error of one model over that of another on the same starts, the mean over the horizons.
+
+    Outliers weigh less.
+    """
+    before, after = before[used], after[used]
+    known, scale = np.isfinite(before), robust_scale(before)
+    if not known.any():
+        return 1.0
+    after = np.where(np.isfinite(after), after, np.inf)
+    first, second = (np.where(known, huber(np.where(known, e, 0.0), scale), 0.0) for e in (before, after))
+    first, second = (np.sum(a, axis=(0, 1, 3)) for a in (first, second))
+    return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
+
+
+def weighed(found: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
+    """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
+    error = np.where(used[:, None, None, None], found.error, np.nan)
+    scale = robust_scale(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.minimum(1.0, HUBER * scale / np.abs(error))
+    sound = np.isfinite(error) & np.isfinite(found.columns).all(axis=-1)
+    return np.where(sound, size / scale**2 / found.overlap[:, None], 0.0)
+
+
+# --- a fit to them
+
+
+STEPS = 3
+"""Gauss-Newton steps at most."""
+FALLS = 0.01
+"""Share by which a step must lower the error to be taken."""
+
+
+def finish(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    *,
+    shaped: bool = False,
+) -> Followed:
+    """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until it predicts
+    better over all horizons at which a model is judged.
+
+    Friction, parameters and effects move, where it is `shaped` friction under the prior of its shape; noise and start
+    stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
+    """
+    best = followed(model, m_step.prior, path, data)
+    error = errors(best, JUDGED)
+    for _ in range(STEPS):
+        model = best.model
+        weights = m_step.weights(model)
+        predictions = open_loop(best, weights)
+        weight = weighed(predictions, used)
+        keep = weight > 0
+        jac, e, w = predictions.columns[keep].astype(float), predictions.error[keep], weight[keep]
+        score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
+        start, nodes = weights.read(model), slice(weights.nodes.size)
+        if shaped:
+            precision, pull = friction_prior(model, weights)  # parameters have theirs in the fit
+            information = information.at[nodes, nodes].add(precision[nodes, nodes])
+            score = score.at[nodes].add(-pull[nodes])
+        goal = _goal(weights, model.unknown, start, score, information)
+        for share in (1.0, 0.5, 0.25):
+            trial = followed(weights.write(model, start + share * (goal - start)), m_step.prior, path, data)
+            trial_error = errors(trial, JUDGED)
+            if ratio(error, trial_error, used) < 1 - FALLS:
+                best, error = trial, trial_error
+                break
+        else:
+            break
+    return best
+
+
+@eqx.filter_jit
+def _goal(weights: Weights, unknown, start, score, information):
+    return weights.fit(unknown, start, score, information, 30)

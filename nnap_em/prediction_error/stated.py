@@ -1,0 +1,194 @@
+"""Reported covariance of a fit whose noise is not that of the model.
+
+A likelihood is then overconfident: recordings disagree by more than it allows, and all of them share forces
+that no part of the model describes, which stand in every recording alike and bend the estimates the same way.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..data.dataset import Dataset
+from ..em.local import locals_along
+from ..em.mstep import ScoringMStep
+from ..em.quadratic import friction_columns
+from ..em.weights import Weights
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
+from ..smoother.kalman import kalman_filter, rts
+from .multistep import Columns, OpenLoop, followed, open_loop, read_columns, weighed
+
+FEATURES = 48
+"""Random functions of the state at every joint; twice as many gave the same within a tenth."""
+SMALLEST, LARGEST, SIZES = 1e-3, 1e5, 49
+"""Sizes of such forces that are tried: variance of what they add over that of the rest, where it is known best."""
+
+
+class Stated(NamedTuple):
+    """Reported uncertainty of a fit."""
+
+    hessian: Float[Array, "weight weight"]
+    """Posterior precision of the M-step's weights."""
+    discrepancy: float
+    """Size of the forces that no part of the model describes, in the units of `discrepancy_columns`."""
+
+
+class Errors(NamedTuple):
+    """Multi-step errors in a row, what each source moves in them, and their weights."""
+
+    error: Float[np.ndarray, " row"]
+    own: Float[np.ndarray, "row phi"]
+    """Columns of the estimated quantities."""
+    other: Float[np.ndarray, "row force"]
+    """Columns of forces that no part of the model describes."""
+    weight: Float[np.ndarray, " row"]
+    """One over the variance, less where errors overlap."""
+    rows: float
+    """Number of rows, did they not overlap."""
+
+
+def widened(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    hessian: Float[Array, "weight weight"],
+    *,
+    key: PRNGKeyArray,
+) -> Stated:
+    """Posterior precision reduced by the disagreement of recordings and by model discrepancy.
+
+        H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s' + tau^2 sum_k b_k b_k') A^-1
+
+    with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s and A its information,
+    that of the prior with it; b_k is the score of the k-th of many smooth random forces of the state, and tau their
+    size, by the likelihood of the errors that are left. Nothing becomes less certain than the prior. [Huber 1967, Proc.
+    5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters; Muller 2013, Econometrica 81, 1805,
+    for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for model discrepancy; Rahimi & Recht 2007, NIPS,
+    for the functions]
+    """
+    weights = m_step.weights(model)
+    other = discrepancy_columns(model, weights, path, data, used, key=key)
+    along = followed(model, m_step.prior, path, data)
+    predictions = open_loop(along, weights, lambda some: [jax.tree.map(lambda a: a[some], other)])
+    prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
+    errors, scores = _rows(predictions, weighed(predictions, used), len(jac))
+    own = errors.own @ jac
+    information = prior + own.T @ (errors.weight[:, None] * own)
+    scores = (scores[used] - scores[used].mean(axis=0)) @ jac
+    count = len(scores)
+    force = size(errors._replace(own=own), information)
+    shared = force * own.T @ (errors.weight[:, None] * errors.other)
+    sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
+    strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
+    half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
+    across = half.T @ np.linalg.solve(information, sources)
+    hessian = jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
+    return Stated(hessian, force)
+
+
+def of_states(
+    model: StateSpaceModel,
+    m_step: ScoringMStep,
+    path: Gaussian,
+    data: Dataset,
+    phi: Float[Array, "draw phi"],
+    force: float,
+    *,
+    key: PRNGKeyArray,
+) -> Float[Array, "seq time state state"]:
+    """Covariance that smoothed states have beyond the smoother's own: by friction and parameters, of which `phi` are
+    deviations drawn from the posterior, and by unmodelled forces of size `force`.
+
+    The smoother is linear about its path: the mean square of what each draw moves there.
+    """
+    weights = m_step.weights(model)
+    other = discrepancy_columns(model, weights, path, data, np.ones(len(data.t), bool), key=key)
+    kicks = force * jax.random.normal(jax.random.fold_in(key, 1), (phi.shape[0], other.force.shape[1]), phi.dtype)
+    linear = locals_along(model, m_step.prior, path, data, m_step.linearise)
+    common = model.log_q, model.log_r, model.start, weights.nodes, jnp.concatenate([phi, kicks], axis=1)
+    return each(_moved, common, (linear, path.mean, other))
+
+
+def _moved(common, one) -> Float[Array, "time state state"]:
+    """Change of one sequence."""
+    (log_q, log_r, start, nodes, draws), (linear, mean, found) = common, one
+    dof = nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], linear.by_force)
+    other = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
+    pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)
+    read = read_columns(nodes, linear, mean, found)
+    still = start._replace(mean=jnp.zeros_like(start.mean))
+    seq = linear.seq._replace(y=jnp.zeros_like(linear.seq.y))
+
+    def response(draw):
+        affine, reading = (a._replace(offset=b @ draw) for a, b in ((linear.affine, pushed), (linear.reading, read)))
+        return rts(kalman_filter(log_q, log_r, still, affine, reading, seq)).state.mean
+
+    moved = jax.lax.map(response, draws)
+    return jnp.einsum("kti,ktj->tij", moved, moved) / draws.shape[0]
+
+
+def discrepancy_columns(
+    model: StateSpaceModel,
+    weights: Weights,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    *,
+    key: PRNGKeyArray,
+) -> Columns:
+    """Random smooth forces of state and input at every joint, as large as friction that is not the same both ways.
+
+    Draws of a Gaussian process whose length is a standard deviation of each signal.
+    """
+    dof = len(model.system.coordinates)
+    known = jnp.asarray(data.valid & used[:, None])[..., None]
+    signals = jnp.concatenate([path.mean[..., : 2 * dof], jnp.nan_to_num(jnp.asarray(data.u))], axis=-1)
+    seen = jnp.where(known, signals, jnp.nan)
+    spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)
+    unit = (signals - jnp.nanmean(seen, axis=(0, 1), keepdims=True)) / jnp.where(spread > 0, spread, 1.0)
+    turned, shifted = jax.random.split(key)
+    slope = jax.random.normal(turned, (unit.shape[-1], dof * FEATURES), unit.dtype)
+    phase = jax.random.uniform(shifted, (1, 1, dof * FEATURES), unit.dtype, maxval=2 * math.pi)
+    value = math.sqrt(2 / FEATURES) * jnp.cos(unit @ slope + phase)
+    acts = jnp.repeat(jnp.diag(weights.asymmetry), FEATURES, axis=0)
+    force = jnp.moveaxis(value, -1, 1)[..., None] * acts[None, :, None]
+    return Columns(force, jnp.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
+
+
+def size(errors: Errors, information: Float[np.ndarray, "own own"]) -> float:
+    """Standard deviation tau of the strengths of `other`, at its largest likelihood.
+
+    error = own x + tau other z + noise, with z standard normal and the size of the noise free; x is projected out as
+    far as the prior lets it. Errors that no such force explains give zero.
+    """
+    root = np.sqrt(errors.weight)[:, None]
+    own, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
+    other, error = (a - own @ np.linalg.solve(information, own.T @ a) for a in (other, error))
+    strength, turn = np.linalg.eigh(other.T @ other)
+    strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
+    if whole == 0.0 or not strength.any():
+        return 0.0
+    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST, LARGEST, SIZES)])[:, None] / strength[-1]
+    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / errors.rows
+    best = np.argmin(0.5 * errors.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
+    return math.sqrt(float(ratios[best, 0] * noise[best]))
+
+
+def _rows(
+    found: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
+) -> tuple[Errors, Float[np.ndarray, "seq phi"]]:
+    """The errors in a row, and the score of every sequence."""
+    columns = np.where(weight[..., None] > 0, found.columns, 0.0).astype(float)
+    error = np.where(weight > 0, found.error, 0.0)
+    scores = np.einsum("skhoc,skho->sc", columns[..., :phi], weight * error)
+    flat = columns.reshape(-1, columns.shape[-1])
+    count = float(np.sum((weight > 0) / found.overlap[:, None]))
+    return Errors(error.ravel(), flat[:, :phi], flat[:, phi:], weight.ravel(), count), scores

@@ -1,0 +1,67 @@
+"""Addresses of the columns of a rig in a log: as declared, or by their names."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..data.dataset import DataError
+from .recording import Address, Topic, field_of, near
+
+_PARTS = (("", "position"), ("d", "velocity"))
+"""Prefix of the name of a joint for its angle and its rate, and the array that holds them."""
+
+
+def resolve(
+    path: Path, topics: Sequence[Topic], inputs: Sequence[str], measured: Sequence[str], declared: Mapping[str, Address]
+) -> dict[str, Address]:
+    """Address of each column of the rig; DataError with the nearest names where one is absent."""
+    out = {}
+    for name in (*inputs, *measured):
+        if name in declared:
+            out[name] = declared_at(path, topics, declared[name], name)
+        else:
+            out[name] = _by_name(path, topics, name, name in inputs)
+    return out
+
+
+def declared_at(path: Path, topics: Sequence[Topic], given: Address, column: str) -> Address:
+    """The address as the file has it."""
+    where = f"column {column!r} from {str(given)!r}"
+    topic = next((topic for topic in topics if topic.name == given.topic), None)
+    if topic is None:
+        hint = near(given.topic, [topic.name for topic in topics])
+        raise DataError(f"{path}: {where}: there is no topic {given.topic!r}; {hint}")
+    return given._replace(path=field_of(path, topic, given.path, where))
+
+
+def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
+    """The one place whose name is that of the column: a field, or a joint of an array of joints."""
+    names = set(_names(column, is_input))
+    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in names]
+    addresses = addresses or [
+        Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in names
+    ]
+    hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
+    if not addresses:
+        every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
+        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {_nearest(column, every)}")
+    if len(addresses) > 1:
+        places = " and ".join(repr(str(each)) for each in addresses[:4])
+        raise DataError(f"{path}: column {column!r}: may be {places}; {hint}")
+    return addresses[0]
+
+
+def _names(column: str, is_input: bool) -> list[str]:
+    if is_input:
+        return [column, f"effort[{column}]"]
+    return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in _PARTS if column.startswith(d))]
+
+
+def _nearest(column: str, every: Sequence[str]) -> str:
+    """The hint by the last word of each address, which is what a column is called by."""
+    words = {re.split(r"[:.\[]", name.rstrip("]"))[-1]: name for name in every}
+    text = near(column, list(words))
+    match = re.match(r"did you mean '([^']*)'\? ", text)
+    hint = f"did you mean {words[match[1]]!r}? " if match else ""
+    names = ", ".join(every[:12]) + (f", and {len(every) - 12} more" if len(every) > 12 else "")
+    return f"{hint}there are: {names or 'no numbers at all'}"

@@ -1,0 +1,60 @@
+"""Logs on the grid as a data set: which sequence is for training, its file, and rig.toml with what was found."""
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..data.dataset import DataError
+from ..data.formats import write_csv
+from ..data.rig import Rig, toml_text
+from .recording import Address
+from .resample import Resampled
+
+
+def places(logs: Sequence[Resampled], test: float) -> list[str]:
+    """The files of all sequences that are used, in the order of the logs: the last ones are for the test.
+
+    `test` from 1 on is how many, below 1 their share; one sequence is left to train on.
+    """
+    count = sum(len(log.values) for log in logs)
+    tests = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
+    if tests >= count:
+        hint = "give fewer, or set [import] longest lower in rig.toml"
+        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {hint}")
+    digits = max(len(str(count - 1)), 3)
+    return [f"train/{i:0{digits}d}.csv" for i in range(count - tests)] + [
+        f"test/{i:0{digits}d}.csv" for i in range(tests)
+    ]
+
+
+def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str], rig: Rig) -> None:
+    """One CSV file a sequence; the clock begins at 0 in each, or runs on from the first log's, as the rig declares."""
+    rest = iter(files)
+    for log in logs:
+        used = [stretch for stretch in log.sequences if not stretch.why]
+        for stretch, values in zip(used, log.values, strict=True):
+            offset = 0.0 if rig.clock == "sequence" else (log.origin - logs[0].origin) * 1e-9 + stretch.start
+            time = offset + rig.dt * np.arange(stretch.rows)
+            write_csv(folder / next(rest), {"time": time} | dict(values))
+
+
+def completed(text: str, addresses: Mapping[str, Address]) -> str:
+    """rig.toml with a line for each column whose place was found by its name."""
+    table = tomllib.loads(text).get("import", {})
+    lines = [
+        f"{toml_text(name)} = {toml_text(str(at))}    # found by its name"
+        for name, at in addresses.items()
+        if name not in table.get("columns", {})
+    ]
+    if not lines:
+        return text
+    head = re.search(r"(?m)^\[import\.columns\].*$", text)
+    if head:
+        return text[: head.end()] + "\n" + "\n".join(lines) + text[head.end() :]
+    if "columns" in table:  # written in another way, which is left as it is
+        return text
+    return text.rstrip() + "\n\n[import.columns]\n" + "\n".join(lines) + "\n"

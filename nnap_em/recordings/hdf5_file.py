@@ -1,0 +1,137 @@
+"""HDF5 files: a group with a time axis is a topic, its data sets are the fields."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..data.dataset import DataError
+from .clock import rising
+from .objects import MOST
+from .recording import EXTRA, Recording, Topic, Track, refuse
+
+TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
+UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9}
+MARKS = ("axis", "kind", "role", "standard_name")
+"""Attributes that mark a data set as the time."""
+_BLOCK = 2**18
+"""Rows of a wide data set that are read at once."""
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """Every group that holds numbers, with a time axis of its own or of a group above."""
+    with _opened(path) as file:
+        every = [_topic(group) for group in _groups(file)]
+        return tuple(topic for topic in every if topic.fields)
+
+
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
+    """The numbers at these paths of these groups."""
+    with _opened(path) as file:
+        return Recording(path, {topic: _track(path, file[topic], paths) for topic, paths in fields.items()})
+
+
+def _topic(group: Any) -> Topic:
+    """A group as a topic."""
+    axis, fields, rows = _axis(group), [], None
+    for name, data in _numeric(group):
+        if axis is not None and data == axis:
+            continue
+        if axis is None or data.shape[0] == axis.shape[0]:
+            fields += [name] if data.ndim == 1 else [f"{name}[{i}]" for i in range(data.shape[1])]
+            rows = data.shape[0]
+    return Topic(group.name, f"group, time in {axis.name!r}" if axis is not None else "no time axis", rows,
+                 tuple(fields))  # fmt: skip
+
+
+def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
+    axis, where = _axis(group), f"group {group.name!r}"
+    if axis is None:
+        names = ", ".join(group) or "nothing"
+        hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
+        refuse(path, where, f"has no time axis (holds {names})", hint)
+    if axis.dtype.kind == "f" and not np.isfinite(axis[:]).all():
+        refuse(path, f"data set {axis.name!r}", "holds times that are no numbers", "cut the rows without a time")
+    clock = rising(path, f"data set {axis.name!r}", _nanoseconds(axis), axis.name.rpartition("/")[2])
+    values = {each: _column(group, each)[clock.used] for each in paths}
+    return Track(clock.t, values, clock.name, clock.notes)
+
+
+def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
+    """One column, read in blocks: neighbours of a wide data set are not kept."""
+    name, _, index = field.removesuffix("]").partition("[")
+    data = group[name]
+    if data.ndim == 1:
+        return data[:].astype(np.float64)
+    blocks = range(0, data.shape[0], _BLOCK)
+    return np.concatenate([data[k : k + _BLOCK, int(index)].astype(np.float64) for k in blocks])
+
+
+def _nanoseconds(axis: Any) -> Int[np.ndarray, " row"]:
+    """The times, by the unit that an attribute, the name, or the size of whole numbers shows."""
+    t = axis[:]
+    named = TIME.match(axis.name.rpartition("/")[2])
+    unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).strip().lower() or (named and named[1]) or ""
+    if unit.lower() in UNITS:
+        scale = UNITS[unit.lower()]
+    else:
+        scale = 1e-9 if t.dtype.kind in "iu" and t.size and np.abs(t[-1]) > 1e14 else 1.0
+    return t.astype(np.int64) if scale == 1e-9 else np.round(t * (scale * 1e9)).astype(np.int64)
+
+
+def _axis(group: Any) -> Any | None:
+    """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
+    inside = [(name, data) for name, data in _numeric(group)]
+    for _, data in inside:
+        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in MARKS):
+            return data
+    for name, data in inside:
+        if data.ndim == 1 and TIME.match(name):
+            return data
+    above = None if group.name == "/" else _axis(group.parent)
+    return above if above is not None and any(data.shape[0] == above.shape[0] for _, data in inside) else None
+
+
+def _numeric(group: Any) -> Iterator[tuple[str, Any]]:
+    """Data sets of one number or one row of numbers per time."""
+    for name, data in group.items():
+        if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in "iuf" and data.shape[0] > 1:
+            if data.ndim == 2 and data.shape[1] > MOST:
+                continue
+            yield name, data
+
+
+def _groups(group: Any) -> Iterator[Any]:
+    yield group
+    for item in group.values():
+        if hasattr(item, "items"):
+            yield from _groups(item)
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        import h5py
+    except ImportError:
+        raise DataError(f"{path}: HDF5 files cannot be read without h5py; {EXTRA}") from None
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        if error.errno:
+            raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights") from None
+        hint = "use another copy, or write it again"
+        raise DataError(f"{path}: no HDF5 file, or damaged or cut short; {hint}") from None
+    with file:
+        try:
+            yield file
+        except (OSError, RuntimeError) as error:
+            hint = "use another copy, or write it again"
+            raise DataError(f"{path}: the file is damaged ({' '.join(str(error).split())}); {hint}") from None

@@ -1,0 +1,116 @@
+"""Content of a recording, whatever file it came from: topics with numbers at times of their own."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..data.dataset import DataError
+from ..data.rig import nearest
+
+EXTRA = 'pip install "nnap-em[logs]"'
+
+
+class Topic(NamedTuple):
+    """One stream of messages, as a look at the file shows it."""
+
+    name: str
+    kind: str
+    """Type and encoding, for people."""
+    messages: int | None
+    """Number of messages; None where the file does not have it."""
+    fields: tuple[str, ...]
+    """Paths of its numbers, such as `position[shoulder]` or `data[0]`, in the order of the message."""
+
+
+class Track(NamedTuple):
+    """Content of one topic."""
+
+    t: Int[np.ndarray, " message"]
+    """ns, rising; of the epoch where the file's clock is."""
+    values: Mapping[str, Float[np.ndarray, " message"]]
+    """Values by path; NaN where a message has no such number."""
+    clock: str
+    """Source of the times: `header stamp`, `log time`, or the name of a column."""
+    notes: tuple[str, ...]
+    """Irregularities of the times."""
+
+
+class Recording(NamedTuple):
+    """Content of one file."""
+
+    path: Path
+    tracks: Mapping[str, Track]
+    """Tracks by topic."""
+    notes: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Reader(Protocol):
+    """A kind of file."""
+
+    def topics(self, path: Path) -> tuple[Topic, ...]:
+        """Topics of the file, without reading it all."""
+        ...
+
+    def read(self, path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
+        """The numbers at these paths of these topics, and nothing else."""
+        ...
+
+
+class Address(NamedTuple):
+    """Address of a column."""
+
+    topic: str
+    path: str
+    scale: float = 1.0
+    """SI unit per unit of the log."""
+
+    def __str__(self) -> str:
+        return f"{self.topic}:{self.path}" if self.topic else self.path
+
+
+def refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
+    """Raise the DataError."""
+    raise DataError(f"{path}: {where}: {problem}; {hint}")
+
+
+def address(text: str) -> tuple[str, str]:
+    """Topic and path of `/joint_states:position[shoulder]`; a table of columns has one topic without name."""
+    topic, _, path = text.rpartition(":")
+    return topic, path
+
+
+def steps(path: str) -> Iterator[str | int]:
+    """The way to a number: names of fields, then indices and names in brackets as ints and as `[name`."""
+    for name, index in re.findall(r"([^.\[\]]+)|\[([^\]]*)\]", path):
+        yield name or (int(index) if index.isdigit() else f"[{index}")
+
+
+def field_of(file: Path, topic: Topic, path: str, where: str) -> str:
+    """The path as the topic lists it, which names a joint where an index stands; DataError where there is none."""
+    if path in topic.fields:
+        return path
+    match = re.fullmatch(r"(.*)\[(\d+)\]", path)
+    row = [name for name in topic.fields if match and re.fullmatch(re.escape(match[1]) + r"\[[^\]]*\]", name)]
+    if match and row:
+        if int(match[2]) < len(row):
+            return row[int(match[2])]
+        refuse(file, where, f"{match[1]!r} of {topic.name!r} has {len(row)} values", f"count from 0 to {len(row) - 1}")
+    if not topic.fields:
+        refuse(file, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
+    refuse(file, where, f"topic {topic.name!r} has no field {path!r}", near(path, topic.fields))
+
+
+OTHER = "write it as ROS 2 CDR, JSON or protobuf, or name another topic"
+
+
+def near(word: str, known: Sequence[str], most: int = 12) -> str:
+    """The hint for a misspelt name among many."""
+    text = nearest(word, known)
+    first, mark, rest = text.partition("possible here: ")
+    names = rest.split(", ")
+    return first + mark + ", ".join(names[:most]) + (f", and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,37 @@
+"""CSV, Parquet and MAT files: one topic without a name, whose fields are the columns."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..data.formats import column_names, read_table
+from .clock import rising
+from .hdf5_file import TIME, UNITS
+from .recording import Recording, Topic, Track, refuse
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """The columns, save that of the time."""
+    names = column_names(path)
+    clock = _clock(path, names)
+    return (Topic("", f"table, time in column {clock!r}", None, tuple(name for name in names if name != clock)),)
+
+
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
+    """These columns; an empty field is NaN."""
+    name = _clock(path, column_names(path))
+    table = read_table(path, (name,), fields[""])
+    scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
+    t = np.round(table[:, 0] * scale * 1e9).astype(np.int64)
+    clock = rising(path, f"column {name!r}", t, name)
+    values = {column: table[clock.used, i] for i, column in enumerate(fields[""], 1)}
+    return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
+
+
+def _clock(path: Path, names: Sequence[str]) -> str:
+    """The column that is the time."""
+    column = next((name for name in names if TIME.match(name)), None)
+    if column is None:
+        refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", "name it 'time' [s]")
+    return column

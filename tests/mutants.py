@@ -462,8 +462,8 @@ MUTANTS = (
     Mutant(
         "finish takes steps that raise the error",
         "prediction_error/multistep.py",
-        "there, used) < 1 - FALLS:",
-        "there, used) > 1 - FALLS:",
+        "trial_error, used) < 1 - FALLS:",
+        "trial_error, used) > 1 - FALLS:",
         "test_fit.py::test_a_gauss_newton_step_is_halved_until_the_errors_fall",
     ),
     Mutant(
@@ -693,8 +693,8 @@ MUTANTS = (
     Mutant(
         "information of steps outside the data",
         "design/information.py",
-        "jnp.where(here.seq.active[:, None, None], jnp.concatenate(",
-        "jnp.where(~here.seq.active[:, None, None], jnp.concatenate(",
+        "jnp.where(linear.seq.active[:, None, None], jnp.concatenate(",
+        "jnp.where(~linear.seq.active[:, None, None], jnp.concatenate(",
         "test_design.py::test_information_is_the_mean_square_of_the_score",
     ),
     Mutant(
@@ -806,8 +806,8 @@ MUTANTS = (
     Mutant(
         "forces unsaid that move no state",
         "prediction_error/stated.py",
-        "pushed = jnp.concatenate([torque, here.by_parameter, other], axis=-1)",
-        "pushed = jnp.concatenate([torque, here.by_parameter, 0.0 * other], axis=-1)",
+        "pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)",
+        "pushed = jnp.concatenate([torque, linear.by_parameter, 0.0 * other], axis=-1)",
         "test_stated.py::test_forces_unsaid_move_states_as_the_same_input_does",
     ),
     Mutant(

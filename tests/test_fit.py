@@ -19,7 +19,7 @@ from nnap_em.fit import identify
 from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.prediction_error import multistep, stated
-from nnap_em.prediction_error.multistep import Followed, Forks
+from nnap_em.prediction_error.multistep import Followed, OpenLoop
 
 MODEL, RULE = slide()
 DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))
@@ -152,7 +152,9 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
     many = lambda model: np.full((4, 3, 2, 1), size(model))  # noqa: E731
     one = lambda model: np.ones((4, 3, 2, 1, RULE.weights(model).nodes.size + 1))  # noqa: E731
     monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "forks", lambda along, *_: Forks(many(along.model), one(along.model), np.ones(2)))
+    monkeypatch.setattr(
+        multistep, "open_loop", lambda along, *_: OpenLoop(many(along.model), one(along.model), np.ones(2))
+    )
     monkeypatch.setattr(multistep, "errors", lambda along, *_: many(along.model))
     monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
     begun = RULE.prior.write(MODEL, jnp.zeros(1))
@@ -170,7 +172,7 @@ def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
 
     one = np.ones((4, 3, 2, 1, RULE.weights(MODEL).nodes.size + 1))
     monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "forks", lambda along, *_: Forks(many(along.model, (0, 0)), one, np.ones(2)))
+    monkeypatch.setattr(multistep, "open_loop", lambda along, *_: OpenLoop(many(along.model, (0, 0)), one, np.ones(2)))
     monkeypatch.setattr(multistep, "errors", lambda along, horizons: many(along.model, horizons))
     monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
     begun = RULE.prior.write(MODEL, jnp.zeros(1))
@@ -182,9 +184,9 @@ def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
 def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
     nodes, asked = RULE.weights(MODEL).nodes.size, []
     columns = np.ones((4, 3, 2, 1, nodes + 1))
-    told = Forks(np.ones((4, 3, 2, 1)), columns, np.ones(2))
+    told = OpenLoop(np.ones((4, 3, 2, 1)), columns, np.ones(2))
     monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "forks", lambda *_: told)
+    monkeypatch.setattr(multistep, "open_loop", lambda *_: told)
     monkeypatch.setattr(multistep, "errors", lambda *_: told.error)
     monkeypatch.setattr(
         multistep, "friction_prior", lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
@@ -209,13 +211,13 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     columns = slope * np.concatenate([np.zeros((*errors.shape, nodes)), np.ones((*errors.shape, 1))], axis=-1)
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
     told, every, likelihood = (
-        Forks(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2)),
+        OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2)),
         np.ones(4, bool),
         50,
     )
-    monkeypatch.setattr(stated, "unsaid", lambda *_, **__: None)
+    monkeypatch.setattr(stated, "discrepancy_columns", lambda *_, **__: None)
     monkeypatch.setattr(stated, "followed", lambda *_: None)
-    monkeypatch.setattr(stated, "forks", lambda *_: told)
+    monkeypatch.setattr(stated, "open_loop", lambda *_: told)
     monkeypatch.setattr(stated, "size", lambda *_: force)
     hessian = jnp.full((1, 1), 1.0 + likelihood)
     found, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
@@ -255,7 +257,10 @@ def test_forces_unsaid_are_as_large_as_asked_at_every_state():
     rng = np.random.default_rng(2)
     path = Gaussian(jnp.asarray(rng.normal(size=(4, 9, 2))), PATH.cov)
     weights = RULE.weights(MODEL)
-    many = [stated.unsaid(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i)).force for i in range(20)]
+    many = [
+        stated.discrepancy_columns(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i)).force
+        for i in range(20)
+    ]
     variance = np.mean([np.sum(np.square(force), axis=1) for force in many], axis=0)
     np.testing.assert_allclose(variance, float(weights.asymmetry[0]) ** 2, rtol=0.2)
 
@@ -297,7 +302,7 @@ def _finished(monkeypatch, error):
 def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch):
     fitted, after, masks = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2)
     assert after.model is fitted.model
-    assert float(after.state.hessian[0, 0]) == 2.0 and after.unsaid == 0.7
+    assert float(after.state.hessian[0, 0]) == 2.0 and after.discrepancy == 0.7
     np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
 
 

@@ -22,13 +22,13 @@ from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.prediction_error.multistep import (
     Columns,
-    Forks,
+    OpenLoop,
     errors,
     finish,
     followed,
-    forks,
     grid_of,
     huber,
+    open_loop,
     ratio,
     robust_scale,
     weighed,
@@ -105,7 +105,7 @@ def test_columns_are_difference_quotients(question, known, name):
     extra = candidate_columns(known.model, candidates)(tracks(known.model, known.path, inputs))
     some = lambda index: [jax.tree.map(lambda a: a[index], extra)]  # noqa: E731
     along = followed(known.model, known.m_step.prior, known.path, known.data)
-    before = forks(along, known.m_step.weights(known.model), some)
+    before = open_loop(along, known.m_step.weights(known.model), some)
     start, probe = candidates[0].start, candidates[0].probes[0]
     weak = jax.tree.map(lambda start, p: start + 1e-2 * (p - start), start, probe)
     after = errors(followed(with_effects(known.model, (weak,)), known.m_step.prior, known.path, known.data))
@@ -215,7 +215,7 @@ def test_weights_are_one_over_the_variance_and_less_for_outliers():
     error = np.tile(np.array([1.0, -1.0, 1.0, -1.0, 1.0])[None, :, None, None], (3, 1, 2, 1))
     error[:, :, 1] *= 10.0
     error[1, 2, 0], error[1, 3, 1], error[2] = 20.0 * 1.4826, np.nan, 1e6
-    weight = weighed(Forks(error, np.ones((*error.shape, 1)), np.array([1.0, 2.0])), np.array([True, True, False]))
+    weight = weighed(OpenLoop(error, np.ones((*error.shape, 1)), np.array([1.0, 2.0])), np.array([True, True, False]))
     near, far = 1 / 1.4826**2, 1 / 14.826**2 / 2.0
     assert weight[0, 0, :, 0].tolist() == pytest.approx([near, far])
     assert weight[1, 2, 0, 0] == pytest.approx(near * 2.0 / 20.0)

@@ -114,6 +114,20 @@ def test_a_payload_of_a_file_from_before_it_had_a_centre_is_read(tmp_path):
     assert float(effect.values()["mass"]) == 0.04 and effect.moment is None
 
 
+def test_the_size_of_the_discrepancy_is_read_under_its_old_name(tmp_path):
+    path, rig = tmp_path / "model.npz", RIGS["slide"]
+    save(path, begin(rig, _data(rig), key=jax.random.key(5))._replace(discrepancy=0.25))
+
+    def older(header, arrays):
+        header["leaves"]["/unsaid"] = header["leaves"].pop("/discrepancy")
+
+    _rewrite(path, older)
+    fitted = load(path)
+    assert fitted.discrepancy == 0.25
+    with pytest.warns(DeprecationWarning, match="discrepancy"):
+        assert fitted.unsaid == 0.25
+
+
 @pytest.mark.parametrize("name", RIGS)
 def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     fitted = _fitted(name)

@@ -59,8 +59,8 @@ def _information(fit: Fit, one) -> Float[Array, "phi phi"]:
     seq, motions = one
 
     def along(x):
-        here, filtered, path = linearised(fit, seq, x)
-        jac = _sensitivities(fit, here, filtered, path)
+        linear, filtered, path = linearised(fit, seq, x)
+        jac = _sensitivities(fit, linear, filtered, path)
         return jac.T @ jac
 
     return jnp.mean(jax.vmap(along)(motions), axis=0)
@@ -77,8 +77,8 @@ def linearised(fit: Fit, seq: Dataset, x: Float[Array, "time state"]) -> tuple[L
     readings = jax.vmap(lambda x, u: linear_reading(model, x, u))(x, model.inputs(seq))
     cov = rts(kalman_filter(model.log_q, model.log_r, start, tangents, readings, prepare(model, seq))).state.cov
     path = Gaussian(x, cov)
-    here = local(model, fit.prior, path, seq, CUBATURE)
-    return here, kalman_filter(model.log_q, model.log_r, start, here.affine, here.reading, here.seq), path
+    linear = local(model, fit.prior, path, seq, CUBATURE)
+    return linear, kalman_filter(model.log_q, model.log_r, start, linear.affine, linear.reading, linear.seq), path
 
 
 POINTS = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
@@ -92,18 +92,18 @@ def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
     return v + std * jnp.asarray(POINTS, v.dtype)[None, :, None]
 
 
-def columns_of(fit: Fit, here: Local, path: Gaussian) -> Float[Array, "time state phi"]:
+def columns_of(fit: Fit, linear: Local, path: Gaussian) -> Float[Array, "time state phi"]:
     """Sensitivity of the next state to phi; friction acts at all speeds that the path may have."""
     speeds = _speeds(path, fit.nodes.shape[0])
-    torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, here.by_force)
-    return jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter], axis=-1), 0.0)
+    torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, linear.by_force)
+    return jnp.where(linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter], axis=-1), 0.0)
 
 
-def _sensitivities(fit: Fit, here: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
+def _sensitivities(fit: Fit, linear: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
     """Sensitivities of the whitened readings to phi."""
-    columns = columns_of(fit, here, path)
-    readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), here)
-    jac = whitened_sensitivities(filtered, columns, readings, here.seq.observed)
+    columns = columns_of(fit, linear, path)
+    readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), linear)
+    jac = whitened_sensitivities(filtered, columns, readings, linear.seq.observed)
     return jac.reshape(-1, jac.shape[-1])
 
 
@@ -137,10 +137,10 @@ def _contrast(common, one):
     model, begin = rival.model, Gaussian(_with_memory(rival.model, start), rival.model.start.cov)
     about = ekf(model, begin, prepared).state.mean
     path = Gaussian(about, jnp.zeros((*about.shape, about.shape[-1])))
-    here = local(model, rival.prior, path, seq, TANGENT)
-    filtered = kalman_filter(model.log_q, model.log_r, begin, here.affine, here.reading, prepared)
-    here = here._replace(seq=prepared)
-    jac, r = _sensitivities(rival, here, filtered, path), filtered.innovation.ravel()
+    linear = local(model, rival.prior, path, seq, TANGENT)
+    filtered = kalman_filter(model.log_q, model.log_r, begin, linear.affine, linear.reading, prepared)
+    linear = linear._replace(seq=prepared)
+    jac, r = _sensitivities(rival, linear, filtered, path), filtered.innovation.ravel()
     return jac.T @ jac, jac.T @ r, r @ r
 
 

@@ -27,12 +27,12 @@ from ..numerics.parallel import each, turns
 from ..prediction_error.multistep import (
     HORIZONS,
     JUDGED,
-    SOON,
+    SHORT_HORIZONS,
     Followed,
     errors,
     finish,
     followed,
-    forks,
+    open_loop,
     ratio,
     read_columns,
     starts,
@@ -101,8 +101,8 @@ class MultiStep(AbstractLoss):
     bars: ClassVar[Bars] = MULTI_STEP
     measure: ClassVar[str] = "share of the squared multi-step error"
     predicts: ClassVar[bool] = True
-    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SOON))
-    judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SOON))
+    bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SHORT_HORIZONS))
+    judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SHORT_HORIZONS))
     """Horizons [s] at which a law that a band shows is judged after its refit."""
 
     def left(self, fit: SmoothedFit) -> float:
@@ -117,7 +117,7 @@ class MultiStep(AbstractLoss):
         track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
         along = candidate_columns(_machine(fit), candidates)
         every = tuple(sorted(set(sum(self.bands, ()))))
-        predictions = forks(
+        predictions = open_loop(
             followed(model, weights.prior, path, data),
             weights,
             lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),

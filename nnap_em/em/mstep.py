@@ -52,15 +52,15 @@ class Core(NamedTuple):
     start: Gaussian
 
 
-def between(here: Any, there: Any, share: float) -> Any:
+def between(origin: Any, target: Any, share: float) -> Any:
     """A model, or a part of one, a share of the way from `here` to `there`."""
-    return _between(*at_home((here, there, jnp.asarray(share, jnp.result_type(float)))))
+    return _between(*at_home((origin, target, jnp.asarray(share, jnp.result_type(float)))))
 
 
 @eqx.filter_jit
-def _between(here, there, share):
+def _between(origin, target, share):
     way = lambda a, b: a + share.astype(a.dtype) * (b - a) if eqx.is_inexact_array(a) else a  # noqa: E731
-    return jax.tree.map(way, here, there)
+    return jax.tree.map(way, origin, target)
 
 
 class AbstractMStep(eqx.Module):
@@ -96,28 +96,28 @@ BLOCK = 8
 
 
 def _quadratic(common, one) -> Quadratic:
-    (log_q, log_r, start, nodes), (here, posterior, read) = common, one
-    return quadratic(log_q, log_r, start, here, nodes, posterior, read)
+    (log_q, log_r, start, nodes), (linear, posterior, read) = common, one
+    return quadratic(log_q, log_r, start, linear, nodes, posterior, read)
 
 
 @eqx.filter_jit
-def _widened(prior: ParameterPrior, w, here: Local, path: Gaussian, pad: int):
+def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
     """Parameters, and sensitivities to them, with `pad` more that do nothing, nameless here; and the first states."""
     widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
     mean, std = widen(prior.mean), jnp.pad(prior.std, (0, pad), constant_values=1.0)
     wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), mean, std)
-    moved = widen(here.by_parameter), widen(here.reading_by_parameter)
+    moved = widen(linear.by_parameter), widen(linear.reading_by_parameter)
     return wide, widen(w), moved, jax.tree.map(lambda a: a[:, 0], path)
 
 
 @eqx.filter_jit
-def _shaken(here: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
+def _shaken(linear: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
     """`log_r` where it is no less than the mean effect of the kicks of a step, as accelerations, on a reading."""
-    assert here.reading_by_force is not None
-    dof = here.by_force.shape[-1]
-    kick = jnp.swapaxes(here.by_force[..., dof : 2 * dof, :], -1, -2)  # of a unit force on every joint
-    response = jnp.linalg.solve(kick, jnp.swapaxes(here.reading_by_force, -1, -2))  # dof obs: of a unit kick
-    known = here.seq.active[..., None] & jnp.all(jnp.isfinite(response), axis=-2)
+    assert linear.reading_by_force is not None
+    dof = linear.by_force.shape[-1]
+    kick = jnp.swapaxes(linear.by_force[..., dof : 2 * dof, :], -1, -2)  # of a unit force on every joint
+    response = jnp.linalg.solve(kick, jnp.swapaxes(linear.reading_by_force, -1, -2))  # dof obs: of a unit kick
+    known = linear.seq.active[..., None] & jnp.all(jnp.isfinite(response), axis=-2)
     square = jnp.einsum("stdo,d->sto", response**2, jnp.exp(log_q[dof : 2 * dof]))
     count = jnp.sum(known, axis=(0, 1), dtype=square.dtype)
     mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(count, 1.0)
@@ -190,10 +190,10 @@ class ScoringMStep(AbstractMStep):
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         """One step of Fisher scoring."""
-        here = locals_along(model, self.prior, posterior.state, data, self.linearise)
-        read = readings_along(model, posterior, here.seq)
+        linear = locals_along(model, self.prior, posterior.state, data, self.linearise)
+        read = readings_along(model, posterior, linear.seq)
         core = self.core(model)
-        core, hessian, used = self.advance(core, here, posterior, read, kept(posterior, data))
+        core, hessian, used = self.advance(core, linear, posterior, read, kept(posterior, data))
         return self.whole(model, core), MStepInfo(hessian, used)
 
     def core(self, model) -> Core:
@@ -208,7 +208,7 @@ class ScoringMStep(AbstractMStep):
     def advance(
         self,
         core: Core,
-        here: Local,
+        linear: Local,
         posterior: Posterior,
         read: Float[Array, "seq time node obs"],
         used: Bool[Array, " seq"],
@@ -218,15 +218,15 @@ class ScoringMStep(AbstractMStep):
         With it the posterior precision where it began, and which of the sequences `used` could be.
         """
         pad = BLOCK * max(1, -(-self.prior.size // BLOCK)) - self.prior.size
-        prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, here, posterior.state, pad)
+        prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
         rule = eqx.tree_at(lambda r: r.prior, self, prior)
-        here = here._replace(by_parameter=of_state, reading_by_parameter=of_reading)
+        linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
-        terms = each(_quadratic, common, (here, posterior, read))
+        terms = each(_quadratic, common, (linear, posterior, read))
         inputs = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
         core, hessian, used = _advance(*inputs)
-        if here.reading_by_force is not None:
-            core = core._replace(log_r=_shaken(here, core.log_q, core.log_r))
+        if linear.reading_by_force is not None:
+            core = core._replace(log_r=_shaken(linear, core.log_q, core.log_r))
         return *_narrowed(core, hessian, pad), used
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:

@@ -84,20 +84,20 @@ def friction_columns(
 
 
 def reading_columns(
-    nodes: Float[Array, "dof count"], speed: Float[Array, "time node dof"], here: Local
+    nodes: Float[Array, "dof count"], speed: Float[Array, "time node dof"], linear: Local
 ) -> Float[Array, "time obs phi"]:
     """Sensitivity of the readings of a sequence to phi, the torques mean over some speeds in every row."""
-    torque = jnp.zeros((*here.seq.y.shape, nodes.size), speed.dtype)
-    if here.reading_by_force is not None:
-        torque = jax.vmap(lambda v, b: friction_columns(nodes, v, b))(speed, here.reading_by_force)
-    return jnp.concatenate([torque, here.reading_by_parameter], axis=-1)
+    torque = jnp.zeros((*linear.seq.y.shape, nodes.size), speed.dtype)
+    if linear.reading_by_force is not None:
+        torque = jax.vmap(lambda v, b: friction_columns(nodes, v, b))(speed, linear.reading_by_force)
+    return jnp.concatenate([torque, linear.reading_by_parameter], axis=-1)
 
 
 def quadratic(
     log_q: Float[Array, " state"],
     log_r: Float[Array, " obs"],
     start: Gaussian,
-    here: Local,
+    linear: Local,
     nodes: Float[Array, "dof count"],
     posterior: Posterior,
     read: Float[Array, "time node obs"],
@@ -106,7 +106,7 @@ def quadratic(
 
     The same program for every structure of the same size.
     """
-    y, observed, dof = here.seq.y, here.seq.observed, nodes.shape[0]
+    y, observed, dof = linear.seq.y, linear.seq.observed, nodes.shape[0]
     q, r = jnp.exp(log_q), jnp.exp(log_r)
 
     def columns(prev, following, kick, excess, by_force, by_parameter):
@@ -122,9 +122,9 @@ def quadratic(
         return jnp.concatenate([sensitivity, by_parameter], axis=1), score, square
 
     sensitivity, score, square = jax.vmap(columns)(
-        posterior.prev, posterior.next, posterior.kick, posterior.excess, here.by_force[:-1], here.by_parameter[:-1]
+        posterior.prev, posterior.next, posterior.kick, posterior.excess, linear.by_force[:-1], linear.by_parameter[:-1]
     )
-    inside = here.seq.active[:-1]
+    inside = linear.seq.active[:-1]
     score = jnp.sum(jnp.where(inside[:, None], score, 0.0), axis=0)
     score_q = jnp.sum(jnp.where(inside[:, None], square, 0.0), axis=0)
     miss = y[:, None] - read
@@ -133,14 +133,14 @@ def quadratic(
     weighed = jnp.where(observed, jnp.mean(miss, axis=1) / r[None], 0.0)
     rates = jnp.concatenate([posterior.prev, posterior.next[-1:]])[..., dof : 2 * dof]
     of_torque = jnp.zeros(nodes.size, score.dtype)
-    if here.reading_by_force is not None:
-        each = jnp.where(observed[:, None], miss / r[None, None], 0.0) @ here.reading_by_force / miss.shape[1]
+    if linear.reading_by_force is not None:
+        each = jnp.where(observed[:, None], miss / r[None, None], 0.0) @ linear.reading_by_force / miss.shape[1]
         of_torque = jnp.sum(jax.vmap(lambda v, pull: spread(nodes, v, pull))(rates, each), axis=0).ravel()
-    of_readings = jnp.einsum("to,top->p", weighed, here.reading_by_parameter)
+    of_readings = jnp.einsum("to,top->p", weighed, linear.reading_by_parameter)
     score = score + jnp.concatenate([of_torque, of_readings])
 
     def noise_filter(log_q, log_r):
-        filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+        filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
         return (filtered.innovation, filtered.log_variance), filtered
 
     (jac_e, jac_s), filtered = jax.jacfwd(noise_filter, argnums=(0, 1), has_aux=True)(log_q, log_r)
@@ -149,6 +149,6 @@ def quadratic(
     noise_information = jac_e.T @ jac_e + 0.5 * jac_s.T @ jac_s
 
     padded = jnp.concatenate([jnp.where(inside[:, None, None], sensitivity, 0.0), jnp.zeros_like(sensitivity[:1])])
-    jac = whitened_sensitivities(filtered, padded, reading_columns(nodes, rates, here), observed)
+    jac = whitened_sensitivities(filtered, padded, reading_columns(nodes, rates, linear), observed)
     jac = jac.reshape(-1, jac.shape[-1])
     return Quadratic(score, jac.T @ jac, jnp.concatenate([score_q, score_r]), noise_information)

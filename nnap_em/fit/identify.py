@@ -1,5 +1,6 @@
 """Identification: from a declared rig and its logs to a fitted model in one call."""
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
@@ -41,10 +42,16 @@ class Identified(NamedTuple):
     """Hypotheses of the start."""
     smoother: AbstractSmoother
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
-    unsaid: float = 0.0
+    discrepancy: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
     memory: str = ""
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
+
+    @property
+    def unsaid(self) -> float:
+        """Old name of `discrepancy`."""
+        warnings.warn("Identified.unsaid is now Identified.discrepancy", DeprecationWarning, stacklevel=2)
+        return self.discrepancy
 
     @property
     def model(self) -> StateSpaceModel:
@@ -156,7 +163,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
     now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
     stated = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
-    return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), unsaid=stated.unsaid)
+    return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

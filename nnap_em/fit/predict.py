@@ -139,7 +139,7 @@ def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
     data = jax.device_put(data)
     path, key = smooth(fitted, data).state, jax.random.key(1)
     phi = phi_samples(fitted, DRAWN, key=key)
-    more = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.unsaid, key=key)
+    more = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key)
     return each(_shown, fitted.model, (path._replace(cov=path.cov + more), data))
 
 

@@ -40,8 +40,12 @@ KIND = Kind(
 )
 
 
-LATER = ("/unsaid", "/m_step/rough", "/memory")
+LATER = ("/discrepancy", "/m_step/rough", "/memory")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
+
+
+RENAMED = {"/unsaid": "/discrepancy"}
+"""Plain numbers that files of before hold under another name."""
 
 
 MODEL, AFTER = "model.npz", "after.npz"
@@ -166,7 +170,10 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     rig = _rig(header["rig"])
     if rig.system not in systems:
         refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
-    leaves, settings = header["leaves"], header["settings"]
+    leaves, settings = (
+        {RENAMED.get(place, place): entry for place, entry in header["leaves"].items()},
+        header["settings"],
+    )
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')

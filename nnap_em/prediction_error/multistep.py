@@ -30,7 +30,7 @@ HORIZONS = (0.25, 0.5)
 """Horizons [s] at which errors are looked at."""
 JUDGED = (*HORIZONS, 1.0)
 """Horizons [s] at which a model is judged: what only bends the first half second fails later."""
-SOON = (0.05, 0.1)
+SHORT_HORIZONS = (0.05, 0.1)
 """Horizons [s] over which even a fast machine remains predictable."""
 SPACING = 0.05
 """Time [s] between starts."""
@@ -59,7 +59,7 @@ class Grid(eqx.Module):
         return np.arange(self.stride, rows - self.ages[-1], self.stride)
 
 
-class Forks(NamedTuple):
+class OpenLoop(NamedTuple):
     """Errors after every start, at every horizon, and the sensitivity of the predictions."""
 
     error: Float[np.ndarray, "seq start horizon obs"]
@@ -67,7 +67,7 @@ class Forks(NamedTuple):
     columns: Float[np.ndarray, "seq start horizon obs column"]
     """Derivatives by friction nodes, by parameters, then by the extra columns."""
     overlap: Float[np.ndarray, " horizon"]
-    """Number of forks that cover one moment."""
+    """Number of predictions that cover one moment."""
 
 
 def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Grid:
@@ -93,7 +93,7 @@ class Followed(NamedTuple):
 
     model: StateSpaceModel
     data: Dataset
-    here: Local
+    linear: Local
     middle: Float[Array, "seq time state"]
     """States halfway between a path and its next state by the model."""
     state: Float[Array, "seq time state"]
@@ -103,17 +103,17 @@ class Followed(NamedTuple):
 
 def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Followed:
     """`model` along the paths of all sequences."""
-    here, exact = _wide(model, prior, path, data)
-    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), here)
-    return Followed(model, data, here, 0.5 * (path.mean + exact), state, gain)
+    linear, exact = _wide(model, prior, path, data)
+    state, gain = each(_filtered, (model.log_q, model.log_r, model.start), linear)
+    return Followed(model, data, linear, 0.5 * (path.mean + exact), state, gain)
 
 
-def forks(
+def open_loop(
     along: Followed,
     weights: Weights,
     extra: Callable[[Int[np.ndarray, " some"]], Iterable[Columns]] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
-) -> Forks:
+) -> OpenLoop:
     """Multi-step errors of all sequences and their derivatives; `extra` returns blocks of more columns of some.
 
     Columns of all sequences, or of all candidates at six joints, would be gigabytes.
@@ -125,7 +125,7 @@ def forks(
         yield Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
 
     columns, see = [], channels(along.model)
-    for some, part in turns(len(along.state), along.here, along.gain, along.middle):
+    for some, part in turns(len(along.state), along.linear, along.gain, along.middle):
         found: list[np.ndarray] = []
         for block in (extra or none)(some):
             sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]
@@ -133,13 +133,13 @@ def forks(
             found.append(sens[..., own if found else 0 :])  # those of what is estimated once
         columns.append(np.concatenate(found, axis=-1))
     overlap = np.asarray(grid.ages) / grid.stride
-    return Forks(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
+    return OpenLoop(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
 
 
 def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
     """The errors alone [rad, or m]; NaN where there is none."""
     grid = _grid(along.model, along.data, horizons)
-    found = each(_errors, (along.model, grid), (along.state, along.here.seq))
+    found = each(_errors, (along.model, grid), (along.state, along.linear.seq))
     return np.asarray(found)[..., channels(along.model)]
 
 
@@ -156,11 +156,11 @@ def _wide(
     rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
     spread = jnp.concatenate([WIDE * HORIZONS[0] * rms, WIDE * rms, jnp.full(path.mean.shape[-1] - 2 * dof, 1e-6)])
     wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
-    here = locals_along(model, prior, wide, data, CUBATURE)
-    exact = each(_exact, model, (path.mean, here.seq.inputs))
-    offset = exact - jnp.einsum("stij,stj->sti", here.affine.matrix, path.mean)
-    affine = here.affine._replace(offset=offset, noise=jnp.zeros_like(here.affine.noise))
-    return here._replace(affine=affine), exact
+    linear = locals_along(model, prior, wide, data, CUBATURE)
+    exact = each(_exact, model, (path.mean, linear.seq.inputs))
+    offset = exact - jnp.einsum("stij,stj->sti", linear.affine.matrix, path.mean)
+    affine = linear.affine._replace(offset=offset, noise=jnp.zeros_like(linear.affine.noise))
+    return linear._replace(affine=affine), exact
 
 
 def _exact(model: StateSpaceModel, one) -> Float[Array, "time state"]:
@@ -168,10 +168,10 @@ def _exact(model: StateSpaceModel, one) -> Float[Array, "time state"]:
     return jax.vmap(model.transition)(*one)
 
 
-def _filtered(common, here: Local):
+def _filtered(common, linear: Local):
     """Filtered means and gains of one sequence about its path."""
     log_q, log_r, start = common
-    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
     return filtered.state.mean, filtered.gain
 
 
@@ -191,26 +191,28 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
 
 
 def read_columns(
-    nodes: Float[Array, "dof count"], here: Local, middle: Float[Array, "time state"], found: Columns
+    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], found: Columns
 ) -> Float[Array, "time obs column"]:
     """Change of the readings of one sequence by friction nodes, parameters and the columns `found`."""
     dof = nodes.shape[0]
-    own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], here), jnp.moveaxis(found.reading, 0, -1)
-    if here.reading_by_force is not None:
-        read = read + jnp.einsum("tod,ctd->toc", here.reading_by_force, found.force)
+    own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], linear), jnp.moveaxis(found.reading, 0, -1)
+    if linear.reading_by_force is not None:
+        read = read + jnp.einsum("tod,ctd->toc", linear.reading_by_force, found.force)
     return jnp.concatenate([own, read], axis=-1)
 
 
 def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     """Change of the predictions of one sequence by every column."""
-    (nodes, grid), (here, gain, middle, found) = common, one
+    (nodes, grid), (linear, gain, middle, found) = common, one
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
     dof = nodes.shape[0]
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], here.by_force)
-    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-    read = read_columns(nodes, here, middle, found)
-    push = jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter, moved], axis=-1), 0.0)
-    matrix, rows, gain, push, read = single((here.affine.matrix, here.reading.rows, gain, push, read))
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], linear.by_force)
+    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
+    read = read_columns(nodes, linear, middle, found)
+    push = jnp.where(
+        linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter, moved], axis=-1), 0.0
+    )
+    matrix, rows, gain, push, read = single((linear.affine.matrix, linear.reading.rows, gain, push, read))
 
     def absorb(s, slices):
         matrix, rows, gain, push, read = slices
@@ -272,7 +274,7 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
     return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
 
 
-def weighed(found: Forks, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
+def weighed(found: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
     """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
     error = np.where(used[:, None, None, None], found.error, np.nan)
     scale = robust_scale(error)
@@ -307,14 +309,14 @@ def finish(
     stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
     """
     best = followed(model, m_step.prior, path, data)
-    here = errors(best, JUDGED)
+    error = errors(best, JUDGED)
     for _ in range(STEPS):
         model = best.model
         weights = m_step.weights(model)
-        now = forks(best, weights)
-        weight = weighed(now, used)
+        predictions = open_loop(best, weights)
+        weight = weighed(predictions, used)
         keep = weight > 0
-        jac, e, w = now.columns[keep].astype(float), now.error[keep], weight[keep]
+        jac, e, w = predictions.columns[keep].astype(float), predictions.error[keep], weight[keep]
         score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
         start, nodes = weights.read(model), slice(weights.nodes.size)
         if shaped:
@@ -324,9 +326,9 @@ def finish(
         goal = _goal(weights, model.unknown, start, score, information)
         for share in (1.0, 0.5, 0.25):
             trial = followed(weights.write(model, start + share * (goal - start)), m_step.prior, path, data)
-            there = errors(trial, JUDGED)
-            if ratio(here, there, used) < 1 - FALLS:
-                best, here = trial, there
+            trial_error = errors(trial, JUDGED)
+            if ratio(error, trial_error, used) < 1 - FALLS:
+                best, error = trial, trial_error
                 break
         else:
             break

@@ -21,13 +21,13 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
     precision, pull = np.zeros((size, size)), np.zeros(size)
     count = nodes.shape[1]
     for j, v in enumerate(nodes):
-        here = slice(j * count, (j + 1) * count)
+        joint = slice(j * count, (j + 1) * count)
         top = np.abs(v).max()
         laws = np.stack([v / top, *(np.tanh(v / (r * top)) for r in KNEES)], axis=1)
         others = np.linalg.svd(laws)[0][:, laws.shape[1] :]  # what no sum of known laws can be
-        beside = others @ others.T / (SHAPE * np.sqrt(np.mean(value[here] ** 2)) + 1e-12) ** 2
-        precision[here, here] = beside + (1e-9 * np.trace(beside) / count + 1e-12) * np.eye(count)
-        pull[here] = beside @ value[here]
+        beside = others @ others.T / (SHAPE * np.sqrt(np.mean(value[joint] ** 2)) + 1e-12) ** 2
+        precision[joint, joint] = beside + (1e-9 * np.trace(beside) / count + 1e-12) * np.eye(count)
+        pull[joint] = beside @ value[joint]
     own = slice(nodes.size, size)
     precision[own, own] = np.eye(weights.prior.size)
     pull[own] = value[own]

@@ -21,7 +21,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
-from .multistep import Columns, Forks, followed, forks, read_columns, weighed
+from .multistep import Columns, OpenLoop, followed, open_loop, read_columns, weighed
 
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""
@@ -34,8 +34,8 @@ class Stated(NamedTuple):
 
     hessian: Float[Array, "weight weight"]
     """Posterior precision of the M-step's weights."""
-    unsaid: float
-    """Size of the forces that no part of the model describes, in the units of `unsaid`."""
+    discrepancy: float
+    """Size of the forces that no part of the model describes, in the units of `discrepancy_columns`."""
 
 
 class Errors(NamedTuple):
@@ -74,17 +74,17 @@ def widened(
     for the functions]
     """
     weights = m_step.weights(model)
-    other = unsaid(model, weights, path, data, used, key=key)
+    other = discrepancy_columns(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
-    now = forks(along, weights, lambda some: [jax.tree.map(lambda a: a[some], other)])
+    predictions = open_loop(along, weights, lambda some: [jax.tree.map(lambda a: a[some], other)])
     prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
-    here, scores = _rows(now, weighed(now, used), len(jac))
-    own = here.own @ jac
-    information = prior + own.T @ (here.weight[:, None] * own)
+    errors, scores = _rows(predictions, weighed(predictions, used), len(jac))
+    own = errors.own @ jac
+    information = prior + own.T @ (errors.weight[:, None] * own)
     scores = (scores[used] - scores[used].mean(axis=0)) @ jac
     count = len(scores)
-    force = size(here._replace(own=own), information)
-    shared = force * own.T @ (here.weight[:, None] * here.other)
+    force = size(errors._replace(own=own), information)
+    shared = force * own.T @ (errors.weight[:, None] * errors.other)
     sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
     strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
@@ -109,33 +109,33 @@ def of_states(
     The smoother is linear about its path: the mean square of what each draw moves there.
     """
     weights = m_step.weights(model)
-    other = unsaid(model, weights, path, data, np.ones(len(data.t), bool), key=key)
+    other = discrepancy_columns(model, weights, path, data, np.ones(len(data.t), bool), key=key)
     kicks = force * jax.random.normal(jax.random.fold_in(key, 1), (phi.shape[0], other.force.shape[1]), phi.dtype)
-    here = locals_along(model, m_step.prior, path, data, m_step.linearise)
+    linear = locals_along(model, m_step.prior, path, data, m_step.linearise)
     common = model.log_q, model.log_r, model.start, weights.nodes, jnp.concatenate([phi, kicks], axis=1)
-    return each(_moved, common, (here, path.mean, other))
+    return each(_moved, common, (linear, path.mean, other))
 
 
 def _moved(common, one) -> Float[Array, "time state state"]:
     """Change of one sequence."""
-    (log_q, log_r, start, nodes, draws), (here, mean, found) = common, one
+    (log_q, log_r, start, nodes, draws), (linear, mean, found) = common, one
     dof = nodes.shape[0]
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], here.by_force)
-    other = jnp.einsum("tsd,ctd->tsc", here.by_force, found.force)
-    pushed = jnp.concatenate([torque, here.by_parameter, other], axis=-1)
-    read = read_columns(nodes, here, mean, found)
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], linear.by_force)
+    other = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
+    pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)
+    read = read_columns(nodes, linear, mean, found)
     still = start._replace(mean=jnp.zeros_like(start.mean))
-    seq = here.seq._replace(y=jnp.zeros_like(here.seq.y))
+    seq = linear.seq._replace(y=jnp.zeros_like(linear.seq.y))
 
     def response(draw):
-        affine, reading = (a._replace(offset=b @ draw) for a, b in ((here.affine, pushed), (here.reading, read)))
+        affine, reading = (a._replace(offset=b @ draw) for a, b in ((linear.affine, pushed), (linear.reading, read)))
         return rts(kalman_filter(log_q, log_r, still, affine, reading, seq)).state.mean
 
     moved = jax.lax.map(response, draws)
     return jnp.einsum("kti,ktj->tij", moved, moved) / draws.shape[0]
 
 
-def unsaid(
+def discrepancy_columns(
     model: StateSpaceModel,
     weights: Weights,
     path: Gaussian,
@@ -163,27 +163,27 @@ def unsaid(
     return Columns(force, jnp.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
 
 
-def size(here: Errors, information: Float[np.ndarray, "own own"]) -> float:
+def size(errors: Errors, information: Float[np.ndarray, "own own"]) -> float:
     """Standard deviation tau of the strengths of `other`, at its largest likelihood.
 
     error = own x + tau other z + noise, with z standard normal and the size of the noise free; x is projected out as
     far as the prior lets it. Errors that no such force explains give zero.
     """
-    root = np.sqrt(here.weight)[:, None]
-    own, other, error = root * here.own, root * here.other, root[:, 0] * here.error
+    root = np.sqrt(errors.weight)[:, None]
+    own, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
     other, error = (a - own @ np.linalg.solve(information, own.T @ a) for a in (other, error))
     strength, turn = np.linalg.eigh(other.T @ other)
     strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
     if whole == 0.0 or not strength.any():
         return 0.0
     ratios = np.concatenate([[0.0], np.geomspace(SMALLEST, LARGEST, SIZES)])[:, None] / strength[-1]
-    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / here.rows
-    best = np.argmin(0.5 * here.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
+    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / errors.rows
+    best = np.argmin(0.5 * errors.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
     return math.sqrt(float(ratios[best, 0] * noise[best]))
 
 
 def _rows(
-    found: Forks, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
+    found: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
 ) -> tuple[Errors, Float[np.ndarray, "seq phi"]]:
     """The errors in a row, and the score of every sequence."""
     columns = np.where(weight[..., None] > 0, found.columns, 0.0).astype(float)

@@ -170,10 +170,10 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     rig = _rig(header["rig"])
     if rig.system not in systems:
         refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
-    leaves, settings = (
-        {RENAMED.get(place, place): entry for place, entry in header["leaves"].items()},
-        header["settings"],
-    )
+    stored: Mapping[str, Any] = header["leaves"]
+    leaves = {RENAMED.get(place, place): entry for place, entry in stored.items()}
+    arrays = {RENAMED.get(place, place): array for place, array in arrays.items()}
+    settings = header["settings"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')

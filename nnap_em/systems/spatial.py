@@ -1,7 +1,7 @@
 """Vectors and rotations of three as tuples of scalars; what is known to be 0 or 1 costs nothing.
 
 A number of the file is a Python float, all else a JAX scalar.  Nothing is stacked: inside one compiled loop an array of
-scalars is built anew for every entry that is read [docs/machines.md#speed].
+scalars is built anew for every entry that is read.
 """
 
 from typing import Any

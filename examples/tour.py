@@ -44,7 +44,7 @@ jax.config.update("jax_enable_x64", True)
 
 # %%
 cable = {"name": "torsional_spring", "joint": 1, "k": 30.0, "theta0": 0.05}
-case = plant.Case(system="slide", effects=(cable,), noise=(5e-4, 5e-3), sequences=8, tests=3, steps=100, seed=1)
+case = plant.Case(system="slide", effects=(cable,), noise=(5e-4, 5e-3), sequences=8, tests=3, steps=95, seed=1)
 folder = Path("out/tour/rig")
 plant.write(case, folder)
 print((folder / "rig.toml").read_text())
@@ -112,7 +112,7 @@ def errors(model):
     return nnap_em.horizon_errors(prediction, model, test.data, 0.4, horizons)
 
 
-horizons = (0.1, 0.2, 0.4, 0.6)
+horizons = (0.1, 0.2, 0.4, 0.5)
 error = {"horizons_s": horizons, "before": errors(closed.before), "after": errors(closed.after)}
 error_figure(error, names)
 

@@ -49,7 +49,7 @@ class Servo(eqx.Module):
     column: str = eqx.field(static=True)
     """Name of the command."""
     kind: str = eqx.field(static=True)
-    values: dict[str, Scalar]
+    values: dict[str, Float[Array, "..."]]
     """Numbers by their keys in rig.toml, in the units of `data/servo.py`; what is not there is none."""
     scales: tuple[tuple[str, int, float], ...] = eqx.field(static=True, default=())
     """Numbers that are proportional to columns of the logs: key, place of the column behind those of the inputs, and

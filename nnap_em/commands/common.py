@@ -153,8 +153,8 @@ def states_of(fitted: Identified, mean, std) -> Channel:
 def log_of(fitted: Identified, logs: Logs) -> Channel:
     """Inputs and readings of the logs as a channel, masked readings too."""
     data, names = logs.as_read, names_of(fitted)
-    values = np.concatenate([np.asarray(data.u), np.asarray(data.y)], axis=-1)
-    return Channel({name: names.unit(name) for name in logs.columns}, values)
+    values = np.concatenate([np.asarray(data.u)[..., : len(names.inputs)], np.asarray(data.y)], axis=-1)
+    return Channel({name: names.unit(name) for name in (*names.inputs, *names.measured)}, values)
 
 
 # --- runs that go on after a stop

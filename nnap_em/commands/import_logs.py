@@ -23,7 +23,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     began = time.perf_counter()
     with whole_folder(args.out) as part:
         rig = read_rig(args.rig, specs)
-        plan = read_plan(args.rig, (*rig.input_columns, *rig.measured))
+        plan = read_plan(args.rig, (*rig.logged_inputs, *rig.measured))
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:

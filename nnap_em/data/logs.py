@@ -21,6 +21,7 @@ from .rough import Rough, rough
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
 INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
+OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
 _REASONS = {
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
@@ -83,7 +84,7 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     sequences = [_sequence(table, each, rig) for table, each in zip(tables, entries, strict=True)]
     data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
     unmasked = pad([s.as_read for s in sequences]) if masked else None
-    return Logs(tuple(path.name for path in files), data, (*rig.input_columns, *rig.measured), masked, unmasked)
+    return Logs(tuple(path.name for path in files), data, (*rig.logged_inputs, *rig.measured), masked, unmasked)
 
 
 def check_split(train: Logs, test: Logs | None = None) -> None:
@@ -135,7 +136,7 @@ class _Table(NamedTuple):
     def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
         """The columns of readings up to some seconds after the first row."""
         early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
-        return dict(zip(rig.measured, self.table[early, 1 + len(rig.input_columns) :].T, strict=True))
+        return dict(zip(rig.measured, self.table[early, 1 + len(rig.logged_inputs) :].T, strict=True))
 
 
 def _limits(readings: Columns, entries: Sequence[Rough]) -> set[tuple[str, float]]:
@@ -153,20 +154,35 @@ class _Sequence(NamedTuple):
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    table = read_table(path, ("time", *rig.input_columns), rig.measured)
+    table = read_table(path, ("time", *rig.logged_inputs), rig.measured)
+    _check_scales(path, table, rig)
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
+
+
+def _check_scales(path: Path, table: Float[np.ndarray, "row column"], rig: Rig) -> None:
+    """Refuse columns that numbers of servos are proportional to where they are negative or in another unit."""
+    for name, scale in rig.input_scales.items():
+        for column, declared in scale.items():
+            values = table[:, 1 + rig.logged_inputs.index(column)]
+            if values[k := int(np.argmin(values))] < 0:
+                hint = f"{name} is proportional to it: write 0 or more, or take it out of `at`"
+                refuse(path, place(path, column, k), f"found {values[k]:g}", hint)
+            ratio = float(np.max(values)) / declared
+            if ratio > OTHER_UNIT or 0 < ratio < 1 / OTHER_UNIT:
+                problem = f"at most {np.max(values):g}, where rig.toml declares {name} at {declared:g}"
+                refuse(path, place(path, column), problem, "write both in one unit")
 
 
 def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     """One file, checked against the rig, without what was found in it."""
     path, table, masked = source.path, source.table, list(source.masked)
-    first = 1 + len(rig.input_columns)
+    first = 1 + len(rig.logged_inputs)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
     line = np.searchsorted(source.rows, np.arange(len(t)))  # of each row of the table, in the file
     y = read.copy()
     for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
-    inputs, readings = dict(zip(rig.input_columns, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
+    inputs, readings = dict(zip(rig.logged_inputs, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
     for finding in implausible(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
         if finding.ruins:
@@ -208,7 +224,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
     """The rows that the file lost, without readings; cut at the first gap where inputs cannot be interpolated."""
-    size, inputs = int(rows[-1]) + 1, slice(1, 1 + len(rig.input_columns))
+    size, inputs = int(rows[-1]) + 1, slice(1, 1 + len(rig.logged_inputs))
     if size == len(rows):
         return _Table(path, table, rows, [])
     full = np.full((size, table.shape[1]), np.nan)

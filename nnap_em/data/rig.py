@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, NoReturn
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds
 from .machine import machine_unit, unpacked
-from .servo import TORQUE, Drive, key_of, read_drives
+from .servo import AT, TORQUE, Drive, key_of, read_drives, scaled
 from .servo import keys as drive_keys
 from .servo import lines as drive_lines
 from .servo import named as drive_numbers
@@ -92,6 +92,7 @@ class Declaration(NamedTuple):
     input_joints: tuple[int, ...]
     machine: str = ""
     input_kinds: tuple[str, ...] = ()
+    input_scales: Mapping[str, Mapping[str, float]] = {}
 
 
 @dataclass(frozen=True)
@@ -113,11 +114,23 @@ class Rig:
     machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
     input_kinds: tuple[str, ...] = ()  # of `servo.KINDS`, one per column; none given: all are torques
     memory: bool = False  # True: friction may have a hidden state in each joint
+    # columns that a number of a servo ("goal.kp") is proportional to, each with its value where it is as declared
+    input_scales: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def kinds(self) -> dict[str, str]:
         """The kind of every input column."""
         return dict(zip(self.input_columns, self.input_kinds or (TORQUE,) * len(self.input_columns), strict=True))
+
+    @property
+    def scale_columns(self) -> tuple[str, ...]:
+        """Columns that numbers of servos are proportional to; they follow the inputs in a Dataset."""
+        return tuple(dict.fromkeys(column for scale in self.input_scales.values() for column in scale))
+
+    @property
+    def logged_inputs(self) -> tuple[str, ...]:
+        """Columns of the inputs of a Dataset."""
+        return (*self.input_columns, *self.scale_columns)
 
     @property
     def bodies(self) -> dict[str, Declared]:
@@ -151,9 +164,10 @@ class Rig:
 
     def __str__(self) -> str:
         words = {name: "" if kind == TORQUE else f" ({kind})" for name, kind in self.kinds.items()}
+        scales = [f"{name} by {' and '.join(scale)}" for name, scale in self.input_scales.items()]
         inputs = [
             f"{name}{word} on joint {j}" for (name, word), j in zip(words.items(), self.input_joints, strict=True)
-        ]
+        ] + scales
         noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}
         reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
         lines = [
@@ -201,12 +215,17 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         machine=declaration.machine,
         input_kinds=declaration.input_kinds,
         memory=model.text("friction") == "dynamic",
+        input_scales=declaration.input_scales,
     )
 
 
 def write_rig(rig: Rig, path: Path) -> None:
     """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
-    parameters = {name: repr(x.mean) if x.std == 0 else _pair(x) for name, x in rig.parameters.items()}
+    scales = {name: f", {AT} = {{ {_columns(scale)} }}" for name, scale in rig.input_scales.items()}
+    parameters = {
+        name: repr(x.mean) if x.std == 0 and name not in scales else _pair(x, scales.get(name, ""))
+        for name, x in rig.parameters.items()
+    }
     bodies = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
     lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
@@ -234,12 +253,16 @@ def write_rig(rig: Rig, path: Path) -> None:
     replace_text(path, "\n".join(lines) + "\n")
 
 
+def _columns(values: Mapping[str, float]) -> str:
+    """Columns and numbers as an inline table has them."""
+    return ", ".join(f"{toml_text(name)} = {value!r}" for name, value in values.items())
+
+
 def _part(rig: Rig) -> list[str]:
     """The joints of the file that move, and those that are held."""
     joints, locked = unpacked(rig.machine).part or (None, ())
     lines = [f"joints = [{', '.join(map(toml_text, joints))}]    # those that move"] if joints else []
-    values = ", ".join(f"{toml_text(name)} = {value!r}" for name, value in locked)
-    return [*lines, f"locked = {{ {values} }}    # rad or m"] if locked else lines
+    return [*lines, f"locked = {{ {_columns(dict(locked))} }}    # rad or m"] if locked else lines
 
 
 def toml_text(text: str) -> str:
@@ -318,9 +341,9 @@ class _Table:
             self.refuse(key, hint=f"write a finite number, {key} = 0.2")
         return float(value)
 
-    def quantity(self, key: str) -> Declared:
-        """A number (trusted) or { mean, std }."""
-        return self.declared(key) if isinstance(self.value(key), dict) else Declared(self.number(key), 0.0)
+    def quantity(self, key: str, optional: Collection[str] = ()) -> Declared:
+        """A number (trusted) or { mean, std }, which may have `optional` keys, too."""
+        return self.declared(key, optional) if isinstance(self.value(key), dict) else Declared(self.number(key), 0.0)
 
     def positive(self, key: str) -> float:
         value = self.number(key)
@@ -328,9 +351,9 @@ class _Table:
             self.refuse(key, hint=f"write a number above 0, {key} = 0.01")
         return value
 
-    def declared(self, key: str) -> Declared:
+    def declared(self, key: str, optional: Collection[str] = ()) -> Declared:
         pair = self.table(key)
-        pair.check(("mean", "std"))
+        pair.check(("mean", "std"), optional)
         if pair.number("std") < 0:
             pair.refuse("std", hint="write a standard deviation of 0 (trusted) or more")
         return Declared(pair.number("mean"), pair.number("std"))
@@ -377,7 +400,8 @@ def _declared(root: _Table, spec: SystemSpec) -> Declaration:
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
     parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
     columns, joints, drives = _input(root, model, spec)
-    return Declaration(spec, parameters | drive_numbers(drives), columns, joints, input_kinds=kinds_of(drives))
+    scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
+    return Declaration(spec, parameters | drive_numbers(drives), columns, joints, "", kinds_of(drives), scales)
 
 
 def kinds_of(drives: Mapping[str, Drive]) -> tuple[str, ...]:
@@ -434,5 +458,5 @@ def _limits(limits: Bounds) -> list[str]:
     ]
 
 
-def _pair(value: Declared) -> str:
-    return f"{{ mean = {value.mean!r}, std = {value.std!r} }}"
+def _pair(value: Declared, more: str = "") -> str:
+    return f"{{ mean = {value.mean!r}, std = {value.std!r}{more} }}"

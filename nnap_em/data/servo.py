@@ -38,6 +38,9 @@ KEYS = tuple(dict.fromkeys(key for keys in KINDS.values() for key in keys))
 RESERVED = ("columns", "joints", "kind", *KEYS)
 """Keys of [input]: a column that is called so can have no table of its own."""
 _LINE = 'kind = "position"'
+AT = "at"
+"""Key of the columns that a number is proportional to."""
+_AT = "at = { gain = 400.0 }: a column of the logs, and its value at which the number is as declared"
 
 
 class Drive(NamedTuple):
@@ -45,6 +48,8 @@ class Drive(NamedTuple):
 
     kind: str
     numbers: Mapping[str, Any]
+    scales: Mapping[str, Mapping[str, float]] = {}
+    """Columns that a number is proportional to, by its key, each with the value at which it is as declared."""
 
 
 def read_drives(table: Any, columns: Collection[str], given: Mapping[str, Drive] | None = None) -> dict[str, Drive]:
@@ -71,15 +76,17 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
     for key in own.items:
         if key != "kind" and key not in KINDS[kind]:
             own.refuse(key, f"an input of kind {kind!r} has no {key}", _possible(kind))
-    numbers = dict(given.numbers) if given.kind == kind else {}
+    numbers, scales = dict(given.numbers) if given.kind == kind else {}, {}
     for place in (table, own):
-        numbers |= {key: _number(place, key, about) for key, about in KINDS[kind].items() if key in place.items}
+        for key in KINDS[kind]:
+            if key in place.items:
+                numbers[key], scales[key] = _number(place, key, KINDS[kind][key]), _scale(place, key)
     for key, about in KINDS[kind].items():
         if about.needed and key not in numbers:
             problem = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
             hint = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
             (own if own.items else table).refuse(key, problem, hint)
-    return Drive(kind, numbers)
+    return Drive(kind, numbers, {key: scale for key, scale in scales.items() if scale})
 
 
 def keys(table: Any) -> tuple[str, ...]:
@@ -107,13 +114,39 @@ def _possible(kind: str) -> str:
 
 def _number(table: Any, key: str, about: Key) -> Any:
     """A number that such a drive can have."""
-    value = table.quantity(key)
+    value = table.quantity(key, (AT,))
     if about.least is not None and (value.mean < about.least or (about.open and value.mean == about.least)):
         bound = f"a number above {about.least:g}" if about.open else f"{about.least:g} or more"
         table.refuse(key, f"found {value.mean:g}", f"write {bound} [{about.unit}]")
     if key == "gain" and value.mean == 0:
         table.refuse(key, "found 0", "write the torque of a unit of the command [N m]")
     return value
+
+
+def _scale(table: Any, key: str) -> dict[str, float]:
+    """The columns that a number is proportional to, with their values at which it is as declared."""
+    value = table.items[key]
+    if not isinstance(value, dict) or AT not in value:
+        return {}
+    pair = table.table(key)
+    at = pair.table(AT) if isinstance(value[AT], dict) and value[AT] else pair.refuse(AT, None, f"write {_AT}")
+    if key == "delay":
+        pair.refuse(AT, "a delay is the same in all rows", "take it out")
+    for column in at.items:
+        if at.number(column) <= 0:
+            at.refuse(column, None, f"write the value of that column at which {key} is as declared, above 0")
+    return {column: at.number(column) for column in at.items}
+
+
+def scaled(drives: Mapping[str, Drive], taken: Collection[str], table: Any) -> dict[str, dict[str, float]]:
+    """Columns that numbers are proportional to, by the names of the numbers; refused are those `taken` by others."""
+    found = {f"{name}.{key}": dict(scale) for name, drive in drives.items() for key, scale in drive.scales.items()}
+    for name, scale in found.items():
+        for column in scale:
+            if column in taken:
+                hint = "name a column that holds a gain or a supply"
+                table.refuse(name, f"{AT}: {column!r} is the time, a state or an input", hint)
+    return found
 
 
 def named(drives: Mapping[str, Drive]) -> dict[str, Any]:

@@ -53,7 +53,8 @@ def limits_of(
     if not rig.input_columns:
         raise DesignError(f"rig {rig.name!r} has no input: there is nothing to design; declare its drive in [input]")
     names, dof = system.coordinates + system.rates, len(system.coordinates)
-    valid, u, mean = np.asarray(data.valid), np.asarray(data.u), path[..., : 2 * dof]
+    valid, mean = np.asarray(data.valid), path[..., : 2 * dof]
+    u = np.asarray(data.u)[..., : len(rig.input_columns)]
     reached = mean[valid & used[:, None] & np.isfinite(mean).all(axis=-1)]
     change = np.abs(np.diff(u, axis=1))[valid[:, 1:] & valid[:, :-1]] / rig.dt
     bounds = rig.limits

@@ -121,7 +121,8 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
             drive[joint - 1] = mass[joint - 1] * acceleration[joint - 1]
             continue
         if servos and servos[i].feeds_back:
-            given = torque_along(servos[i], given, system.gears[i] * y[..., rig.measured.index(position)], rig.dt)
+            q, scale = system.gears[i] * y[..., rig.measured.index(position)], u[..., len(servos) :]
+            given = torque_along(servos[i], given, q, scale, rig.dt)
         drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(given[valid] ** 2))
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
@@ -176,7 +177,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         log_r=jnp.asarray(2 * np.log(np.hypot(noise, shaken))),
         measured=tuple(places),
         dt=rig.dt,
-        substeps=min(max(SUBSTEPS, math.ceil(steps_of_sample(system, servos, rig.dt))), MOST_STEPS),
+        substeps=min(max(SUBSTEPS, math.ceil(steps_of_sample(system, servos, data, rig.dt))), MOST_STEPS),
         servos=servos or None,
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)

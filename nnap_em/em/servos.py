@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..data.servo import KINDS
 from ..model import hooks
@@ -26,18 +27,24 @@ def build_servos(rig: Rig) -> tuple[Servo, ...]:
 
     def servo(column: str, kind: str) -> Servo:
         there = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
-        return Servo(column, kind, {key: numbers[f"{column}.{key}"] for key in there})
+        values = {key: numbers[f"{column}.{key}"] for key in there}
+        scales = ((key, rig.input_scales.get(f"{column}.{key}", {})) for key in values)
+        flat = tuple((key, rig.scale_columns.index(name), at) for key, scale in scales for name, at in scale.items())
+        return Servo(column, kind, values, flat)
 
     return tuple(servo(*pair) for pair in rig.kinds.items()) if rig.input_kinds else ()
 
 
-def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], dt: float) -> float:
+def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], data: Dataset, dt: float) -> float:
     """Integration steps that a sample needs, by the fastest eigenvalue of the machine under its servos.
 
-    Of M a = -K q - D v at rest in some poses, K and D the slopes of the torques.
+    Of M a = -K q - D v at rest in some poses, K and D the slopes of the torques at the largest gains in the logs.
     """
     if not servos:
         return 0.0
+    scale = np.asarray(data.u)[np.asarray(data.valid), len(servos) :]
+    largest = jnp.asarray(scale.max(axis=0), float) if scale.size else None
+    servos = tuple(servo.at(largest) for servo in servos)
     dof = len(system.coordinates)
     q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
     slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
@@ -58,7 +65,11 @@ def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -
 
 
 def torque_along(
-    servo: Servo, u: Float[np.ndarray, "seq time"], q: Float[np.ndarray, "seq time"], dt: float
+    servo: Servo,
+    u: Float[np.ndarray, "seq time"],
+    q: Float[np.ndarray, "seq time"],
+    scale: Float[np.ndarray, "seq time column"],
+    dt: float,
 ) -> Float[np.ndarray, "seq time"]:
     """Torque of a servo at logged commands and positions of the motor's side [N m, or N]; NaN where none is read.
 
@@ -66,6 +77,8 @@ def torque_along(
     """
     ahead = np.concatenate([q[:, LAG:], np.repeat(q[:, -1:], LAG, axis=1)], axis=1)
     behind = np.concatenate([np.repeat(q[:, :1], LAG, axis=1), q[:, :-LAG]], axis=1)
-    fed = jax.vmap(lambda u: servo.fed(u, dt))(jnp.asarray(u, float))
-    each = jax.vmap(jax.vmap(servo.torque))
-    return np.asarray(each(fed, jnp.asarray(q, float), jnp.asarray((ahead - behind) / (2 * LAG * dt), float)))
+    columns = jnp.asarray(scale, float) if scale.size else None
+    fed = jax.vmap(lambda u, scale: servo.at(scale).fed(u, dt))(jnp.asarray(u, float), columns)
+    each = jax.vmap(jax.vmap(lambda scale, *row: servo.at(scale).torque(*row)))
+    rate = jnp.asarray((ahead - behind) / (2 * LAG * dt), float)
+    return np.asarray(each(columns, fed, jnp.asarray(q, float), rate))

@@ -203,7 +203,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
         later = place not in settings and (
-            "/effects/" in place or place.endswith(("/angles", "/branching"))
+            "/effects/" in place or place.endswith(("/angles", "/branching", "/scales"))
         )  # its default
         if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")

@@ -69,7 +69,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     except RigError:
         return [CheckResult(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
-    if stiff := list(_stiff(rig, system)):
+    if stiff := list(_stiff(rig, system, data)):
         return [*amount, *stiff]
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
@@ -180,7 +180,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     needed = gravity + mass * scales.acceleration
     servos = build_servos(rig)
     yield from drives(rig, system, data, needed, gravity)
-    inputs = np.moveaxis(np.asarray(data.u), -1, 0)
+    inputs = np.moveaxis(np.asarray(data.u), -1, 0)[: len(rig.input_columns)]
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
         if rig.kinds[name] != TORQUE:
             continue
@@ -235,9 +235,9 @@ def drives(
             )
 
 
-def _stiff(rig: Rig, system: AbstractSystem) -> Iterator[CheckResult]:
+def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:
     """A servo that no integration step of a sample can follow."""
-    steps = steps_of_sample(system, build_servos(rig), rig.dt)
+    steps = steps_of_sample(system, build_servos(rig), data, rig.dt)
     if steps > MOST_STEPS:
         text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
         yield CheckResult(BAD, "servo", f"{text}: look at the units of its gains, or sample faster")

@@ -77,7 +77,7 @@ def _columns(
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v, a = (jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, dof)), float) for _ in range(3))
     u = jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, len(system.joints))), float)
-    servos = tuple(unlimited(servo) for servo in servos)
+    servos = tuple(unlimited(servo.at(None)) for servo in servos)
     own = [name for name in names if any(name == f"{s.column}.{key}" for s in servos for key in s.values)]
 
     def driven(system, servos, q, v, u):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
 from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
-from ..data.servo import TORQUE, Drive, read_drives
+from ..data.servo import TORQUE, Drive, read_drives, scaled
 from ..data.servo import keys as drive_keys
 from ..data.servo import named as drive_numbers
 from .mjcf import Part, read_machine
@@ -43,7 +43,8 @@ def declare(root: Any) -> Declaration:
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
-    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives))
+    scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
+    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives), scales)
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:

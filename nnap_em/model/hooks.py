@@ -24,10 +24,18 @@ def reaching(
 
 
 def fed(
-    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, u: Float[Array, "time input"], dt: float
+    effects: Effects,
+    servos: Sequence[Servo],
+    system: AbstractSystem,
+    u: Float[Array, "time input"],
+    dt: float,
+    scale: Float[Array, "time column"] | None = None,
 ) -> Float[Array, "time input"]:
-    """Values that the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`)."""
-    given = jnp.stack([servo.fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
+    """Values that the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`).
+
+    `scale` are the columns that numbers of the servos are proportional to (`Servo.at`).
+    """
+    given = jnp.stack([servo.at(scale).fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
     return late(effects, servos, system, given, dt)
 
 
@@ -52,11 +60,12 @@ def driven(
     u: Float[Array, " input"],
     q: Float[Array, " dof"],
     v: Float[Array, " dof"],
+    scale: Float[Array, " column"] | None = None,
 ) -> Float[Array, " input"]:
     """Torque of every drive at one moment, with the effects that take none [N m, before the gear]."""
     torques = []
     for i, (joint, gear, servo) in enumerate(zip(system.joints, system.gears, servos, strict=True)):
-        torque = servo.torque(u[i], gear * q[joint - 1], gear * v[joint - 1])
+        torque = servo.at(scale).torque(u[i], gear * q[joint - 1], gear * v[joint - 1])
         for effect in effects:
             if effect.joint == joint:
                 torque = effect.drive(torque)

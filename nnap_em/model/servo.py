@@ -49,13 +49,29 @@ class Servo(eqx.Module):
     column: str = eqx.field(static=True)
     """Name of the command."""
     kind: str = eqx.field(static=True)
-    values: dict[str, Scalar]
+    values: dict[str, Float[Array, "..."]]
     """Numbers by their keys in rig.toml, in the units of `data/servo.py`; what is not there is none."""
+    scales: tuple[tuple[str, int, float], ...] = eqx.field(static=True, default=())
+    """Numbers that are proportional to columns of the logs: key, place of the column behind those of the inputs, and
+    the value of that column at which the number is as declared."""
 
     def with_values(self, values: Mapping[str, Scalar]) -> "Servo":
         """The drive with other numbers, those of `values` that are its own, by their names in the rig ("goal.kp")."""
         own = {key: values.get(f"{self.column}.{key}", value) for key, value in self.values.items()}
         return replace(self, values=own)
+
+    def at(self, columns: Float[Array, "*time column"] | None) -> "Servo":
+        """The drive with its numbers as the columns that scale them stand, in one row or in all.
+
+        Where there are no such columns, the numbers are as declared.
+        """
+        if not self.scales:
+            return self
+        values = dict(self.values)
+        if columns is not None:
+            for key, place, declared in self.scales:
+                values[key] = values[key] * columns[..., place] / declared
+        return replace(self, values=values, scales=())
 
     @property
     def feeds_back(self) -> bool:

@@ -34,6 +34,8 @@ class Inputs(NamedTuple):
     """The clock in the middle of the step [s]."""
     age: Float[Array, "*time"]
     """Since the first row [s]."""
+    scale: Float[Array, "*time column"] | None = None
+    """Columns that numbers of servos are proportional to; None where there are none."""
 
     @classmethod
     def held(cls, u: Float[Array, " input"]) -> "Inputs":
@@ -80,19 +82,21 @@ class StateSpaceModel(AbstractModel):
 
     def inputs(self, seq: Dataset) -> Inputs:
         """External inputs in every row, as the effects change them."""
-        u, t = jnp.asarray(seq.u), jnp.asarray(seq.t)
+        u, t, scale = jnp.asarray(seq.u), jnp.asarray(seq.t), None
         if self.servos:
-            u = hooks.fed(self.effects, self.servos, self.system, u, self.dt)
+            drives = len(self.servos)
+            scale = u[:, drives:] if u.shape[1] > drives else None
+            u = hooks.fed(self.effects, self.servos, self.system, u[:, :drives], self.dt, scale)
         else:
             u = hooks.reaching(self.effects, self.system, u, self.dt)
-        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1])
+        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale)
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
         """State of the machine at one moment, as effects get it."""
         dof = len(self.system.coordinates)
         q, v = x[:dof], x[dof : 2 * dof]
         system = hooks.machine(self.effects, self.system, u.time)
-        torque = hooks.driven(self.effects, self.servos, system, u.u, q, v) if self.servos else u.u
+        torque = hooks.driven(self.effects, self.servos, system, u.u, q, v, u.scale) if self.servos else u.u
         return Scene(system, q, v, system.drive(torque), u.time, self.unknown(v), self.unknown)
 
     def driving(
@@ -103,10 +107,11 @@ class StateSpaceModel(AbstractModel):
             return jax.vmap(self.system.drive)(hooks.reaching(effects, self.system, u.u, self.dt))
         fed, dof = hooks.late(effects, servos, self.system, u.u, self.dt), len(self.system.coordinates)
 
-        def at(x: Float[Array, " state"], fed: Float[Array, " input"]) -> Float[Array, " dof"]:
-            return self.system.drive(hooks.driven(effects, servos, self.system, fed, x[:dof], x[dof : 2 * dof]))
+        def at(x: Float[Array, " state"], fed: Float[Array, " input"], scale) -> Float[Array, " dof"]:
+            q, v = x[:dof], x[dof : 2 * dof]
+            return self.system.drive(hooks.driven(effects, servos, self.system, fed, q, v, scale))
 
-        return jax.vmap(at)(x, fed)
+        return jax.vmap(at)(x, fed, u.scale)
 
     def rate(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> Float[Array, " state"]:
         """Time derivative of the state under inputs u and an extra generalised force [N m]."""

@@ -150,7 +150,8 @@ def discrepancy_columns(
     """
     dof = len(model.system.coordinates)
     known = jnp.asarray(data.valid & used[:, None])[..., None]
-    signals = jnp.concatenate([path.mean[..., : 2 * dof], jnp.nan_to_num(jnp.asarray(data.u))], axis=-1)
+    u = jnp.nan_to_num(jnp.asarray(data.u)[..., : len(model.system.joints)])
+    signals = jnp.concatenate([path.mean[..., : 2 * dof], u], axis=-1)
     seen = jnp.where(known, signals, jnp.nan)
     spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)
     unit = (signals - jnp.nanmean(seen, axis=(0, 1), keepdims=True)) / jnp.where(spread > 0, spread, 1.0)

@@ -80,7 +80,7 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
     """
     source = reader(path)
     topics = source.topics(path)
-    addresses = resolve(path, topics, rig.input_columns, rig.measured, plan.columns)
+    addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
     twins = {f"{name}'": declared_at(path, topics, at, name) for name, at in plan.duplicates.items()}
     every = addresses | twins
     for topic in shifts:
@@ -123,7 +123,7 @@ def _gridded(
     signals: Mapping[str, Signal],
     facts: tuple[TopicFacts, ...],
 ) -> Resampled:
-    inputs = {name: signals[name] for name in rig.input_columns}
+    inputs = {name: signals[name] for name in rig.logged_inputs}
     readings = {name: signals[name] for name in rig.measured}
     start, end = _common(recording.path, inputs, readings, rig.dt)
     _fine(recording.path, readings, rig.dt)

@@ -38,7 +38,8 @@ def _agrees(function, **arguments: Float[Array, "..."]) -> str:
 def test_every_effect_of_the_catalogue(name):
     model = with_effects(MODEL, (CANDIDATES[name],))
     x = jnp.asarray(np.random.default_rng(0).normal(scale=3.0, size=model.log_q.shape[0]))
-    row = Inputs(jnp.asarray([0.2]), jnp.asarray([0.1]), jnp.asarray(1.0), jnp.asarray(1.0))._asdict()
+    inputs = Inputs(jnp.asarray([0.2]), jnp.asarray([0.1]), jnp.asarray(1.0), jnp.asarray(1.0))
+    row = {name: value for name, value in inputs._asdict().items() if value is not None}
 
     def rate(x, force, *row):
         return (model.rate(x, Inputs(*row), force),)

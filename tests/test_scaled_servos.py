@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.logs import DataError, read_logs
+from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.em.build import build_system
 from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
@@ -172,6 +172,15 @@ def test_a_mistake_in_a_log_is_refused_with_row_and_column(tmp_path, case):
     with pytest.raises(DataError, match=message) as error:
         read_logs(_log(tmp_path, **wrong), rig)
     assert "a.csv" in str(error.value)
+
+
+@pytest.mark.parametrize("ratio", [OTHER_UNIT, 1 / OTHER_UNIT])
+def test_a_column_may_be_far_from_its_declared_value_but_not_in_another_unit(tmp_path, ratio):
+    """One percent to either side of the largest and the smallest ratio."""
+    rig, more = _rig(tmp_path, KP), 1.01 if ratio > 1 else 1 / 1.01
+    assert read_logs(_log(tmp_path, supply=7.4 * ratio / more), rig).data.u.shape[-1] == 3
+    with pytest.raises(DataError, match="write both in one unit"):
+        read_logs(_log(tmp_path, supply=7.4 * ratio * more), rig)
 
 
 def test_a_log_without_the_column_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from nnap_em.storage.journal import Journal, keeping
 
 TOUR = Path(__file__).resolve().parents[1] / "examples" / "tour.py"
 SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
-"""Of the design, whose quality `test_design.py` holds."""
+"""Small effort of the design search: `test_design.py` tests the quality of a design."""
 
 
 def _cells():

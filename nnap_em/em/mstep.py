@@ -53,7 +53,7 @@ class Core(NamedTuple):
 
 
 def between(origin: Any, target: Any, share: float) -> Any:
-    """A model, or a part of one, a share of the way from `here` to `there`."""
+    """A model, or a part of one, a share of the way from `origin` to `target`."""
     return _between(*at_home((origin, target, jnp.asarray(share, jnp.result_type(float)))))
 
 

@@ -116,7 +116,7 @@ def test_columns_are_difference_quotients(question, known, name):
 
 
 def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
-    """Columns of a model with a free function, whose parameters are many under one name, come in order, in blocks, too."""
+    """Columns in blocks are those of one block, also where a free function has many parameters under one name."""
     _, q = question
     around = surroundings(question[0], q.model, q.data, q.path, ROWS)
     free = next(c for c in catalogue["unknown_function"].candidates(around) if len(c.probes) > 5)

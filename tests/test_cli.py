@@ -87,7 +87,7 @@ def fit(bench) -> Path:
 
 def test_help_shows_examples_and_loads_no_jax():
     code = """
-import sys, time
+import sys
 from nnap_em.commands import cli
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
@@ -95,7 +95,6 @@ for command in ("", "simulate", "init", "check", "identify", "diagnose", "compar
     except SystemExit as stop:
         assert stop.code == 0
 assert not {"jax", "numpy", "equinox", "matplotlib"} & set(sys.modules)
-assert time.process_time() < 0.5
 """
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr

@@ -103,7 +103,7 @@ def test_a_sixth_is_trimmed_at_either_end():
 
 def test_one_fit_is_ahead_of_another_by_what_it_is_likelier():
     one, other = (_emstate(MODEL, top) for top in (5.0, 3.0))
-    assert ahead(one, other) == pytest.approx(12.0)
+    assert ahead(one.top, other.top) == pytest.approx(12.0)
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
@@ -196,6 +196,7 @@ def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypat
 
     smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
     monkeypatch.setattr(context_of, "fit", fit)
+    monkeypatch.setattr(context_of, "_afresh", lambda *_: None)
     monkeypatch.setattr(context_of, "smooth", lambda *_: (smoothed, np.ones(6, bool)))
     monkeypatch.setattr(context_of, "followed", lambda *_: None)
     monkeypatch.setattr(context_of, "errors", lambda *_: None)

@@ -67,6 +67,11 @@ class Schedule(eqx.Module):
     hold: int = eqx.field(static=True, default=2)
     """Epochs at a horizon before it grows; the first horizon lasts one more."""
 
+    @property
+    def at_first(self) -> int:
+        """Epochs at the first horizon."""
+        return self.hold + 1
+
     def horizon(self, epoch: int, longest: int) -> int:
         """Samples seen in `epoch`, counted from 0."""
         return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))

@@ -1,0 +1,51 @@
+"""A fit over the whole length goes on from friction that was fitted before, or from none where that is likelier."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rod
+
+from nnap_em.diagnose.context import EFFORT, SearchContext, extend
+from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnose.losses import OneStep
+from nnap_em.fit.identify import friction_table, identify
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """Friction of a rod, and the logs."""
+    data = rod.logs(0)
+    return identify(rod.rig(tmp_path_factory.mktemp("rod"), pendulum=True), data, key=jax.random.key(0)), data
+
+
+def _extended(fitted, model):
+    """A fit that goes on from `model`, and what it logs."""
+    (before, data), lines = fitted, []
+    context = SearchContext(before, {}, data, OneStep(), EFFORT, lines.append)
+    return extend(context, Hypothesis(model, before.m_step), rod.ROWS), lines
+
+
+def test_friction_too_steep_for_the_integration_is_left(fitted):
+    """Of 200 N m from .02 rad/s on, no step of the fit leads back to .1 N m and .05 N m s/rad."""
+    before, _ = fitted
+    weights = before.m_step.weights(before.model)
+    w = weights.read(before.model)
+    phi = weights.phi(before.model.unknown, w)
+    steep = -200 * jnp.tanh(weights.nodes.ravel() / 0.02) - phi
+    precise = 1e4 * jnp.eye(phi.size)
+    model = weights.write(before.model, weights.fit(before.model.unknown, w, precise @ steep, precise, 500))
+    assert abs(float(model.unknown(jnp.ones(1))[0])) > 100
+    state, lines = _extended(fitted, eqx.tree_at(lambda m: m.log_q, model, model.log_q + 8))
+    assert any("friction from its start" in line for line in lines)
+    v = np.array([[-4.0, -1.0, -0.3, 0.3, 1.0, 4.0]])
+    table = friction_table(before._replace(state=state), jnp.asarray(v))
+    np.testing.assert_allclose(table.torque, -0.05 * v - 0.1 * np.tanh(v / 0.1), atol=0.01)
+
+
+def test_friction_that_is_right_is_gone_on_from(fitted):
+    before, _ = fitted
+    state, lines = _extended(fitted, before.model)
+    assert len(lines) == 1
+    assert np.nanmean(state.top) == pytest.approx(np.nanmean(before.state.top), abs=0.5)

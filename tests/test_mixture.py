@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.em.loop import DIVERGED, _replaced, e_step
+from nnap_em.em.loop import _replaced, e_step
 from nnap_em.fit.branches import APART, branches, modes
 from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
@@ -191,16 +191,18 @@ def test_the_likelier_side_is_the_one_of_the_grid():
     assert first.loglik[1] < found.loglik[1] - 5  # it was on the other side
 
 
-def test_a_second_path_that_diverged_is_not_taken():
-    """One nat to either side of the fall that a linearisation about another path may explain; no number is worse."""
-    model, data = _model(), _logs([1, -1, 1], 0)
+def test_the_likelier_of_both_paths_is_taken():
+    """Each by the model linearised about itself, one nat to either side; no number is less likely than any."""
+    model, data = _model(), _logs([1, -1, 1, -1], 0)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
-    fall = jnp.asarray([DIVERGED - 1, DIVERGED + 1, jnp.nan])
-    second = first._replace(loglik=first.loglik - fall, state=jax.tree.map(lambda a: a + 1, first.state))
-    found = _replaced(first, second, np.arange(3))
+    loglik = first.loglik + 30.0  # the first smoother's own are of models linearised about other paths
+    second = first._replace(
+        loglik=loglik + jnp.asarray([1.0, -1.0, jnp.nan, -1.0]), state=jax.tree.map(lambda a: a + 1, first.state)
+    )
+    found = _replaced(first, second, loglik.at[3].set(jnp.nan), np.arange(4))
     moved = np.asarray(found.state.mean - first.state.mean)[:, 0, 0]
-    np.testing.assert_array_equal(moved, [1.0, 0.0, 0.0])
-    np.testing.assert_array_equal(found.loglik[1:], first.loglik[1:])
+    np.testing.assert_allclose(moved, [1.0, 0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_array_equal(found.loglik[1:3], first.loglik[1:3])
 
 
 def test_two_sides_that_nothing_decides_are_both_reported():

@@ -47,14 +47,6 @@ class EMState(NamedTuple):
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
 
 
-DIVERGED = 100.0
-"""Fall of the log-likelihood [nat] beyond which the relinearisations of a second smoother have diverged.
-
-That of the first one is of a model linearised about another path, and may be too high: by 72 on a real double pendulum
-whose second path was nearer to the encoder (.10 rad, .16 before).  On simulations diverged paths lost 360 and more.
-"""
-
-
 class FitError(RuntimeError):
     """EM cannot go on: every sequence is lost."""
 
@@ -104,7 +96,8 @@ def _seconded(model: AbstractModel, data: Dataset, second: AbstractBranching | N
     if second is None or not some.size:
         return first
     for few, batch in turns(len(some), *jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))):
-        first = _replaced(first, each(_likeliest_path, (model, second), batch), some[few])
+        path, loglik = each(_likeliest_path, (model, second), batch)
+        first = _replaced(first, path, loglik, some[few])
     return first
 
 
@@ -118,17 +111,22 @@ def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray
     return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
 
-def _likeliest_path(common, one) -> Posterior:
+def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:
+    """The likeliest path of the second smoother, and the likelihood of that of the first, each linearised about itself.
+
+    A relinearisation may diverge, so that the path it began from is compared, too.
+    """
     (model, second), (seq, first) = common, one
-    paths = second.paths(model, prepare(model, seq), first)
-    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths)
+    ready = prepare(model, seq)
+    paths = second.paths(model, ready, first)
+    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths), second.loglik(model, ready, first)
 
 
 @eqx.filter_jit
-def _replaced(first: Posterior, second: Posterior, index) -> Posterior:
-    """`second` at the places `index` of `first`, where it has not diverged."""
+def _replaced(first: Posterior, second: Posterior, loglik: Float[Array, " some"], index) -> Posterior:
+    """`second` at the places `index` of `first`, where it is likelier than these are by their `loglik`."""
     pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
-    known = second.loglik > first.loglik[index] - DIVERGED
+    known = second.loglik > jnp.where(jnp.isnan(loglik), -jnp.inf, loglik)
     second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
     return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
 

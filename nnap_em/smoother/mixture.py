@@ -179,7 +179,7 @@ class MixtureSmoother(AbstractBranching):
     """Places of the angles in the state."""
     linearise: Tangent | Cubature
     iterations: int = eqx.field(static=True, default=4)
-    """Relinearisations about a smoothed path, the last of which gives its likelihood.
+    """Relinearisations about a smoothed path; one more, about the last path, gives its likelihood.
 
     One is too few to compare paths: on a real double pendulum the likelihood of a diverged path was 27 nats above that
     of the right one after the first, and 60 nats below it after the second.
@@ -220,9 +220,13 @@ class MixtureSmoother(AbstractBranching):
                 return filtered, rts(filtered)
 
             posterior = linear_posterior(*jax.lax.fori_loop(0, self.iterations, again, (filtered, smoothed)))
-            return posterior._replace(loglik=jnp.where(here, posterior.loglik, -jnp.inf))
+            return posterior._replace(loglik=jnp.where(here, self.loglik(model, seq, posterior.state), -jnp.inf))
 
         return jax.vmap(follow)(paths, smoothed, here)
+
+    def loglik(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> Float[Array, ""]:
+        """Log-likelihood of the readings by the model linearised about `path`."""
+        return relinearised(model, path, seq, self.linearise).loglik
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""

@@ -82,8 +82,12 @@ class AbstractBranching(AbstractSmoother):
     @abstractmethod
     def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
         """The posterior about each of several paths, and about the path `first`, with a leading axis; the likelihood is
-        -inf where there is none.
+        that of the model linearised about the path itself, and -inf where there is none.
         """
+
+    @abstractmethod
+    def loglik(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> Float[Array, ""]:
+        """Log-likelihood of the readings by the model linearised about `path`."""
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

@@ -953,8 +953,8 @@ MUTANTS = (
     Mutant(
         "the fit that is behind wins",
         "diagnose/context.py",
-        "np.nan_to_num(a.top, nan=-1e3) - np.nan_to_num(b.top, nan=-1e3)",
-        "np.nan_to_num(b.top, nan=-1e3) - np.nan_to_num(a.top, nan=-1e3)",
+        "np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3)",
+        "np.nan_to_num(b, nan=-1e3) - np.nan_to_num(a, nan=-1e3)",
         "test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier",
     ),
     Mutant(

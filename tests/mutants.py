@@ -392,8 +392,8 @@ MUTANTS = (
     Mutant(
         "rest of a law at another joint",
         "diagnose/keys.py",
-        "own == its and one.joint == other.joint",
-        "own == its",
+        "first == second and one.joint == other.joint",
+        "first == second",
         "test_search.py::test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint",
     ),
     Mutant(
@@ -869,8 +869,8 @@ MUTANTS = (
     Mutant(
         "nuisance not projected out of the columns",
         "diagnose/screen.py",
-        "own - nuisance @ solve(nuisance.T @ own)",
-        "own",
+        "candidates - nuisance @ solve(nuisance.T @ candidates)",
+        "candidates",
         "test_shares.py::test_the_nuisance_is_projected_out_by_ridge_regression",
     ),
     Mutant(
@@ -981,8 +981,8 @@ MUTANTS = (
     Mutant(
         "laws of one cause leave the question open",
         "diagnose/rounds.py",
-        "own.isdisjoint(its)",
-        "not own.isdisjoint(its)",
+        "of_best.isdisjoint(of_one)",
+        "not of_best.isdisjoint(of_one)",
         "test_rounds.py::test_laws_of_other_causes_that_explain_the_same_leave_the_question_open",
     ),
     Mutant(
@@ -1016,7 +1016,7 @@ MUTANTS = (
     Mutant(
         "one-step errors decide where innovations are not white",
         "diagnose/search.py",
-        "white = white_innovations(_outcome(context.before, found.now, found.state), context.data)",
+        "white = white_innovations(_outcome(context.before, searched.hypothesis, searched.state), context.data)",
         "white = True",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
@@ -1072,8 +1072,8 @@ MUTANTS = (
     Mutant(
         "errors that overlap count in full",
         "diagnose/screen.py",
-        "np.maximum(len(rows.error) / rows.overlap, directions[some] + 2)",
-        "np.maximum(len(rows.error), directions[some] + 2)",
+        "np.maximum(len(rows.error) / rows.overlap, directions[indices] + 2)",
+        "np.maximum(len(rows.error), directions[indices] + 2)",
         "test_shares.py::test_errors_that_overlap_count_for_less",
     ),
     Mutant(
@@ -1086,8 +1086,8 @@ MUTANTS = (
     Mutant(
         "recordings of one motion are evidence of each other",
         "diagnose/folds.py",
-        "if difference < REPEATS * own:",
-        "if difference < 0 * own:",
+        "if difference < REPEATS * square:",
+        "if difference < 0 * square:",
         "test_shares.py::test_recordings_of_one_motion_are_left_out_together",
     ),
     Mutant(

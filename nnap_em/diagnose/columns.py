@@ -48,11 +48,11 @@ def _track(null: StateSpaceModel, one) -> Track:
     dof = len(null.system.coordinates)
     still = jnp.zeros(dof, mean.dtype)
     rate = jax.vmap(lambda x, u: null.rate(x, u, still))
-    now = rate(mean, inputs)
-    middle = mean + 0.5 * null.dt * now
+    rates = rate(mean, inputs)
+    middle = mean + 0.5 * null.dt * rates
     acceleration = rate(middle, inputs)[:, dof : 2 * dof]
     along = lambda x, rate, u: jax.jvp(lambda x: null.true(x, u), (x,), (rate,))  # noqa: E731
-    true, past = jax.vmap(along)(mean, now, inputs)
+    true, past = jax.vmap(along)(mean, rates, inputs)
     past = past.at[0].set(0.0)  # the first row has none
     drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, inputs)
     friction = jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
@@ -166,16 +166,16 @@ def candidate_columns(
 
     def along(track: Track) -> Columns:
         length = track.x.shape[1]
-        more = [(0, 0), (0, max(0, rows - length))]
-        longer = lambda a: np.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
+        padding = [(0, 0), (0, max(0, rows - length))]
+        longer = lambda a: np.pad(a, padding + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
         track = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
         force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):
-                for full, own in ((force, columns.force), (reading, columns.reading)):
-                    full[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
+                for full, values in ((force, columns.force), (reading, columns.reading)):
+                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places), :length]
         return Columns(force, reading)
 
     return along

@@ -134,9 +134,9 @@ def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: Sta
 
 def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSystem) -> bool:
     """True for laws of another kind and of other signals."""
-    own, its = (set(effect.signals(system)) for effect in (best, one))
-    alike = one.named and one.name == best.name
-    return not alike and bool(own and its) and own.isdisjoint(its)
+    of_best, of_one = (set(effect.signals(system)) for effect in (best, one))
+    same_law = one.named and one.name == best.name
+    return not same_law and bool(of_best and of_one) and of_best.isdisjoint(of_one)
 
 
 def score(screened: Screened, model: StateSpaceModel) -> float:

@@ -263,7 +263,7 @@ MUTANTS = (
     Mutant(
         "proposal not weighed out",
         "smoother/particle/filter.py",
-        " - now.log_psi(x) + log_ahead",
+        " - present.log_psi(x) + log_ahead",
         " + log_ahead",
         UNBIASED,
     ),
@@ -799,8 +799,8 @@ MUTANTS = (
     Mutant(
         "smoothed states that a model does not widen",
         "fit/predict.py",
-        "path._replace(cov=path.cov + more)",
-        "path._replace(cov=path.cov + 0.0 * more)",
+        "path._replace(cov=path.cov + model_cov)",
+        "path._replace(cov=path.cov + 0.0 * model_cov)",
         "test_predict.py::test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read",
     ),
     Mutant(

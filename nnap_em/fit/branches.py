@@ -55,9 +55,9 @@ def branches(
         for i, share in zip(*modes(loglik, angles), strict=True):
             gap = distance(angles[i], smoothed)
             most = int(np.argmax(gap.max(axis=0)))
-            there = np.flatnonzero(gap[:, most] > APART / 2)
+            rows = np.flatnonzero(gap[:, most] > APART / 2)
             if share >= LEAST and gap.max() > APART:
-                span = int(there[0]), int(there[-1])
+                span = int(rows[0]), int(rows[-1])
                 out.append(Branch(int(sequence), float(share), mean[i], second.angles[most], span))
     return tuple(out)
 

@@ -434,15 +434,15 @@ MUTANTS = (
     Mutant(
         "loud recordings decide alone",
         "prediction_error/multistep.py",
-        "np.sqrt(whole * own)",
+        "np.sqrt(whole * single)",
         "np.sqrt(whole * whole)",
         "test_forks.py::test_a_loud_recording_counts_by_the_root_of_its_loudness",
     ),
     Mutant(
         "weights of sequences that are not used",
         "prediction_error/multistep.py",
-        "error = np.where(used[:, None, None, None], found.error, np.nan)",
-        "error = found.error",
+        "error = np.where(used[:, None, None, None], predictions.error, np.nan)",
+        "error = predictions.error",
         "test_forks.py::test_weights_are_one_over_the_variance_and_less_for_outliers",
     ),
     Mutant(

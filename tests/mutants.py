@@ -771,8 +771,8 @@ MUTANTS = (
     Mutant(
         "Coriolis force of a slide halved",
         "systems/recursion.py",
-        "scaled(2.0, cross(spin, own))",
-        "scaled(1.0, cross(spin, own))",
+        "scaled(2.0, cross(spin, velocity))",
+        "scaled(1.0, cross(spin, velocity))",
         BRANCH,
     ),
     Mutant(
@@ -792,7 +792,7 @@ MUTANTS = (
     Mutant(
         "bodies that cannot be",
         "systems/bodies.py",
-        "mass = jnp.where(physical(mass, own), mass, jnp.nan)",
+        "mass = jnp.where(physical(mass, tensor), mass, jnp.nan)",
         "mass = jnp.asarray(mass)",
         f"{MACHINES}unphysical_bodies_have_no_numbers",
     ),

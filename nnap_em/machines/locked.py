@@ -29,9 +29,9 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
     """
     poses, joints = [], []
     for i, body in enumerate(machine.bodies):
-        pose, own = _held(body, [joint for joint in machine.joints if joint.body == i], values)
+        pose, remaining = _held(body, [joint for joint in machine.joints if joint.body == i], values)
         poses.append(pose)
-        joints += own
+        joints += remaining
     moved, had = {joint.body for joint in joints}, {joint.body for joint in machine.joints}
     carrier, within = {-1: -1}, {-1: Pose(np.zeros(3), np.eye(3))}
     for i, body in enumerate(machine.bodies):
@@ -57,8 +57,8 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         return _vector(within[body].place + within[body].turn @ np.asarray(at))
 
     def free(parts: tuple) -> tuple:
-        there = [part for part in parts if names[part.joint] in order]
-        return tuple(part._replace(joint=order[names[part.joint]]) for part in there)
+        present = [part for part in parts if names[part.joint] in order]
+        return tuple(part._replace(joint=order[names[part.joint]]) for part in present)
 
     return machine._replace(
         bodies=tuple(bodies),

@@ -339,21 +339,21 @@ def _parameters(fits: Sequence[Fit]) -> Iterator[Number]:
 
 def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
     """The reported parameters of effects."""
-    each = []
+    reports = []
     for fit in fits:
         model, cov = fit.fitted.model, covariance(fit.fitted)
         pairs = zip(model.effects, blocks(model, fit.fitted.m_step), strict=True)
-        each.append({key_of(effect): estimates(effect, cov[block, block], model.system) for effect, block in pairs})
-    for key in dict.fromkeys(itertools.chain(*each)):
-        reported = [effects.get(key, {}) for effects in each]
+        reports.append({key_of(effect): estimates(effect, cov[block, block], model.system) for effect, block in pairs})
+    for key in dict.fromkeys(itertools.chain(*reports)):
+        reported = [effects.get(key, {}) for effects in reports]
         for name in dict.fromkeys(itertools.chain(*reported)):
             entries = [parameters.get(name) for parameters in reported]
-            value = np.asarray([np.nan if one is None else one.value for one in entries])
-            std = np.asarray([np.nan if one is None else one.std for one in entries])
+            value = np.asarray([np.nan if parameter is None else parameter.value for parameter in entries])
+            std = np.asarray([np.nan if parameter is None else parameter.std for parameter in entries])
             if name in PERIODIC:
                 first = value[np.isfinite(value)][0]
                 value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-            unit = next(one.unit for one in entries if one is not None)
+            unit = next(parameter.unit for parameter in entries if parameter is not None)
             yield number(f"{name} of {words(key)}", unit, value, std)
 
 

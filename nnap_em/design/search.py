@@ -101,8 +101,8 @@ def search(
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
         costs = criterion.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
-        one = pool.expected.of(chosen[-1])
-        total = one if total is None else total + one
+        added = pool.expected.of(chosen[-1])
+        total = added if total is None else total + added
     plan = _of(pool, np.asarray(chosen))
     log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):

@@ -121,12 +121,12 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     """Stack made by NumPy: a stack of many small arrays would be one program for every number of them."""
     flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
     stacked = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
-    same = [bool((a == a[0]).all()) for a in stacked]
-    if all(same):  # one probe, or one given twice
-        same = [False] * len(same)
+    constants = [bool((a == a[0]).all()) for a in stacked]
+    if all(constants):  # one probe, or one given twice
+        constants = [False] * len(constants)
     pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
-    leaves = [np.asarray(a[0]) if one else pad(a) for a, one in zip(stacked, same, strict=True)]
-    axes = [None if one else 0 for one in same]
+    leaves = [np.asarray(a[0]) if constant else pad(a) for a, constant in zip(stacked, constants, strict=True)]
+    axes = [None if constant else 0 for constant in constants]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
 
 

@@ -223,7 +223,7 @@ class Dispute(NamedTuple):
 def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
     """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
-    for dispute in [one for step in closed.last for one in step.disputed][:most]:
+    for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
         name, joint, channel, inputs = dispute.key
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
@@ -255,14 +255,14 @@ class SuspectReport(NamedTuple):
 def suspected(closed: Closed) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
-    for each in [one for step in closed.last for one in step.suspects]:
-        name, joint, channel, inputs = each.key
+    for suspect in [entry for step in closed.last for entry in step.suspects]:
+        name, joint, channel, inputs = suspect.key
         text = (
-            f"{words(each.key)} would remove {each.share:.0%} of the squared prediction error, "
-            f"where chance removes {f'up to {each.chance:.0%}' if each.chance >= 0.005 else 'less than 1%'}"
+            f"{words(suspect.key)} would remove {suspect.share:.0%} of the squared prediction error, "
+            f"where chance removes {f'up to {suspect.chance:.0%}' if suspect.chance >= 0.005 else 'less than 1%'}"
         )
         place = catalogue[name].key(), joint, channel, list(inputs)
-        report = SuspectReport(*place, each.share, each.chance, words(each.key), text, catalogue[name].confirm)
+        report = SuspectReport(*place, suspect.share, suspect.chance, words(suspect.key), text, catalogue[name].confirm)
         out.append(report)
     return out
 
@@ -281,7 +281,7 @@ def advice(
     """Sentences on the next measurement."""
     out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     out += [MORE] if suspects else []
-    out += [f"To see a {each.law} by itself: {each.confirm}" for each in suspects if each.confirm]
+    out += [f"To see a {suspect.law} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm]
     out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
     for finding in accepted:
         if finding.effect.confirm:

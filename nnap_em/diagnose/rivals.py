@@ -45,7 +45,7 @@ def instead(
     """
     fit = _smoothed(fitted, data, place)
     around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
-    same = [one for one in proposals(around, fit.model.effects) if means(one.start)]
+    same = [candidate for candidate in proposals(around, fit.model.effects) if means(candidate.start)]
     trials = []
     screened = sorted(screen(OneStep(), fit, same, shifts=0).screened, key=lambda s: -s.share.inside) if same else []
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):

@@ -48,8 +48,8 @@ def branches(
         return ()
     out = []
     for sequence in beyond(first, second):
-        one = jax.tree.map(lambda a, s=sequence: a[s : s + 1], (data, first.state))
-        mean, loglik = (np.asarray(a[0]) for a in each(_paths, (model, second), one))
+        batch = jax.tree.map(lambda a, s=sequence: a[s : s + 1], (data, first.state))
+        mean, loglik = (np.asarray(a[0]) for a in each(_paths, (model, second), batch))
         angles = mean[:, : int(np.sum(data.valid[sequence])), list(second.angles)]
         smoothed = np.asarray(first.state.mean[sequence])[: angles.shape[1], list(second.angles)]
         for i, share in zip(*modes(loglik, angles), strict=True):

@@ -277,7 +277,7 @@ def remember(
         tries = [
             screen(fitted.model, fitted.rule, fitted.path, data, fitted.used, scales, step, left) for step in steps
         ]
-        best = {j: max(tries, key=lambda one: one.wald[j]) for j in left}
+        best = {j: max(tries, key=lambda tested: tested.wald[j]) for j in left}
         sentences |= {j: _unseen(fitted.model, scales, tries, j) for j in left}
         j = max(left, key=lambda j: best[j].wald[j], default=-1)
         if j < 0 or best[j].wald[j] < WALD:
@@ -339,7 +339,7 @@ REFUSED = "the static map is kept, memory predicts no better"
 def _unseen(model: StateSpaceModel, scales: Sizes, tries: Sequence[Screen], j: int) -> str:
     """The static map is kept since no distance shows a contact, with the levels that would have been seen."""
     unit, angle = model.system.force_unit(j + 1), model.system.unit(model.system.coordinates[j])
-    least, level = WALD * max(one.std[j] for one in tries), scales.level[j]
+    least, level = WALD * max(tested.std[j] for tested in tries), scales.level[j]
     text = f"the static map is kept, no memory from {tries[0].distance[j]:.2g} to {tries[-1].distance[j]:.2g} {angle}"
     if least > level:
         return f"{text}; the logs could not show it: a level below {least:.2g} {unit}, and friction is {level:.2g}"

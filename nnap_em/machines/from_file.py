@@ -138,7 +138,7 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
 
 
 def _place(machine: Machine, table: Any, joint: Any) -> int:
-    names = [one.name for one in machine.joints]
+    names = [declared.name for declared in machine.joints]
     if isinstance(joint, str):
         return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))
     if not isinstance(joint, int) or not 1 <= joint <= len(names):

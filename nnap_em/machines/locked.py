@@ -107,11 +107,11 @@ def _held(body: Body, joints: list[Joint], values: Mapping[str, float]) -> tuple
         change = Pose(axis * way if joint.slide else anchor - turn @ anchor, turn)
         pose = pose.of(change)
         free = [
-            one._replace(
-                axis=_vector(turn.T @ np.asarray(one.axis)),
-                anchor=_vector(turn.T @ (np.asarray(one.anchor) - change.place)),
+            other._replace(
+                axis=_vector(turn.T @ np.asarray(other.axis)),
+                anchor=_vector(turn.T @ (np.asarray(other.anchor) - change.place)),
             )
-            for one in free
+            for other in free
         ]
     return pose, free
 

@@ -119,16 +119,18 @@ def main() -> None:
         arguments.error("the command needs --out FOLDER")
     if args.coordinator and not args.here:
         arguments.error("--coordinator needs --here N: processes on this machine")
-    here = args.here or args.processes
-    if not 0 < here <= args.processes - args.first:
-        arguments.error(f"processes {args.first} to {args.first + here - 1} of {args.processes}: check --first, --here")
-    threads = max(1, cores() // here)
+    local = args.here or args.processes
+    if not 0 < local <= args.processes - args.first:
+        arguments.error(
+            f"processes {args.first} to {args.first + local - 1} of {args.processes}: check --first, --here"
+        )
+    threads = max(1, cores() // local)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     waits = ("xla_cpu_collective_call_terminate_timeout_seconds", "xla_cpu_collective_timeout_seconds")
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--{name}={PATIENCE}" for name in waits)])
     children = []
-    for index in range(args.first, args.first + here):
+    for index in range(args.first, args.first + local):
         order = ["--coordinator", address, "--work", str(index), str(threads), str(args.processes), *args.command]
         children.append(subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *order]))
     try:

@@ -263,7 +263,7 @@ MUTANTS = (
     Mutant(
         "proposal not weighed out",
         "smoother/particle/filter.py",
-        " - now.log_psi(x) + log_ahead",
+        " - present.log_psi(x) + log_ahead",
         " + log_ahead",
         UNBIASED,
     ),
@@ -392,8 +392,8 @@ MUTANTS = (
     Mutant(
         "rest of a law at another joint",
         "diagnose/keys.py",
-        "own == its and one.joint == other.joint",
-        "own == its",
+        "first == second and one.joint == other.joint",
+        "first == second",
         "test_search.py::test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint",
     ),
     Mutant(
@@ -434,15 +434,15 @@ MUTANTS = (
     Mutant(
         "loud recordings decide alone",
         "prediction_error/multistep.py",
-        "np.sqrt(whole * own)",
+        "np.sqrt(whole * single)",
         "np.sqrt(whole * whole)",
         "test_forks.py::test_a_loud_recording_counts_by_the_root_of_its_loudness",
     ),
     Mutant(
         "weights of sequences that are not used",
         "prediction_error/multistep.py",
-        "error = np.where(used[:, None, None, None], found.error, np.nan)",
-        "error = found.error",
+        "error = np.where(used[:, None, None, None], predictions.error, np.nan)",
+        "error = predictions.error",
         "test_forks.py::test_weights_are_one_over_the_variance_and_less_for_outliers",
     ),
     Mutant(
@@ -771,8 +771,8 @@ MUTANTS = (
     Mutant(
         "Coriolis force of a slide halved",
         "systems/recursion.py",
-        "scaled(2.0, cross(spin, own))",
-        "scaled(1.0, cross(spin, own))",
+        "scaled(2.0, cross(spin, velocity))",
+        "scaled(1.0, cross(spin, velocity))",
         BRANCH,
     ),
     Mutant(
@@ -792,15 +792,15 @@ MUTANTS = (
     Mutant(
         "bodies that cannot be",
         "systems/bodies.py",
-        "mass = jnp.where(physical(mass, own), mass, jnp.nan)",
+        "mass = jnp.where(physical(mass, tensor), mass, jnp.nan)",
         "mass = jnp.asarray(mass)",
         f"{MACHINES}unphysical_bodies_have_no_numbers",
     ),
     Mutant(
         "smoothed states that a model does not widen",
         "fit/predict.py",
-        "path._replace(cov=path.cov + more)",
-        "path._replace(cov=path.cov + 0.0 * more)",
+        "path._replace(cov=path.cov + model_cov)",
+        "path._replace(cov=path.cov + 0.0 * model_cov)",
         "test_predict.py::test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read",
     ),
     Mutant(
@@ -869,8 +869,8 @@ MUTANTS = (
     Mutant(
         "nuisance not projected out of the columns",
         "diagnose/screen.py",
-        "own - nuisance @ solve(nuisance.T @ own)",
-        "own",
+        "candidates - nuisance @ solve(nuisance.T @ candidates)",
+        "candidates",
         "test_shares.py::test_the_nuisance_is_projected_out_by_ridge_regression",
     ),
     Mutant(
@@ -953,8 +953,8 @@ MUTANTS = (
     Mutant(
         "the fit that is behind wins",
         "diagnose/context.py",
-        "np.nan_to_num(a.top, nan=-1e3) - np.nan_to_num(b.top, nan=-1e3)",
-        "np.nan_to_num(b.top, nan=-1e3) - np.nan_to_num(a.top, nan=-1e3)",
+        "np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3)",
+        "np.nan_to_num(b, nan=-1e3) - np.nan_to_num(a, nan=-1e3)",
         "test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier",
     ),
     Mutant(
@@ -981,8 +981,8 @@ MUTANTS = (
     Mutant(
         "laws of one cause leave the question open",
         "diagnose/rounds.py",
-        "own.isdisjoint(its)",
-        "not own.isdisjoint(its)",
+        "of_best.isdisjoint(of_one)",
+        "not of_best.isdisjoint(of_one)",
         "test_rounds.py::test_laws_of_other_causes_that_explain_the_same_leave_the_question_open",
     ),
     Mutant(
@@ -1016,7 +1016,7 @@ MUTANTS = (
     Mutant(
         "one-step errors decide where innovations are not white",
         "diagnose/search.py",
-        "white = white_innovations(_outcome(context.before, found.now, found.state), context.data)",
+        "white = white_innovations(_outcome(context.before, searched.hypothesis, searched.state), context.data)",
         "white = True",
         "test_search.py::test_one_step_errors_decide_where_noise_is_what_the_model_says",
     ),
@@ -1072,8 +1072,8 @@ MUTANTS = (
     Mutant(
         "errors that overlap count in full",
         "diagnose/screen.py",
-        "np.maximum(len(rows.error) / rows.overlap, directions[some] + 2)",
-        "np.maximum(len(rows.error), directions[some] + 2)",
+        "np.maximum(len(rows.error) / rows.overlap, directions[indices] + 2)",
+        "np.maximum(len(rows.error), directions[indices] + 2)",
         "test_shares.py::test_errors_that_overlap_count_for_less",
     ),
     Mutant(
@@ -1086,8 +1086,8 @@ MUTANTS = (
     Mutant(
         "recordings of one motion are evidence of each other",
         "diagnose/folds.py",
-        "if difference < REPEATS * own:",
-        "if difference < 0 * own:",
+        "if difference < REPEATS * square:",
+        "if difference < 0 * square:",
         "test_shares.py::test_recordings_of_one_motion_are_left_out_together",
     ),
     Mutant(

@@ -100,10 +100,10 @@ class Bench(NamedTuple):
     """Only where there are any; as predictions of the reported error may see them."""
 
 
-def read_bench(folder: Path, trust: bool, more: Sequence[Path] = ()) -> Bench:
-    """A data set, with `more` logs of the same rig to train on; `trust`: no reading is masked."""
+def read_bench(folder: Path, trust: bool, further: Sequence[Path] = ()) -> Bench:
+    """A data set, with `further` logs of the same rig to train on; `trust`: no reading is masked."""
     rig = read_rig(folder / "rig.toml", specs)
-    train = read_training(rig, (folder, *more), trust)
+    train = read_training(rig, (folder, *further), trust)
     test = read_logs(folder / "test", rig, trust=trust, until=GIVEN) if has_logs(folder / "test") else None
     check_split(train, test)
     return Bench(rig, train, test)
@@ -111,8 +111,8 @@ def read_bench(folder: Path, trust: bool, more: Sequence[Path] = ()) -> Bench:
 
 def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     """The training logs of a data set, and of further folders: those in train/, or in the folder itself."""
-    first, *more = folders
-    places = [first / "train", *(folder if has_logs(folder) else folder / "train" for folder in more)]
+    first, *others = folders
+    places = [first / "train", *(folder if has_logs(folder) else folder / "train" for folder in others)]
     names = (folder.resolve().name for folder in folders)
     parts = {name: read_logs(place, rig, trust=trust) for name, place in zip(names, places, strict=True)}
     if len(parts) < len(folders):
@@ -168,7 +168,7 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
 
     Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
     """
-    same = _given(args, *OPTIONS, none=True)
+    same = _options(args, *OPTIONS, none=True)
     of = {"rig.toml": dataclasses.asdict(bench.rig), "training data": fingerprint(bench.train.data), **same}
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
@@ -188,7 +188,7 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
             journal.clear()
 
 
-def _given(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
+def _options(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
     """Those of these options that the command has; `none`: also where they were left out."""
     options = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
     return {name: value for name, value in options.items() if none or value is not None}
@@ -199,7 +199,7 @@ def go_on(args: argparse.Namespace, journal: Journal) -> str:
     if not len(journal):
         return "stopped before the end of the first step; nothing was kept"
     command = ["nnap-em", args.command, str(args.folder), "--out", str(args.out)]
-    for name, value in _given(args, *OPTIONS, "epochs", "more", "logs").items():
+    for name, value in _options(args, *OPTIONS, "epochs", "more", "logs").items():
         for one in value if isinstance(value, list) else [value]:
             command += [name, str(one)]
     command += ["--trust-readings"] * args.trust_readings

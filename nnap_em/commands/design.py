@@ -56,8 +56,8 @@ def _wanted(args: argparse.Namespace, fitted: Identified) -> list[tuple[Law | No
     """Laws to be discriminated: those that the report beside the model leaves open, and those that --rival names."""
     report = model_file(args.folder).with_name("report.json")
     pairs = open_pairs(json.loads(report.read_text())) if report.exists() else []
-    own = [Law(effect.name, effect.joint, effect.channel) for effect in fitted.model.effects] or [None]
-    return pairs + [(law, _law(text)) for text in args.rival for law in own]
+    laws = [Law(effect.name, effect.joint, effect.channel) for effect in fitted.model.effects] or [None]
+    return pairs + [(law, _law(text)) for text in args.rival for law in laws]
 
 
 def _law(text: str) -> Law:

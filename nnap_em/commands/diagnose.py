@@ -36,18 +36,18 @@ def run(args: argparse.Namespace, log: Log) -> None:
         key = jax.random.key(args.seed)
         closed = close_the_loop(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
         journal.open = not closed.complete
-        found, mark = findings(closed), fingerprint(bench.train.data)
+        accepted, mark = findings(closed), fingerprint(bench.train.data)
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before", closed.before), ("after", closed.after)):
             save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, closed, found, bench.train, bench.test, seed=args.seed, began=began, log=report)
+        write_diagnosis(args.out, closed, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
     if journal.open:
         log(go_on(args, journal))
 
 
 def _clock(seconds: float) -> str:
     """Time that is left, or by which it is exceeded, in minutes and seconds."""
-    minutes, rest = divmod(round(abs(seconds)), 60)
-    return f"{minutes}:{rest:02} {'left' if seconds > 0 else 'over'}"
+    minutes, remainder = divmod(round(abs(seconds)), 60)
+    return f"{minutes}:{remainder:02} {'left' if seconds > 0 else 'over'}"

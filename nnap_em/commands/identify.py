@@ -55,12 +55,12 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch
 
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
         nonlocal last
-        now, out = time.perf_counter(), np.flatnonzero(~np.asarray(used)).tolist()
-        horizon, loglik, seconds = seen * rig.dt, float(state.loglik[-1]), now - last
+        moment, out = time.perf_counter(), np.flatnonzero(~np.asarray(used)).tolist()
+        horizon, loglik, seconds = seen * rig.dt, float(state.loglik[-1]), moment - last
         epochs.append(
             {"epoch": state.epoch, "horizon_s": horizon, "log_likelihood": loglik, "left_out": out, "seconds": seconds}
         )
-        last = now
+        last = moment
         noise = _noise(rig, np.asarray(state.best.log_r))
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
         log(

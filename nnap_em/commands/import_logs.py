@@ -41,12 +41,12 @@ def run(args: argparse.Namespace, log: Log) -> None:
     log(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
 
 
-def _reaching(text: str, here: Path, out: Path) -> str:
+def _reaching(text: str, folder: Path, out: Path) -> str:
     """A rig.toml that finds its machine file, which stays where it is, from another folder."""
     file = tomllib.loads(text)["model"].get("file")
     if file is None:
         return text
-    path = toml_text(os.path.relpath(here / file, out))
+    path = toml_text(os.path.relpath(folder / file, out))
     return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
 
 

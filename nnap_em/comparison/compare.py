@@ -154,8 +154,8 @@ class Comparison(NamedTuple):
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
             changed += [f"the {curve.name}{parts}"] * curve.changed
         changed += [number.name for number in self.numbers if number.changed]
-        rest = tests - len(changed)
-        others = f"{_counted(rest, 'other ')} did not" if rest else "no other quantity was tested"
+        unchanged = tests - len(changed)
+        others = f"{_counted(unchanged, 'other ')} did not" if unchanged else "no other quantity was tested"
         text = f"{listed(changed)} changed {between}; {others}."
         return text[0].upper() + text[1:]
 
@@ -223,14 +223,14 @@ def _opened(fit: Path | str | Identified) -> Fit:
     return Fit("", stored.fitted, *_visited(stored.fitted, file), stored.fingerprint)
 
 
-def _labels(given: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> tuple[str, ...]:
+def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> tuple[str, ...]:
     """Short names that differ: of the folder, else the paths as they are given, else numbers."""
-    paths = [None if isinstance(fit, Identified) else model_file(Path(fit)).absolute() for fit in given]
+    paths = [None if isinstance(fit, Identified) else model_file(Path(fit)).absolute() for fit in sources]
     short = [
         fit.fitted.rig.name if path is None else path.parent.name if path.stem in ("model", "after") else path.stem
         for path, fit in zip(paths, opened, strict=True)
     ]
-    full = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, given, strict=True)]
+    full = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, sources, strict=True)]
     numbered = [f"fit {i}" for i in range(1, len(short) + 1)]
     return tuple(next(labels for labels in (short, full, numbered) if len(set(labels)) == len(labels)))
 
@@ -339,21 +339,21 @@ def _parameters(fits: Sequence[Fit]) -> Iterator[Number]:
 
 def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
     """The reported parameters of effects."""
-    each = []
+    reports = []
     for fit in fits:
         model, cov = fit.fitted.model, covariance(fit.fitted)
-        own = zip(model.effects, blocks(model, fit.fitted.m_step), strict=True)
-        each.append({key_of(effect): estimates(effect, cov[block, block], model.system) for effect, block in own})
-    for key in dict.fromkeys(itertools.chain(*each)):
-        reported = [effects.get(key, {}) for effects in each]
+        pairs = zip(model.effects, blocks(model, fit.fitted.m_step), strict=True)
+        reports.append({key_of(effect): estimates(effect, cov[block, block], model.system) for effect, block in pairs})
+    for key in dict.fromkeys(itertools.chain(*reports)):
+        reported = [effects.get(key, {}) for effects in reports]
         for name in dict.fromkeys(itertools.chain(*reported)):
             entries = [parameters.get(name) for parameters in reported]
-            value = np.asarray([np.nan if one is None else one.value for one in entries])
-            std = np.asarray([np.nan if one is None else one.std for one in entries])
+            value = np.asarray([np.nan if parameter is None else parameter.value for parameter in entries])
+            std = np.asarray([np.nan if parameter is None else parameter.std for parameter in entries])
             if name in PERIODIC:
                 first = value[np.isfinite(value)][0]
                 value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-            unit = next(one.unit for one in entries if one is not None)
+            unit = next(parameter.unit for parameter in entries if parameter is not None)
             yield number(f"{name} of {words(key)}", unit, value, std)
 
 
@@ -367,8 +367,8 @@ def number(
     """A number, tested and pooled over the fits that estimate it."""
     has = np.isfinite(value) & np.isfinite(std) & (std > 0)
     test = joint_test(value[has, None], std[has, None, None] ** 2) if has.sum() > 1 else None
-    own = std[has, None]
-    return Number(name, unit, value, std, pool(value[has, None], own, max(prior_std, own.max(initial=0.0))), test)
+    stds = std[has, None]
+    return Number(name, unit, value, std, pool(value[has, None], stds, max(prior_std, stds.max(initial=0.0))), test)
 
 
 # --- the rest that a reader should know
@@ -386,7 +386,7 @@ def _differences(fits: Sequence[Fit]) -> Iterator[str]:
 
     keys: list[list[Key]] = [[key_of(effect) for effect in fit.fitted.model.effects] for fit in fits]
     for key in dict.fromkeys(itertools.chain(*keys)):
-        yield from lines(f"{words(key)} is", np.asarray([key in own for own in keys]), "not")
+        yield from lines(f"{words(key)} is", np.asarray([key in held for held in keys]), "not")
     yield from lines("friction is learned", np.asarray([fit.fitted.rig.friction for fit in fits]), "not")
     tables = [parameter_table(fit.fitted) for fit in fits]
     for name in dict.fromkeys(itertools.chain(*tables)):

@@ -134,19 +134,19 @@ def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarr
     free = list(family.free)
 
     def left(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        size, rest = seen.fit(family.columns(view, place[None]))
-        return size[0], rest[0]
+        size, residual = seen.fit(family.columns(view, place[None]))
+        return size[0], residual[0]
 
-    _, rest = seen.fit(family.columns(view, family.grid))
-    rss = (rest**2).sum(axis=1)
+    _, residual = seen.fit(family.columns(view, family.grid))
+    rss = (residual**2).sum(axis=1)
     free = [] if rss.min() > 0.5 * seen.target @ seen.target else free  # far from an explanation
     places = [family.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
     low, high = family.grid.min(axis=0), family.grid.max(axis=0)
     if free:
         places = [_polished(lambda p: left(p)[1], place, free, low, high) for place in places]
     fits = [(place, *left(place)) for place in places]
-    place, size, rest = min(fits, key=lambda fit: float(fit[2] @ fit[2]))
-    return place, size, float(rest @ rest)
+    place, size, residual = min(fits, key=lambda fit: float(fit[2] @ fit[2]))
+    return place, size, float(residual @ residual)
 
 
 def _polished(

@@ -48,8 +48,8 @@ def constant_readings(
     usual = float(np.median(np.repeat(lengths, lengths)))
     full = np.zeros(y.size, bool)
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
-        there = [every[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]
-        if limit in limits or any(_beyond(name, readings, run, sign, dt) for run in there):
+        at_limit = [every[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]
+        if limit in limits or any(_beyond(name, readings, run, sign, dt) for run in at_limit):
             full |= _closed(y == limit) & np.isfinite(y)
     if full.any():
         yield FULL, np.flatnonzero(full)
@@ -176,8 +176,8 @@ def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> b
     rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
     spread, coarse = noise(y), 4 * _quantum(y)
     for side in (before, after[::-1]):
-        there, uncertainty = _ahead(side, rows, spread)
-        if np.all(sign * (there - y[run.first]) <= _SURE * uncertainty + coarse):
+        expected, uncertainty = _ahead(side, rows, spread)
+        if np.all(sign * (expected - y[run.first]) <= _SURE * uncertainty + coarse):
             return False
     return True
 

@@ -94,11 +94,11 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
     """
     parts = {f"train file {file}": rows for file, rows in _contents(train)}
     parts |= {f"test file {file}": rows for file, rows in (_contents(test) if test else ())}
-    for name, row, other, there, copy in repeats(parts):
+    for name, row, other, source_row, copy in repeats(parts):
         leaks = name.startswith("test") and other.startswith("train")
         if copy:
             raise DataError(f"{name}: the same content as {other}; remove one of the two")
-        problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {there + 1}"
+        problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {source_row + 1}"
         if leaks:
             raise DataError(f"{problem}; remove one of the two: test sequences are new to the fit")
         warnings.warn(f"{problem}; cut sequences without overlap", DataWarning, 2)
@@ -106,10 +106,10 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
 
 def together(parts: Mapping[str, Logs]) -> Logs:
     """Logs of one rig from some folders as one; files of all but the first carry the names of their folders."""
-    first, *rest = parts.items()
-    if not rest:
+    first, *others = parts.items()
+    if not others:
         return first[1]
-    named = [("", first[1]), *((f"{name}/", logs) for name, logs in rest)]
+    named = [("", first[1]), *((f"{name}/", logs) for name, logs in others)]
     files = tuple(start + file for start, logs in named for file in logs.files)
     masked = tuple(m._replace(file=start + m.file) for start, logs in named for m in logs.masked)
     every = [logs for _, logs in named]
@@ -235,12 +235,12 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
     dark = np.any([error > INTERPOLATION_ERROR for _, error in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
-    here, masked = rows[rows < end], []
+    used, masked = rows[rows < end], []
     for first, count, kind, hint in (
         (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
         (
             end,
-            len(rows) - len(here),
+            len(rows) - len(used),
             "cut",
             "inputs before these rows cannot be interpolated: not used",
         ),
@@ -251,7 +251,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
             problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
             problem += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
             warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
-    return _Table(path, full[:end], here, masked)
+    return _Table(path, full[:end], used, masked)
 
 
 def _contents(logs: Logs) -> Iterator[tuple[str, Float[np.ndarray, "time column"]]]:

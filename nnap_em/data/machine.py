@@ -177,13 +177,13 @@ def machine_unit(text: str, name: str) -> str:
     for sensor in machine.sensors:
         if name == sensor.name:
             return SENSE_UNITS[sensor.kind]
-    dof, (owner, _, own) = len(machine.joints), name.partition(".")
+    dof, (owner, _, quantity) = len(machine.joints), name.partition(".")
     if name in machine.states:
         place = machine.states.index(name)
         return state_unit(not machine.joints[place % dof].slide, rate=place >= dof)
     slide = next((joint.slide for joint in machine.joints if joint.name == owner), False)
     per_joint = {"armature": "kg" if slide else "kg m^2", "stiffness": "N/m" if slide else "N m/rad"}
-    return per_joint.get(own) or {"mass": "kg", "com": "m"}.get(own.partition(".")[0], "kg m^2")
+    return per_joint.get(quantity) or {"mass": "kg", "com": "m"}.get(quantity.partition(".")[0], "kg m^2")
 
 
 def states(joints: tuple[Joint, ...]) -> tuple[str, ...]:

@@ -59,8 +59,8 @@ def _prediction(u: Float[np.ndarray, " time"], missing: Bool[np.ndarray, " time"
     rows = np.lib.stride_tricks.sliding_window_view(u, order + 1)[complete]
     if len(rows) < 2 * order:
         return np.ones(1)
-    past, now = rows[:, order - 1 :: -1] if order > 1 else rows[:, :1], rows[:, order]
-    return np.linalg.solve(past.T @ past + 1e-9 * len(rows) * np.eye(order), past.T @ now)
+    past, target = rows[:, order - 1 :: -1] if order > 1 else rows[:, :1], rows[:, order]
+    return np.linalg.solve(past.T @ past + 1e-9 * len(rows) * np.eye(order), past.T @ target)
 
 
 def _filled(

@@ -87,13 +87,13 @@ def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]])
     sequences_seen: dict[bytes, str] = {}
     for name, rows in sequences.items():
         rows = np.asarray(rows) + 0.0  # no -0
-        own = dict(_stretches(rows))
-        everything = rows.tobytes() if own else None
+        stretches = dict(_stretches(rows))
+        everything = rows.tobytes() if stretches else None
         if everything in sequences_seen:
             yield Repeat(name, 0, sequences_seen[everything], 0, True)
-        elif same := next((content for content in own if content in seen), None):
-            yield Repeat(name, own[same], *seen[same], False)
-        for content, row in own.items():
+        elif same := next((content for content in stretches if content in seen), None):
+            yield Repeat(name, stretches[same], *seen[same], False)
+        for content, row in stretches.items():
             seen.setdefault(content, (name, row))
         if everything:
             sequences_seen.setdefault(everything, name)

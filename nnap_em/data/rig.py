@@ -458,5 +458,5 @@ def _limits(limits: Bounds) -> list[str]:
     ]
 
 
-def _pair(value: Declared, more: str = "") -> str:
-    return f"{{ mean = {value.mean!r}, std = {value.std!r}{more} }}"
+def _pair(value: Declared, suffix: str = "") -> str:
+    return f"{{ mean = {value.mean!r}, std = {value.std!r}{suffix} }}"

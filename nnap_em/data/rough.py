@@ -26,10 +26,10 @@ def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = 
     `limits` are columns and values at which they are known to saturate.
     """
     first = {name: spikes(values) for name, values in readings.items()}
-    rest = {name: _without(values, first[name]) for name, values in readings.items()}
+    remaining = {name: _without(values, first[name]) for name, values in readings.items()}
     entries = []
-    for name, values in rest.items():
-        still = list(constant_readings(name, rest, dt, [value for column, value in limits if column == name]))
+    for name, values in remaining.items():
+        still = list(constant_readings(name, remaining, dt, [value for column, value in limits if column == name]))
         entries += [Rough(kind, name, rows[np.isfinite(values[rows])]) for kind, rows in still]
         y = _without(values, *(rows for _, rows in still))
         rows = np.sort(np.concatenate([first[name], spikes(y)])) if still else first[name]

@@ -52,14 +52,14 @@ class Drive(NamedTuple):
     """Columns that a number is proportional to, by its key, each with the value at which it is as declared."""
 
 
-def read_drives(table: Any, columns: Collection[str], given: Mapping[str, Drive] | None = None) -> dict[str, Drive]:
-    """The drive of every column of the table [input]; `given` are those of a machine file.
+def read_drives(table: Any, columns: Collection[str], of_file: Mapping[str, Drive] | None = None) -> dict[str, Drive]:
+    """The drive of every column of the table [input]; `of_file` are those of a machine file.
 
     Keys of [input] hold for every column that has such a number, those of [input.COLUMN] for one.
     Refused are unknown kinds and keys, a servo without its gain, and numbers that no drive has.
     """
     _refuse_unknown(table, columns)
-    drives = {column: _drive(table, column, (given or {}).get(column, Drive(TORQUE, {}))) for column in columns}
+    drives = {column: _drive(table, column, (of_file or {}).get(column, Drive(TORQUE, {}))) for column in columns}
     kinds = {drive.kind for drive in drives.values()}
     for key in table.items:
         if key in KEYS and not any(key in KINDS[kind] for kind in kinds):
@@ -68,16 +68,16 @@ def read_drives(table: Any, columns: Collection[str], given: Mapping[str, Drive]
     return drives
 
 
-def _drive(table: Any, column: str, given: Drive) -> Drive:
+def _drive(table: Any, column: str, of_file: Drive) -> Drive:
     """The drive of one column, by its own table, then by [input], then by the file."""
-    own = table.table("" if column in RESERVED else column, absent={})
-    own.check((), ("kind", *KEYS))
-    kind = _kind(own) or _kind(table) or given.kind
-    for key in own.items:
+    section = table.table("" if column in RESERVED else column, absent={})
+    section.check((), ("kind", *KEYS))
+    kind = _kind(section) or _kind(table) or of_file.kind
+    for key in section.items:
         if key != "kind" and key not in KINDS[kind]:
-            own.refuse(key, f"an input of kind {kind!r} has no {key}", _possible(kind))
-    numbers, scales = dict(given.numbers) if given.kind == kind else {}, {}
-    for place in (table, own):
+            section.refuse(key, f"an input of kind {kind!r} has no {key}", _possible(kind))
+    numbers, scales = dict(of_file.numbers) if of_file.kind == kind else {}, {}
+    for place in (table, section):
         for key in KINDS[kind]:
             if key in place.items:
                 numbers[key], scales[key] = _number(place, key, KINDS[kind][key]), _scale(place, key)
@@ -85,7 +85,7 @@ def _drive(table: Any, column: str, given: Drive) -> Drive:
         if about.needed and key not in numbers:
             problem = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
             hint = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
-            (own if own.items else table).refuse(key, problem, hint)
+            (section if section.items else table).refuse(key, problem, hint)
     return Drive(kind, numbers, {key: scale for key, scale in scales.items() if scale})
 
 
@@ -138,15 +138,15 @@ def _scale(table: Any, key: str) -> dict[str, float]:
     return {column: at.number(column) for column in at.items}
 
 
-def scaled(drives: Mapping[str, Drive], taken: Collection[str], table: Any) -> dict[str, dict[str, float]]:
-    """Columns that numbers are proportional to, by the names of the numbers; refused are those `taken` by others."""
-    found = {f"{name}.{key}": dict(scale) for name, drive in drives.items() for key, scale in drive.scales.items()}
-    for name, scale in found.items():
+def scaled(drives: Mapping[str, Drive], reserved: Collection[str], table: Any) -> dict[str, dict[str, float]]:
+    """Columns that numbers are proportional to, by the names of the numbers; refused are `reserved` ones."""
+    scales = {f"{name}.{key}": dict(scale) for name, drive in drives.items() for key, scale in drive.scales.items()}
+    for name, scale in scales.items():
         for column in scale:
-            if column in taken:
+            if column in reserved:
                 hint = "name a column that holds a gain or a supply"
                 table.refuse(name, f"{AT}: {column!r} is the time, a state or an input", hint)
-    return found
+    return scales
 
 
 def named(drives: Mapping[str, Drive]) -> dict[str, Any]:

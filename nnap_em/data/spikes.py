@@ -119,7 +119,7 @@ class _Fit(NamedTuple):
     base: Float[np.ndarray, "row term"]
     size: float
     """Distance of the nearest reading of the run."""
-    rest: float
+    residual: float
     """The least squares that it leaves."""
     freedom: int
     end: bool
@@ -137,8 +137,8 @@ def _fit(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], side: int)
     base = np.vander(x, 3 if end else 4)
     keep = ~np.isin(rows, run)
     left = y[rows] - base @ np.linalg.lstsq(base[keep], y[rows][keep], rcond=None)[0]
-    rest, freedom = float(left[keep] @ left[keep]), max(int(keep.sum()) - base.shape[1], 1)
-    return _Fit(x, y[rows], base, float(np.min(np.abs(left[~keep]))), rest, freedom, end)
+    residual, freedom = float(left[keep] @ left[keep]), max(int(keep.sum()) - base.shape[1], 1)
+    return _Fit(x, y[rows], base, float(np.min(np.abs(left[~keep]))), residual, freedom, end)
 
 
 def _stands_out(
@@ -148,8 +148,8 @@ def _stands_out(
     worse.
     """
     fit = _fit(y, run, side)
-    excess = max(fit.rest / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
-    spread = max(sigma, math.sqrt(fit.rest / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
+    excess = max(fit.residual / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
+    spread = max(sigma, math.sqrt(fit.residual / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
     size = fit.size / strict / (_END if fit.end else 1.0 if run.size == 1 else _SHORT)
     if size < 1.1 * SPIKE * spread or size < _LEAST * float(np.std(y[np.isfinite(y)])):
         return False
@@ -157,10 +157,10 @@ def _stands_out(
         return False
     if fit.end:
         return True
-    if side < _SIDE and size < _QUICK * math.sqrt((wide := _fit(y, run, _SIDE)).rest / wide.freedom):
+    if side < _SIDE and size < _QUICK * math.sqrt((wide := _fit(y, run, _SIDE)).residual / wide.freedom):
         return False
-    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.rest + _MARGIN * sigma**2
-    return worse and _in_two(fit.x, fit.y) > 1.5 * fit.rest
+    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.residual + _MARGIN * sigma**2
+    return worse and _in_two(fit.x, fit.y) > 1.5 * fit.residual
 
 
 def _in_two(x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]) -> float:
@@ -190,9 +190,9 @@ def _activity(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma
     The upper quartile: one more spike near by does not hide this one.
     """
     first = max(run[0] - _AROUND, 0)
-    there = y[first : run[-1] + _AROUND + 1].copy()
-    there[run - first] = np.nan
-    left = _left(np.flatnonzero(np.isfinite(there)), there, 1)
+    window = y[first : run[-1] + _AROUND + 1].copy()
+    window[run - first] = np.nan
+    left = _left(np.flatnonzero(np.isfinite(window)), window, 1)
     beside = (left.rows < run[0] - first - 2) | (left.rows > run[-1] - first + 2)
     bend = (np.abs(left.miss) / left.factor)[beside]
     return max(float(np.percentile(bend, 75)) - 1.5 * sigma, 0.0) if bend.size else math.inf

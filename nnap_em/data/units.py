@@ -23,8 +23,8 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
 def joint_called(coordinates: Sequence[str], joint: int) -> str:
     """A joint, counted from 1, as a reader finds it: by its number, and its name where it has one of its own."""
     name = coordinates[joint - 1] if 0 < joint <= len(coordinates) else ""
-    own = name and not re.fullmatch(r"(theta|x|q|joint)\d*", name)
-    return f"joint {joint}" + (f" ({name})" if own else "")
+    named = name and not re.fullmatch(r"(theta|x|q|joint)\d*", name)
+    return f"joint {joint}" + (f" ({name})" if named else "")
 
 
 def with_names(text: str, coordinates: Sequence[str]) -> str:

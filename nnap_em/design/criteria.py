@@ -50,12 +50,12 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     It is one where noise is that of the model; on a real machine recordings disagree, the posterior is wider
     (`prediction_error.stated.widened`), and new logs add as much less.
     """
-    before, now = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
-    counts = now > 1e-12 * now.max()
+    before, variances = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
+    counts = variances > 1e-12 * variances.max()
 
     def wider(part: float) -> float:
         """Mean logarithm of the variances over those of the fit."""
-        return float(np.mean(np.log(np.diagonal(after(before, part * logs))[counts] / now[counts])))
+        return float(np.mean(np.log(np.diagonal(after(before, part * logs))[counts] / variances[counts])))
 
     return 1.0 if wider(1.0) >= 0 or wider(1e-6) <= 0 else root_scalar(wider, bracket=(1e-6, 1.0)).root
 

@@ -99,11 +99,11 @@ def design_experiment(
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
-    apart = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
+    discrimination = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
     slow = _slow(fit, visited)
     friction = _friction(fit, visited, slow)
-    criterion = _criterion(question, fitted, fit, friction, apart)
+    criterion = _criterion(question, fitted, fit, friction, discrimination)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
@@ -133,35 +133,35 @@ def design_experiment(
         row.times(setup.share * sequences * t.size),
         criterion,
         tuple(rivals),
-        apart,
+        discrimination,
         slow,
         friction.weight[0],
     )
 
 
 def _criterion(
-    name: str, fitted: Identified, fit: Fit, friction: Friction, apart: Discrimination | None
+    name: str, fitted: Identified, fit: Fit, friction: Friction, discrimination: Discrimination | None
 ) -> AbstractCriterion:
     """The criterion of that name, or all of those that there are."""
-    prior, there = fitted.m_step.prior, {}
+    prior, criteria = fitted.m_step.prior, {}
     if fitted.rig.friction:
-        there["friction"] = friction
+        criteria["friction"] = friction
     if prior.size:
-        there["parameters"] = Parameters(fit, tuple(range(prior.size)))
+        criteria["parameters"] = Parameters(fit, tuple(range(prior.size)))
     singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
-    if apart is not None:
-        there["apart"] = apart
-    if name == "all" and there:
-        return Several(tuple(there.values()))
-    if name not in there | singles:
-        known = ", ".join([*there, *singles]) or "none: the fit has no friction map, no parameter and no rival"
+    if discrimination is not None:
+        criteria["apart"] = discrimination
+    if name == "all" and criteria:
+        return Several(tuple(criteria.values()))
+    if name not in criteria | singles:
+        known = ", ".join([*criteria, *singles]) or "none: the fit has no friction map, no parameter and no rival"
         why = {
             "apart": "the fit has no effect that the data could not tell from another; name a law with --rival",
             "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
             "friction": "the rig is declared free of friction",
         }.get(name, "not a question of this fit")
         raise DesignError(f"--for {name}: {why}; possible here: {known}")
-    return (there | singles)[name]
+    return (criteria | singles)[name]
 
 
 def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, "row dof"]:

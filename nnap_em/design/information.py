@@ -49,7 +49,7 @@ def _covariances(weights, unknown, w, hessian) -> tuple[Float[Array, "phi phi"],
 
 
 def information(
-    fit: Fit, seq: Dataset, x: Float[Array, "proposal few time state"]
+    fit: Fit, seq: Dataset, x: Float[Array, "proposal recorded time state"]
 ) -> Float[np.ndarray, "proposal phi phi"]:
     """Expected information of phi in sequences, the mean over some motions."""
     return np.asarray(each(_information, fit, (seq, x)))

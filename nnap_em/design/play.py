@@ -24,16 +24,16 @@ class Motions(NamedTuple):
     lowest: Float[Array, "*proposal path readable"]
     """Lowest value of every coordinate and rate over the whole motion."""
     highest: Float[Array, "*proposal path readable"]
-    x: Float[Array, "*proposal few time state"]
-    """The first few motions themselves."""
+    x: Float[Array, "*proposal recorded time state"]
+    """The first motions themselves."""
 
 
 class _Common(NamedTuple):
     paths: Paths
     spread: Float[Array, " readable"]
     """Standard deviation of the first state."""
-    few: Float[Array, " few"]
-    """Number of motions that are kept."""
+    recorded: Float[Array, " recorded"]
+    """An entry for each motion that is recorded."""
 
 
 def motions(
@@ -42,7 +42,7 @@ def motions(
     t: Float[np.ndarray, " time"],
     u: Float[np.ndarray, "proposal time input"],
     start: Float[np.ndarray, "proposal readable"],
-    few: int,
+    recorded: int,
     *,
     key: PRNGKeyArray,
 ) -> Motions:
@@ -50,7 +50,7 @@ def motions(
     angle = np.asarray(paths.model.system.angles)
     reach = (limits.highest - limits.lowest)[: angle.size]
     spread = BY_HAND * np.where(angle, np.minimum(reach, 2 * np.pi), reach)
-    common = _Common(paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(few))
+    common = _Common(paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(recorded))
     keys = jax.random.split(key, 1)[np.zeros(len(u), int)]
     return each(_motions, common, (blank(t, u, len(paths.model.measured)), jnp.asarray(start), keys))
 
@@ -67,7 +67,7 @@ def blank(t: Float[np.ndarray, " time"], u: Float[np.ndarray, "proposal time inp
 
 
 def _motions(common: _Common, one) -> Motions:
-    (paths, spread, few), (seq, start, key) = common, one
+    (paths, spread, recorded), (seq, start, key) = common, one
     model, count = paths.model, paths.tables.shape[0]
     key_start, key_kick = jax.random.split(key)
     free = spread.shape[0]
@@ -80,7 +80,7 @@ def _motions(common: _Common, one) -> Motions:
         (x, low, high), (u, kick) = carry, slices
         low, high = jnp.minimum(low, x[:, :free]), jnp.maximum(high, x[:, :free])
         following, _ = paths.advance(x, u)
-        return (following + kick, low, high), x[: few.shape[0]]
+        return (following + kick, low, high), x[: recorded.shape[0]]
 
     begin = x0, x0[:, :free], x0[:, :free]
     (_, low, high), x = jax.lax.scan(step, begin, (paths.inputs(seq), kick))

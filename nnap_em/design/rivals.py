@@ -27,8 +27,8 @@ class Law(NamedTuple):
 
     def means(self, effect: AbstractEffect) -> bool:
         """True for this law."""
-        here = self.joint in (None, effect.joint) and self.channel in (None, effect.channel)
-        return here and self.name in (effect.name, effect.key())
+        matches = self.joint in (None, effect.joint) and self.channel in (None, effect.channel)
+        return matches and self.name in (effect.name, effect.key())
 
 
 class Rivals(NamedTuple):
@@ -57,24 +57,24 @@ def rivals(
     Raises DesignError where the machine cannot have such a law, or the fit does not hold the one.
     """
     out, beside = [], []
-    for own, other in laws:
-        log(f"fitting {other} in place of {own or 'nothing'}")
-        model = _instead(fitted, data, own, other)
-        if own is None:
+    for law, other in laws:
+        log(f"fitting {other} in place of {law or 'nothing'}")
+        model = _instead(fitted, data, law, other)
+        if law is None:
             beside.append((str(other), model))
         else:
-            out.append(Rivals((str(own), str(other)), fitted, model))
+            out.append(Rivals((str(law), str(other)), fitted, model))
     pairs = itertools.combinations(beside if len(beside) > 1 else [("nothing", fitted), *beside], 2)
     return out + [Rivals((a, b), one, other) for (a, one), (b, other) in pairs if beside]
 
 
-def _instead(fitted: Identified, data: Dataset, own: Law | None, other: Law) -> Identified:
+def _instead(fitted: Identified, data: Dataset, law: Law | None, other: Law) -> Identified:
     """The fit with one law in the place of another."""
     effects = fitted.model.effects
-    place = next((i for i, effect in enumerate(effects) if own is not None and own.means(effect)), None)
-    if own is not None and place is None:
+    place = next((i for i, effect in enumerate(effects) if law is not None and law.means(effect)), None)
+    if law is not None and place is None:
         held = ", ".join(words(key_of(effect)) for effect in effects)
-        raise DesignError(f"the fit holds no {own}; it holds {held or 'no effect'}")
+        raise DesignError(f"the fit holds no {law}; it holds {held or 'no effect'}")
     refit = instead(fitted, data, place, other.means)
     if refit is None:
         known = sorted({words(key_of(effect)) for effect in possible(fitted, data)})

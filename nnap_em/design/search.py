@@ -68,10 +68,10 @@ class Plan(NamedTuple):
 
 
 @step(lambda setup, *_: (HERE, Information(HERE, tuple(Contrast(HERE, HERE, HERE) for _ in setup.pairs))))
-def evaluated(setup: Setup, proposal: Proposal, few: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
+def evaluated(setup: Setup, proposal: Proposal, recorded: int) -> tuple[Bool[np.ndarray, " proposal"], Information]:
     """Proposals that stay inside the limits, and the information of each."""
     u, start = played(proposal, setup.limits, setup.t), starts(proposal, setup.limits)
-    trials = motions(setup.paths, setup.limits, setup.t, u, start, few, key=setup.key)
+    trials = motions(setup.paths, setup.limits, setup.t, u, start, recorded, key=setup.key)
     seq = blank(setup.t, u, len(setup.fit.model.measured))
     return allowed(trials, setup.limits), expected_information(setup, seq, trials.x, start).times(setup.share)
 
@@ -101,8 +101,8 @@ def search(
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
         costs = criterion.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
-        one = pool.expected.of(chosen[-1])
-        total = one if total is None else total + one
+        added = pool.expected.of(chosen[-1])
+        total = added if total is None else total + added
     plan = _of(pool, np.asarray(chosen))
     log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
@@ -151,10 +151,10 @@ def _bettered(
     ok, expected = evaluated(setup, other, effort.few)
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
-        rest = _of(plan, np.arange(count) != slot).expected.sum()
-        costs = criterion.cost(rest + expected.of(np.append(mine, 0)))[: len(mine)]
-        now = float(criterion.cost(plan.expected.sum()))
-        if len(mine) and np.nanmin(costs, initial=np.inf) < now:
+        remainder = _of(plan, np.arange(count) != slot).expected.sum()
+        costs = criterion.cost(remainder + expected.of(np.append(mine, 0)))[: len(mine)]
+        current = float(criterion.cost(plan.expected.sum()))
+        if len(mine) and np.nanmin(costs, initial=np.inf) < current:
             best = int(mine[np.nanargmin(costs)])
             plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),
                             _of(plan, np.arange(count) > slot)])  # fmt: skip

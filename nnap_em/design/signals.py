@@ -108,12 +108,12 @@ def played(
     goal = z[..., -1:] * (middle[:, None] + half[:, None] * wave)
     most, out = limits.rate * (t[1] - t[0]), np.zeros_like(goal)
     rest = np.clip(0.0, limits.low, limits.high)
-    now = np.broadcast_to(rest, goal.shape[:-1])
+    value = np.broadcast_to(rest, goal.shape[:-1])
     for k in range(t.size):
         left = (t.size - k) * most  # to be back at rest in the end
-        now = np.clip(goal[..., k], now - most, now + most)
-        now = np.clip(now, np.maximum(limits.low, rest - left), np.minimum(limits.high, rest + left))
-        out[..., k] = now
+        value = np.clip(goal[..., k], value - most, value + most)
+        value = np.clip(value, np.maximum(limits.low, rest - left), np.minimum(limits.high, rest + left))
+        out[..., k] = value
     return np.swapaxes(out, 1, 2)
 
 

@@ -48,11 +48,11 @@ def _track(null: StateSpaceModel, one) -> Track:
     dof = len(null.system.coordinates)
     still = jnp.zeros(dof, mean.dtype)
     rate = jax.vmap(lambda x, u: null.rate(x, u, still))
-    now = rate(mean, inputs)
-    middle = mean + 0.5 * null.dt * now
+    rates = rate(mean, inputs)
+    middle = mean + 0.5 * null.dt * rates
     acceleration = rate(middle, inputs)[:, dof : 2 * dof]
     along = lambda x, rate, u: jax.jvp(lambda x: null.true(x, u), (x,), (rate,))  # noqa: E731
-    true, past = jax.vmap(along)(mean, now, inputs)
+    true, past = jax.vmap(along)(mean, rates, inputs)
     past = past.at[0].set(0.0)  # the first row has none
     drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, inputs)
     friction = jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
@@ -121,12 +121,12 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     """Stack made by NumPy: a stack of many small arrays would be one program for every number of them."""
     flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
     stacked = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
-    same = [bool((a == a[0]).all()) for a in stacked]
-    if all(same):  # one probe, or one given twice
-        same = [False] * len(same)
+    constants = [bool((a == a[0]).all()) for a in stacked]
+    if all(constants):  # one probe, or one given twice
+        constants = [False] * len(constants)
     pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
-    leaves = [np.asarray(a[0]) if one else pad(a) for a, one in zip(stacked, same, strict=True)]
-    axes = [None if one else 0 for one in same]
+    leaves = [np.asarray(a[0]) if constant else pad(a) for a, constant in zip(stacked, constants, strict=True)]
+    axes = [None if constant else 0 for constant in constants]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
 
 
@@ -166,16 +166,16 @@ def candidate_columns(
 
     def along(track: Track) -> Columns:
         length = track.x.shape[1]
-        more = [(0, 0), (0, max(0, rows - length))]
-        longer = lambda a: np.pad(a, more + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
+        padding = [(0, 0), (0, max(0, rows - length))]
+        longer = lambda a: np.pad(a, padding + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
         track = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
         force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):
-                for full, own in ((force, columns.force), (reading, columns.reading)):
-                    full[:, stack.places] = np.asarray(own)[:, : len(stack.places), :length]
+                for full, values in ((force, columns.force), (reading, columns.reading)):
+                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places), :length]
         return Columns(force, reading)
 
     return along

@@ -86,36 +86,38 @@ def findings(closed: Closed) -> list[Finding]:
     """All effects found, each with its equivalents."""
     fitted, model = closed.after, closed.after.model
     cov = covariance(fitted)
-    own = [cov[block, block] for block in blocks(model, fitted.m_step)]
+    covariances = [cov[block, block] for block in blocks(model, fitted.m_step)]
     laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]
-    entries = list(zip(model.effects, closed.found, own, laws, strict=True))
+    entries = list(zip(model.effects, closed.found, covariances, laws, strict=True))
     out = []
-    for effect, found, numbers, law in entries:
+    for effect, record, numbers, law in entries:
         if law is not None:
             continue  # reported with the law that it completes
         drawn = effect.curve(numbers, model.system)
         parameters = estimates(effect, numbers, model.system)
         sizes = ", ".join(f"{n} = {with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items())
-        rest = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
-        form, remains = (shape(one) if one else None for one in (drawn, rest))
+        remainder = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
+        form, remains = (shape(one) if one else None for one in (drawn, remainder))
         sentence = ": ".join(filter(None, (words(key_of(effect)), sizes, form.words if form else "")))
-        if rest is not None and remains is not None:
-            left = f"{np.ptp(rest.mean):.2g} {rest.unit}: {remains.words}"
+        if remainder is not None and remains is not None:
+            left = f"{np.ptp(remainder.mean):.2g} {remainder.unit}: {remains.words}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
         evidence = {
-            "log_likelihood_gain": found.gain,
-            "p_value": max(found.p_value, 1e-300),
-            "held_out_gain": found.held_out,
-            "share_of_error": found.share,
+            "log_likelihood_gain": record.gain,
+            "p_value": max(record.p_value, 1e-300),
+            "held_out_gain": record.held_out,
+            "share_of_error": record.share,
         }
-        beside = drawn is None and rest is not None
-        one = Finding(effect, parameters, evidence, found.equivalent, sentence, drawn or rest, form or remains, beside)
+        beside = drawn is None and remainder is not None
+        one = Finding(
+            effect, parameters, evidence, record.equivalent, sentence, drawn or remainder, form or remains, beside
+        )
         out.append(one)
     return out
 
 
 def verdict(
-    found: Sequence[Finding],
+    accepted: Sequence[Finding],
     error: Mapping[str, Any] | None,
     failed: int = 0,
     rivals: Sequence[Key] = (),
@@ -130,29 +132,29 @@ def verdict(
     """
     if not complete:
         first = (
-            verdict(found, error, failed, rivals, suspects)
-            if found or rivals or suspects
+            verdict(accepted, error, failed, rivals, suspects)
+            if accepted or rivals or suspects
             else "No effect was found yet."
         )
         return f"{first} The search was not finished in the time given: more may be missing."
-    if not found and rivals:
+    if not accepted and rivals:
         return (
             f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "
             "same; none is added."
         )
-    if not found and suspects:
-        first, *more = suspects
-        others = f" ({len(more)} more below)" if more else ""
+    if not accepted and suspects:
+        first, *remaining = suspects
+        others = f" ({len(remaining)} more below)" if remaining else ""
         return f"No effect is certain to be missing. Suspected: {first.description}{others}."
-    if not found and failed:
+    if not accepted and failed:
         return (
             "No single effect of the catalogue is certain to be missing, but the declared model does not explain "
             f"everything: {failed} tests of its one-step errors fail."
         )
-    if not found:
+    if not accepted:
         return "Nothing is missing that these data could show: the declared model explains them."
-    names = listed([_sized(finding) for finding in found])
-    it = "it" if len(found) == 1 else "them"
+    names = listed([_sized(finding) for finding in accepted])
+    it = "it" if len(accepted) == 1 else "them"
     text = f"The model lacks {names}"
     if not error:
         return text + "."
@@ -221,7 +223,7 @@ class Dispute(NamedTuple):
 def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
     """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
-    for dispute in [one for step in closed.last for one in step.disputed][:most]:
+    for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
         name, joint, channel, inputs = dispute.key
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
@@ -253,14 +255,14 @@ class SuspectReport(NamedTuple):
 def suspected(closed: Closed) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
-    for each in [one for step in closed.last for one in step.suspects]:
-        name, joint, channel, inputs = each.key
+    for suspect in [entry for step in closed.last for entry in step.suspects]:
+        name, joint, channel, inputs = suspect.key
         text = (
-            f"{words(each.key)} would remove {each.share:.0%} of the squared prediction error, "
-            f"where chance removes {f'up to {each.chance:.0%}' if each.chance >= 0.005 else 'less than 1%'}"
+            f"{words(suspect.key)} would remove {suspect.share:.0%} of the squared prediction error, "
+            f"where chance removes {f'up to {suspect.chance:.0%}' if suspect.chance >= 0.005 else 'less than 1%'}"
         )
         place = catalogue[name].key(), joint, channel, list(inputs)
-        report = SuspectReport(*place, each.share, each.chance, words(each.key), text, catalogue[name].confirm)
+        report = SuspectReport(*place, suspect.share, suspect.chance, words(suspect.key), text, catalogue[name].confirm)
         out.append(report)
     return out
 
@@ -271,7 +273,7 @@ def undecided(closed: Closed) -> tuple[Key, ...]:
 
 
 def advice(
-    found: Sequence[Finding],
+    accepted: Sequence[Finding],
     disputed: Sequence[Dispute] = (),
     rivals: Sequence[Key] = (),
     suspects: Sequence["SuspectReport"] = (),
@@ -279,9 +281,9 @@ def advice(
     """Sentences on the next measurement."""
     out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     out += [MORE] if suspects else []
-    out += [f"To see a {each.law} by itself: {each.confirm}" for each in suspects if each.confirm]
+    out += [f"To see a {suspect.law} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm]
     out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
-    for finding in found:
+    for finding in accepted:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
         for key in finding.equivalent:

@@ -35,8 +35,8 @@ def motions(
         both = known.all(axis=0)
         if 2 * both.sum() < known.sum(axis=1).max():  # too short a part of the longer one to be its repetition
             continue
-        difference, own = np.mean((scaled[i] - scaled[j])[both] ** 2), np.mean(scaled[[i, j]][:, both] ** 2)
-        if difference < REPEATS * own:
+        difference, square = np.mean((scaled[i] - scaled[j])[both] ** 2), np.mean(scaled[[i, j]][:, both] ** 2)
+        if difference < REPEATS * square:
             motion[motion == motion[j]] = motion[i]
     return motion
 

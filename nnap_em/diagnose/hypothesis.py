@@ -53,18 +53,18 @@ class Hypothesis(NamedTuple):
     def additions(self) -> tuple[Addition, ...]:
         """The effects of the model, each with all that belongs to it."""
         prior = self.m_step.prior
+        entries = zip(self.model.effects, blocks(self.model, self.m_step), self.found, strict=True)
         return tuple(
-            Addition(effect, prior.mean[here], prior.std[here], found)
-            for effect, here, found in zip(self.model.effects, blocks(self.model, self.m_step), self.found, strict=True)
+            Addition(effect, prior.mean[block], prior.std[block], evidence) for effect, block, evidence in entries
         )
 
     def having(self, additions: tuple[Addition, ...]) -> "Hypothesis":
         """The same declared model with other additions."""
         prior = self.m_step.prior
         declared = prior.size - sum(a.mean.shape[0] for a in self.additions)
-        own = [f"{i}.{name}" for i, a in enumerate(additions) for name in fields(a.effect)]
+        added = [f"{i}.{name}" for i, a in enumerate(additions) for name in fields(a.effect)]
         joined = ParameterPrior(
-            prior.declared + tuple(own),
+            prior.declared + tuple(added),
             jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
             jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
         )
@@ -74,10 +74,10 @@ class Hypothesis(NamedTuple):
         )
         return Hypothesis(model, rule, tuple(a.found for a in additions))
 
-    def plus(self, effect: AbstractEffect, candidate: Candidate, found: Found | None = None) -> "Hypothesis":
+    def plus(self, effect: AbstractEffect, candidate: Candidate, evidence: Found | None = None) -> "Hypothesis":
         """The hypothesis with one effect more, behind the others."""
         centre = candidate.start if effect.linear else effect
-        return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.spread), found)))
+        return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.spread), evidence)))
 
     def without(self, place: int) -> "Hypothesis":
         """The hypothesis without the effect at `place`."""
@@ -87,11 +87,11 @@ class Hypothesis(NamedTuple):
         """The same with other numbers in the model."""
         return self._replace(model=model)
 
-    def with_evidence(self, place: int, found: Found) -> "Hypothesis":
+    def with_evidence(self, place: int, evidence: Found) -> "Hypothesis":
         """The same with the evidence of the effect at `place`."""
-        evidence = list(self.found)
-        evidence[place] = found
-        return self._replace(found=tuple(evidence))
+        entries = list(self.found)
+        entries[place] = evidence
+        return self._replace(found=tuple(entries))
 
 
 def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:

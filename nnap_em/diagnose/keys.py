@@ -46,21 +46,21 @@ def listed(names: Sequence[str]) -> str:
 
 def remainder_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the named law whose rest an unnamed one is: a function of the same signals at the same joint."""
-    laws = (i for i, e in enumerate(model.effects) if e.named and _alike(e, effect, model))
+    laws = (i for i, e in enumerate(model.effects) if e.named and _same_signals(e, effect, model))
     return None if effect.named else next(laws, None)
 
 
 def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the law whose place `effect` takes: of the same key in another form, as one that repeats each turn."""
-    alike = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
+    places = (i for i, e in enumerate(model.effects) if key_of(e) == key_of(effect))
     if effect.named:  # of a law with a form the richer one alone
-        alike = (i for i in alike if flat(effect).size > flat(model.effects[i]).size)
-    return next((i for i in alike if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
+        places = (i for i in places if flat(effect).size > flat(model.effects[i]).size)
+    return next((i for i in places if jax.tree.structure(model.effects[i]) != jax.tree.structure(effect)), None)
 
 
 def completed(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """True if an unnamed law in the model is a function of the same signals at the same joint as a named one."""
-    return effect.named and any(not e.named and _alike(e, effect, model) for e in model.effects)
+    return effect.named and any(not e.named and _same_signals(e, effect, model) for e in model.effects)
 
 
 def free_signals(law: AbstractEffect) -> int:
@@ -70,12 +70,12 @@ def free_signals(law: AbstractEffect) -> int:
 
 def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:
     """True where a function at a joint can be what `law` is: a named law of its signals, or a function of fewer."""
-    own, its = (set(effect.signals(system)) for effect in (free, law))
-    inside = its == own if law.named else its < own
-    return not free.named and bool(its) and inside and free.joint == law.joint
+    signals, of_law = (set(effect.signals(system)) for effect in (free, law))
+    inside = of_law == signals if law.named else of_law < signals
+    return not free.named and bool(of_law) and inside and free.joint == law.joint
 
 
-def _alike(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
+def _same_signals(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
     """True if both are functions of the same signals at the same joint."""
-    own, its = (set(effect.signals(model.system)) for effect in (one, other))
-    return bool(own) and own == its and one.joint == other.joint
+    first, second = (set(effect.signals(model.system)) for effect in (one, other))
+    return bool(first) and first == second and one.joint == other.joint

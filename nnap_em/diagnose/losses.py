@@ -107,7 +107,7 @@ class MultiStep(AbstractLoss):
 
     def left(self, fit: SmoothedFit) -> float:
         """Product of what each refit left: a later law must remove the floor of the first error, not of the rest."""
-        removed = [found.removed for found in fit.now.found if found is not None]
+        removed = [evidence.removed for evidence in fit.now.found if evidence is not None]
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
@@ -120,7 +120,7 @@ class MultiStep(AbstractLoss):
         predictions = open_loop(
             followed(model, weights.prior, path, data),
             weights,
-            lambda some: blocks(along(jax.tree.map(lambda a: a[some], track))),
+            lambda sequences: blocks(along(jax.tree.map(lambda a: a[sequences], track))),
             every,
         )
         rows, weight = starts(model, data, every), weighed(predictions, fit.used)
@@ -158,13 +158,13 @@ class OneStep(AbstractLoss):
         """Innovations in standard deviations; derivatives by the sensitivity equations of the Kalman filter."""
         model, data = fit.model, fit.data
         weights = fit.m_step.weights(model)
-        here = locals_along(model, weights.prior, fit.path, data, CUBATURE)
-        track = tracks(model, fit.path, here.seq.inputs)
+        linear = locals_along(model, weights.prior, fit.path, data, CUBATURE)
+        track = tracks(model, fit.path, linear.seq.inputs)
         along = candidate_columns(_machine(fit), candidates, fit.rows)
         common = (model.log_q, model.log_r, model.start, weights.nodes)
         parts = []
-        for _, (local, own) in turns(len(data.t), here, track):  # columns of all at once fill the memory
-            innovations = each(_innovations, common, (local, own.middle, along(own)), together=1)
+        for _, (local, batch) in turns(len(data.t), linear, track):  # columns of all at once fill the memory
+            innovations = each(_innovations, common, (local, batch.middle, along(batch)), together=1)
             parts.append([np.asarray(a, np.float32) for a in innovations])
         error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
         finite = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
@@ -205,12 +205,12 @@ def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
 
 def _innovations(common, one) -> tuple[Float[Array, "time obs"], Float[Array, "time obs column"]]:
     """Whitened innovations of one sequence and what friction nodes, parameters and candidates take off them."""
-    (log_q, log_r, start, nodes), (here, middle, columns) = common, one
+    (log_q, log_r, start, nodes), (linear, middle, columns) = common, one
     dof = nodes.shape[0]
-    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
-    moved = jnp.einsum("tsd,ctd->tsc", here.by_force, columns.force)
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], here.by_force)
-    states = jnp.concatenate([torque, here.by_parameter, moved], axis=-1)
-    read = read_columns(nodes, here, middle, columns)
-    states = jnp.where(here.seq.active[:, None, None], states, 0.0)
-    return filtered.innovation, whitened_sensitivities(filtered, states, read, here.seq.observed)
+    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
+    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], linear.by_force)
+    states = jnp.concatenate([torque, linear.by_parameter, moved], axis=-1)
+    read = read_columns(nodes, linear, middle, columns)
+    states = jnp.where(linear.seq.active[:, None, None], states, 0.0)
+    return filtered.innovation, whitened_sensitivities(filtered, states, read, linear.seq.observed)

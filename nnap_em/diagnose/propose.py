@@ -69,9 +69,9 @@ def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
 def proposals(around: Around, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:
     """Everything in the catalogue that this machine could have, and other forms of what is `known` to be there."""
     every = [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
-    there = {key_of(candidate.start) for candidate in every}
+    keys = {key_of(candidate.start) for candidate in every}
     free = (form for law in known if law.named for form in free_form(law, around))
-    every += [form for form in free if key_of(form.start) not in there]
+    every += [form for form in free if key_of(form.start) not in keys]
     return every + [form for law in known for form in law.richer(around)]
 
 

@@ -16,7 +16,7 @@ from .hypothesis import Found, Hypothesis
 from .verdict import ONE_STEP
 
 
-def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMState | None]:
+def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesis, EMState | None]:
     """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise.
 
     A fit that took the steps for motion has lost its way: it begins again where it was short.
@@ -25,9 +25,9 @@ def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMSt
     for i, channel in enumerate(rig.measured):
         y = np.asarray(context.data.y)[..., i]
         step = grid_step(y.ravel())
-        model = cast(StateSpaceModel, state.best if state else now.model)
-        declared, now_r = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
-        share = step**2 / 12 / (declared**2 if declared else max(now_r - step**2 / 12, 0.25 * now_r))
+        model = cast(StateSpaceModel, state.best if state else hypothesis.model)
+        declared, estimated = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
+        share = step**2 / 12 / (declared**2 if declared else max(estimated - step**2 / 12, 0.25 * estimated))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
         if share < 0.1 or gain < ONE_STEP.nats:
             continue
@@ -35,11 +35,11 @@ def quantised(context: SearchContext, now: Hypothesis) -> tuple[Hypothesis, EMSt
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        found = Found(float(gain), float(gain), 0.0)
+        evidence = Found(float(gain), float(gain), 0.0)
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
-        now = now.refitted(early).plus(effect, candidate, found)
+        hypothesis = hypothesis.refitted(early).plus(effect, candidate, evidence)
         if declared:
-            log_r = now.model.log_r.at[i].set(math.log(declared**2 + step**2 / 12))
-            now = now.refitted(eqx.tree_at(lambda m: m.log_r, now.model, log_r))
-        state = extend(context, now, first)
-    return now, state
+            log_r = hypothesis.model.log_r.at[i].set(math.log(declared**2 + step**2 / 12))
+            hypothesis = hypothesis.refitted(eqx.tree_at(lambda m: m.log_r, hypothesis.model, log_r))
+        state = extend(context, hypothesis, first)
+    return hypothesis, state

@@ -43,11 +43,11 @@ class Trial(NamedTuple):
 
 def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
     """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
-    (log_q, log_r, start), (here, path) = common, one
-    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    (log_q, log_r, start), (linear, path) = common, one
+    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
     posterior = linear_posterior(filtered, rts(filtered))
     nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
-    read = jnp.einsum("tos,tns->tno", here.reading.rows, nodes) + here.reading.offset[:, None]
+    read = jnp.einsum("tos,tns->tno", linear.reading.rows, nodes) + linear.reading.offset[:, None]
     known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(posterior.state.mean))
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
@@ -71,12 +71,12 @@ def refit(
     core = m_step.core(model)
 
     def program(rule: ScoringMStep, core: Core, path: Gaussian):
-        here = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
-        posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (here, path))
-        following, hessian, _ = rule.advance(core, here, posterior, read, jnp.asarray(used))
+        linear = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
+        posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (linear, path))
+        following, hessian, _ = rule.advance(core, linear, posterior, read, jnp.asarray(used))
         return following, steady, posterior.loglik, hessian
 
-    best, stride, here, goal = None, 1.0, core, core
+    best, stride, base, goal = None, 1.0, core, core
     for count in range(passes):
         rule = m_step if count >= HELD else still
         proposal, smoothed, loglik, hessian = program(rule, core, path)
@@ -84,11 +84,11 @@ def refit(
         if best is None or total >= best[0] - 0.5:
             if best is None or total > best[0]:
                 best = (total, core, np.asarray(loglik), hessian, smoothed)
-            goal, here, stride = proposal, core, min(1.0, 2 * stride)
+            goal, base, stride = proposal, core, min(1.0, 2 * stride)
             path = smoothed
         else:
             stride, path = stride / 3, best[4]
-        core = between(here, goal, stride)
+        core = between(base, goal, stride)
     assert best is not None
     _, core, loglik, hessian, path = best
     return Trial(m_step.whole(model, core), m_step, path, loglik, hessian)

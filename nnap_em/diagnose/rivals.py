@@ -45,7 +45,7 @@ def instead(
     """
     fit = _smoothed(fitted, data, place)
     around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
-    same = [one for one in proposals(around, fit.model.effects) if means(one.start)]
+    same = [candidate for candidate in proposals(around, fit.model.effects) if means(candidate.start)]
     trials = []
     screened = sorted(screen(OneStep(), fit, same, shifts=0).screened, key=lambda s: -s.share.inside) if same else []
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
@@ -68,22 +68,22 @@ def compare_equivalents(closed: Closed, data: Dataset) -> Closed:
     Screens are linear, fits over the whole length are not: an equivalent that is
     clearly less likely goes, and one that is clearly likelier takes the place of its effect.
     """
-    for place, found in enumerate(closed.found):
-        if not found.equivalent:
+    for place, evidence in enumerate(closed.found):
+        if not evidence.equivalent:
             continue
-        fitted, held = closed.after, key_of(closed.after.model.effects[place])
-        own, *others = ((key, instead(fitted, data, place, partial(_is, key))) for key in (held, *found.equivalent))
-        own = max(_total(one) for one in (again(fitted, data), own[1]) if one is not None)
-        leads = {key: _total(other) - own for key, other in others if other is not None}
+        fitted, keys = closed.after, (key_of(closed.after.model.effects[place]), *evidence.equivalent)
+        reference, *others = ((key, instead(fitted, data, place, partial(_is, key))) for key in keys)
+        reference = max(_total(one) for one in (again(fitted, data), reference[1]) if one is not None)
+        leads = {key: _total(other) - reference for key, other in others if other is not None}
         best, other = max(others, key=lambda entry: leads.get(entry[0], -math.inf))
         if other is not None and leads[best] > EQUIVALENT_NATS:
-            rest = [one for i, one in enumerate(closed.found) if i != place]
+            remaining = [one for i, one in enumerate(closed.found) if i != place]
             equivalent = [key for key, lead in leads.items() if key != best and leads[best] - lead <= EQUIVALENT_NATS]
-            found = found._replace(equivalent=tuple(equivalent), gain=found.gain + leads[best])
-            return closed._replace(after=_settled(other, data), found=(*rest, found))
-        equivalent = [key for key in found.equivalent if leads.get(key, 0.0) >= -EQUIVALENT_NATS]
+            evidence = evidence._replace(equivalent=tuple(equivalent), gain=evidence.gain + leads[best])
+            return closed._replace(after=_settled(other, data), found=(*remaining, evidence))
+        equivalent = [key for key in evidence.equivalent if leads.get(key, 0.0) >= -EQUIVALENT_NATS]
         both = closed.found[:place], closed.found[place + 1 :]
-        closed = closed._replace(found=(*both[0], found._replace(equivalent=tuple(equivalent)), *both[1]))
+        closed = closed._replace(found=(*both[0], evidence._replace(equivalent=tuple(equivalent)), *both[1]))
     return closed
 
 
@@ -95,8 +95,8 @@ def _settled(fitted: Identified, data: Dataset) -> Identified:
     """A quick refit after EM over the whole length."""
     data = jax.device_put(data)
     context = _context(fitted, data)
-    now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    return finished(fitted._replace(state=extend(context, now, context.longest)), data)
+    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
+    return finished(fitted._replace(state=extend(context, hypothesis, context.longest)), data)
 
 
 def _context(fitted: Identified, data: Dataset) -> SearchContext:
@@ -106,10 +106,10 @@ def _context(fitted: Identified, data: Dataset) -> SearchContext:
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:
     """Smoothed fit without one of its effects, over the whole length."""
     data = jax.device_put(data)
-    now = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    now = now if place is None else now.without(place)
+    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
+    hypothesis = hypothesis if place is None else hypothesis.without(place)
     context = _context(fitted, data)
-    return smooth(context, now, context.longest)[0]._replace(declared=now.having(()))
+    return smooth(context, hypothesis, context.longest)[0]._replace(declared=hypothesis.having(()))
 
 
 def _total(fitted: Identified) -> float:

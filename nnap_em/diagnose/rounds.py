@@ -134,9 +134,9 @@ def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: Sta
 
 def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSystem) -> bool:
     """True for laws of another kind and of other signals."""
-    own, its = (set(effect.signals(system)) for effect in (best, one))
-    alike = one.named and one.name == best.name
-    return not alike and bool(own and its) and own.isdisjoint(its)
+    of_best, of_one = (set(effect.signals(system)) for effect in (best, one))
+    same_law = one.named and one.name == best.name
+    return not same_law and bool(of_best and of_one) and of_best.isdisjoint(of_one)
 
 
 def score(screened: Screened, model: StateSpaceModel) -> float:
@@ -203,17 +203,19 @@ def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
 def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
     """The best law of every kind that would reach its bar, had a few recordings not contradicted."""
     best: dict[Key, Disputed] = {}
-    for one in every:
-        folds, key = np.asarray(one.share.folds), key_of(one.candidate.start)
-        if one.share.least < required(one.bar, free_signals(one.candidate.start)) or agreed(one.share.folds, one.floor):
+    for screened in every:
+        share, start = screened.share, screened.candidate.start
+        if share.least < required(screened.bar, free_signals(start)) or agreed(share.folds, screened.floor):
             continue
-        held = seen.members[one.band]
+        folds = np.asarray(share.folds)
+        held = seen.members[screened.band]
         against = held[folds < 0].any(axis=0)
         if not 0 < 2 * against.sum() < held.any(axis=0).sum():
             continue  # no odd ones: it is no law
-        if not seeded(one.candidate, one.coefficients).possible():
+        if not seeded(screened.candidate, screened.coefficients).possible():
             continue
-        entry = Disputed(key, one.share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))
+        key = key_of(start)
+        entry = Disputed(key, share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))
         if key not in best or best[key].share < entry.share:
             best[key] = entry
     return tuple(sorted(best.values(), key=lambda entry: -entry.share))

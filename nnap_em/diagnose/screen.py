@@ -113,11 +113,11 @@ def project(
     order, root = np.argsort(cell, kind="stable"), np.sqrt(linearised.weight[keep])
     error = (root * linearised.error[keep])[order]
     columns = (root[:, None] * linearised.columns[keep])[order].astype(float)
-    nuisance, own = columns[:, : len(pull)], columns[:, len(pull) :]
+    nuisance, candidates = columns[:, : len(pull)], columns[:, len(pull) :]
     factor = np.linalg.cholesky(nuisance.T @ nuisance + precision)
     solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
     error = error - nuisance @ solve(nuisance.T @ error - pull)
-    return Rows(error, own - nuisance @ solve(nuisance.T @ own), cell[order], step, linearised.overlap)
+    return Rows(error, candidates - nuisance @ solve(nuisance.T @ candidates), cell[order], step, linearised.overlap)
 
 
 def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
@@ -128,15 +128,15 @@ def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> 
     the end changes its sign, since a constant would keep its meaning.
     """
     columns = linearised.columns.copy()
-    for weight, own in zip(linearised.weight, columns, strict=True):
+    for weight, sequence in zip(linearised.weight, columns, strict=True):
         at = np.flatnonzero((weight > 0).any(axis=1))
         if len(at) < SHIFTABLE:
-            own[..., nuisance:] = 0.0  # too few to lose their meaning: they take no part
+            sequence[..., nuisance:] = 0.0  # too few to lose their meaning: they take no part
             continue
         by = rng.integers(len(at) // 4, 3 * len(at) // 4 + 1)
-        moved = np.roll(own[at][..., nuisance:], by, axis=0)
+        moved = np.roll(sequence[at][..., nuisance:], by, axis=0)
         moved[:by] *= -1
-        own[at, ..., nuisance:] = moved
+        sequence[at, ..., nuisance:] = moved
     return linearised._replace(columns=columns)
 
 
@@ -173,9 +173,9 @@ def _gone(c, score, gram) -> Float[np.ndarray, " candidate"]:
 def _sums(rows: Rows, places: Int[np.ndarray, "candidate probe"], ridge) -> _Sums:
     edges = np.flatnonzero(np.diff(rows.cell)) + 1
     scores, grams = [], []
-    for here in np.split(np.arange(len(rows.cell)), edges):
-        x = np.moveaxis(rows.columns[here[0] : here[-1] + 1][:, places], 0, 1)  # candidate row probe
-        scores.append(np.einsum("mrk,r->mk", x, rows.error[here[0] : here[-1] + 1]))
+    for indices in np.split(np.arange(len(rows.cell)), edges):
+        x = np.moveaxis(rows.columns[indices[0] : indices[-1] + 1][:, places], 0, 1)  # candidate row probe
+        scores.append(np.einsum("mrk,r->mk", x, rows.error[indices[0] : indices[-1] + 1]))
         grams.append(np.swapaxes(x, 1, 2) @ x)
     return _Sums(np.stack(scores), np.stack(grams), ridge)
 
@@ -194,17 +194,17 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
     inside, left_out, directions = np.zeros((3, len(candidates)))
     folds, coefficients = np.zeros((len(candidates), len(held))), np.zeros(where[-1].stop)
     for size in np.unique(sizes) if len(held) > 1 else ():  # of one fold nothing can be left out
-        some = np.flatnonzero(sizes == size)
-        places = np.array([np.arange(where[int(i)].start, where[int(i)].stop) for i in some])
-        sums = _sums(rows, places, np.array([_ridge(candidates[int(i)]) for i in some]))
-        gone, coefficients[places], directions[some] = sums.fitted()
-        count = np.maximum(len(rows.error) / rows.overlap, directions[some] + 2)
-        inside[some] = 1 - (1 - gone / total) * (count - 1) / (count - directions[some] - 1)
+        indices = np.flatnonzero(sizes == size)
+        places = np.array([np.arange(where[int(i)].start, where[int(i)].stop) for i in indices])
+        sums = _sums(rows, places, np.array([_ridge(candidates[int(i)]) for i in indices]))
+        gone, coefficients[places], directions[indices] = sums.fitted()
+        count = np.maximum(len(rows.error) / rows.overlap, directions[indices] + 2)
+        inside[indices] = 1 - (1 - gone / total) * (count - 1) / (count - directions[indices] - 1)
         out = np.stack([sums.left_out(fold == f) for f in np.unique(fold)], axis=1)
-        folds[some] = out / np.where(out < 0, np.maximum(held, held.mean()), held)
+        folds[indices] = out / np.where(out < 0, np.maximum(held, held.mean()), held)
         moments = sum(sums.left_out(block == b) for b in np.unique(block))
-        least = np.where(np.asarray(timed)[some], np.inf, moments)
-        left_out[some] = np.minimum(out.sum(axis=1), least) / total
+        least = np.where(np.asarray(timed)[indices], np.inf, moments)
+        left_out[indices] = np.minimum(out.sum(axis=1), least) / total
     return Shares(inside, left_out, folds, directions, coefficients)
 
 
@@ -285,21 +285,21 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
 def _screened(
     shares: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float, independent: float
 ) -> Iterator[Screened]:
-    for i, (candidate, here) in enumerate(zip(candidates, spans(candidates), strict=True)):
+    for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
         directions = round(float(shares.directions[i]))
-        yield Screened(candidate, shares.coefficients[here], directions, share, band, floor, chance, independent)
+        yield Screened(candidate, shares.coefficients[span], directions, share, band, floor, chance, independent)
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:
     """Share of the information on the `chosen` candidate that each could not give in its place; 0: the same model."""
     candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
     where = spans(candidates)
-    own = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
-    total, out = information[own, own].astype(float), []
-    for here in where:
-        cross = information[own, here].astype(float)
-        block = information[here, here].astype(float)
+    reference = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
+    total, out = information[reference, reference].astype(float), []
+    for span in where:
+        cross = information[reference, span].astype(float)
+        block = information[span, span].astype(float)
         left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross.T
         out.append(float(np.clip(np.trace(left) / max(np.trace(total), 1e-300), 0.0, 1.0)))
     return out

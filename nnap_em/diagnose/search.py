@@ -37,46 +37,48 @@ from .trial import Refit, fitted
 from .verdict import Rejection, explains, needed
 
 
-def _forward(context: SearchContext, now: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
-    """`now` with the law that a screening round over `length` rows accepts; as it is, where it accepts none."""
+def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
+    """The hypothesis with the law that a screening round over `length` rows accepts; unchanged, if it accepts none."""
     release_programs()
-    fit, followed = smooth(context, now, length)
+    fit, followed = smooth(context, hypothesis, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
     context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
-    added = sum(not effect.read_off for effect in now.model.effects)
+    added = sum(not effect.read_off for effect in hypothesis.model.effects)
     if not fit.used.any() or added >= context.effort.most:
-        return now
+        return hypothesis
     outcome = screening_round(fit, context)
     steps.append(outcome.step)
     if outcome.step.untried:
         raise TimeUp
-    return now if outcome.accepted is None else _with(now, outcome.accepted, _found(outcome, context.loss), context)
+    if outcome.accepted is None:
+        return hypothesis
+    return _with(hypothesis, outcome.accepted, _evidence(outcome, context.loss), context)
 
 
-def _with(now: Hypothesis, case: Refit, found: Found, context: SearchContext) -> Hypothesis:
-    """`now` with a refitted law; a named law whose remainder explains the larger part of both gives way to that."""
+def _with(hypothesis: Hypothesis, case: Refit, evidence: Found, context: SearchContext) -> Hypothesis:
+    """The hypothesis with a refitted law; a named law gives way to a remainder that explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
-    m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, now.m_step.tie)  # under the old hold on noise
-    following, rest = case.after._replace(m_step=m_step), remainder_of(case.effect, now.model)
-    form = replaced(case.effect, now.model)
-    place = rest if form is None else form
-    law = None if place is None else now.found[place]
+    m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, hypothesis.m_step.tie)  # under the old hold on noise
+    following, remainder = case.after._replace(m_step=m_step), remainder_of(case.effect, hypothesis.model)
+    form = replaced(case.effect, hypothesis.model)
+    place = remainder if form is None else form
+    law = None if place is None else hypothesis.found[place]
     if law is None or (form is None and explains(law.removed, case.removed)):
-        return following.with_evidence(-1, found)
-    both = found._replace(removed=1 - (1 - law.removed) * (1 - case.removed))  # over the model without the older law
+        return following.with_evidence(-1, evidence)
+    both = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))  # over the model without the older law
     following = following.with_evidence(-1, both)
     if form is not None:  # its place is taken already
         return following
-    context.log(f"  {words(key_of(now.model.effects[cast(int, rest)]))} is a part of it, and is removed")
-    return following.without(cast(int, rest))
+    context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
+    return following.without(cast(int, remainder))
 
 
-def _names(now: Hypothesis) -> frozenset[tuple[Key, Any]]:
+def _names(hypothesis: Hypothesis) -> frozenset[tuple[Key, Any]]:
     """The laws and their forms."""
-    return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in now.model.effects)
+    return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in hypothesis.model.effects)
 
 
-def _found(outcome: Round, loss: AbstractLoss) -> Found:
+def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Refit, outcome.accepted)
     screened, directions = case.screened, max(case.screened.directions, 1)
@@ -86,44 +88,44 @@ def _found(outcome: Round, loss: AbstractLoss) -> Found:
     return Found(case.gain, held_out, p_value, outcome.equivalent, share, case.removed)
 
 
-def _backward(context: SearchContext, now: Hypothesis) -> Hypothesis:
+def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
     """Backward elimination: remove laws, the least needed first, without which a fit loses too little to count.
 
     The models with and without a law are fitted in the same way, from their own smoothed paths.
     """
-    while now.found:
-        fit, _ = smooth(context, now, context.longest)
+    while hypothesis.found:
+        fit, _ = smooth(context, hypothesis, context.longest)
         if not fit.used.any():
             break
-        full = fitted(now, fit.path, fit, context.loss, context.effort.passes)
-        losses = [_lost(context, now, full, fit, place) for place in range(len(now.found))]
+        full = fitted(hypothesis, fit.path, fit, context.loss, context.effort.passes)
+        losses = [_share_without(context, hypothesis, full, fit, place) for place in range(len(hypothesis.found))]
         least = int(np.argmin(losses))
         floor = context.loss.bars.floor(context.loss.count(fit))
         if needed(losses[least], floor):
             break
-        name = words(key_of(now.model.effects[least]))
+        name = words(key_of(hypothesis.model.effects[least]))
         reason = f"without it {losses[least]:.1%} of the squared error is lost, {floor:.1%} counts"
         context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
-        now = now.without(least)
-    return now
+        hypothesis = hypothesis.without(least)
+    return hypothesis
 
 
-def _lost(context: SearchContext, now: Hypothesis, full, fit, place: int) -> float:
+def _share_without(context: SearchContext, hypothesis: Hypothesis, full, fit, place: int) -> float:
     """Share of the squared error of a fit without an effect that the fit with it removes, at its best band of horizons.
 
     Infinite for steps of a reading, which are seen in the numbers themselves.
     """
-    effect = now.model.effects[place]
-    if effect.read_off or any(remainder_of(other, now.model) == place for other in now.model.effects):
+    effect = hypothesis.model.effects[place]
+    if effect.read_off or any(remainder_of(other, hypothesis.model) == place for other in hypothesis.model.effects):
         return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
     if not effect.possible():
         return -math.inf
-    less = now.without(place)
-    own, _ = smooth(context, less, context.longest)
-    both = fit._replace(used=fit.used & own.used)
+    reduced = hypothesis.without(place)
+    smoothed, _ = smooth(context, reduced, context.longest)
+    both = fit._replace(used=fit.used & smoothed.used)
     if not both.used.any():  # without it no sequence is followed
         return math.inf
-    trial = fitted(less, own.path, both._replace(now=less), context.loss, context.effort.passes)
+    trial = fitted(reduced, smoothed.path, both._replace(now=reduced), context.loss, context.effort.passes)
     return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
 
 
@@ -137,11 +139,11 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     before, data = context.before, context.data
     begun = _quantised(context)
     one_step = _by_one_step(context, *begun) if white else None
-    now, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
-    if not now.found or state is None:
+    hypothesis, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
+    if not hypothesis.found or state is None:
         return Closed(before, before, (), tuple(steps), complete=complete)
-    outcome = finished(_outcome(before, now, state), data)
-    closed = Closed(before, outcome, cast(tuple[Found, ...], now.found), tuple(steps), complete=complete)
+    outcome = finished(_outcome(before, hypothesis, state), data)
+    closed = Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
     if one_step is None or not complete:  # to compare equivalents takes a fit for each
         return closed
     try:
@@ -151,15 +153,15 @@ def search(context: SearchContext, *, white: bool) -> Closed:
         return closed
 
 
-def _by_one_step(context: SearchContext, now: Hypothesis, state: EMState | None) -> "_Searched | None":
+def _by_one_step(context: SearchContext, hypothesis: Hypothesis, state: EMState | None) -> "_Searched | None":
     """Outcome of a search by one-step errors; None where its innovations are not white, so that it proves nothing."""
-    found = _search(context._replace(loss=OneStep()), now, state, _ladder(context))
-    white = white_innovations(_outcome(context.before, found.now, found.state), context.data)
+    searched = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
+    white = white_innovations(_outcome(context.before, searched.hypothesis, searched.state), context.data)
     if not white:
         context.log(
             "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
         )
-    return found if white else None
+    return searched if white else None
 
 
 def _quantised(context: SearchContext) -> tuple[Hypothesis, EMState | None]:
@@ -190,21 +192,21 @@ def _first(context: SearchContext) -> int:
     return max(most, default=min(followed, default=context.longest))
 
 
-def _outcome(before: Identified, now: Hypothesis, state: EMState | None) -> Identified:
-    return before if state is None else before._replace(state=state, m_step=now.m_step)
+def _outcome(before: Identified, hypothesis: Hypothesis, state: EMState | None) -> Identified:
+    return before if state is None else before._replace(state=state, m_step=hypothesis.m_step)
 
 
 class _Searched(NamedTuple):
     """Outcome of a search by one loss."""
 
-    now: Hypothesis
+    hypothesis: Hypothesis
     state: EMState | None
     """Its fit over the whole length; None for the declared model."""
     steps: list[Step]
     complete: bool = True
 
 
-def _search(context: SearchContext, now: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
+def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
     """Forward selection and backward elimination by one loss, until neither changes anything or the time is up.
 
     The rounds look at `lengths` rows in turn, then, and after the first law at once, at all.  A law that was accepted
@@ -217,29 +219,29 @@ def _search(context: SearchContext, now: Hypothesis, state: EMState | None, leng
     while True:
         length = ahead.pop(0)
         best = state.best if state else context.stages[length][0].best if length < longest else context.before.model
-        now = now.refitted(cast(StateSpaceModel, best))
+        hypothesis = hypothesis.refitted(cast(StateSpaceModel, best))
         try:
             with until(context.until):
-                more = _forward(context, now, length, steps)
-                if more.found is now.found and ahead:
+                proposed = _forward(context, hypothesis, length, steps)
+                if proposed.found is hypothesis.found and ahead:
                     continue
-                searched.add(_names(now))
-                if _names(more) in searched:  # nothing new, or one law in the place of another and back
+                searched.add(_names(hypothesis))
+                if _names(proposed) in searched:  # nothing new, or one law in the place of another and back
                     steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
-                    more = _backward(context, now)
-                    if more.found is now.found:
-                        return _Searched(now, state, steps)
+                    proposed = _backward(context, hypothesis)
+                    if proposed.found is hypothesis.found:
+                        return _Searched(hypothesis, state, steps)
         except TimeUp:
             context.log("the time is up: the search is not finished")
-            return _Searched(now, state, steps, complete=False)
+            return _Searched(hypothesis, state, steps, complete=False)
         try:
-            now, state = more, extend(context, more, length) if more.found else None
+            hypothesis, state = proposed, extend(context, proposed, length) if proposed.found else None
         except FitError as error:
             context.log(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
-            return _Searched(now, state, steps)
-        if _names(now) in searched:
-            return _Searched(now, state, steps)
+            return _Searched(hypothesis, state, steps)
+        if _names(hypothesis) in searched:
+            return _Searched(hypothesis, state, steps)
         ahead = [longest]
 
 

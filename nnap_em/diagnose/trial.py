@@ -54,19 +54,19 @@ class Refit(NamedTuple):
         )
 
 
-def fitted(now: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
-    """`now` after some passes from a path, finished before and after on what the loss looks at."""
-    begun = Trial(now.model, now.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
+def fitted(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
+    """`hypothesis` after some passes from a path, finished before and after on the data of the loss."""
+    begun = Trial(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
     begun = loss.finish(fit, begun)
-    return loss.finish(fit, refit(begun.model, now.m_step.early(), path, fit.data, fit.used, passes=passes))
+    return loss.finish(fit, refit(begun.model, hypothesis.m_step.early(), path, fit.data, fit.used, passes=passes))
 
 
 def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
     """A candidate in the model, or in the place of the law that it is another form of, refitted."""
-    candidate, now = screened.candidate, fit.now
+    candidate, hypothesis = screened.candidate, fit.now
     effect = seeded(candidate, screened.coefficients)
-    place = replaced(effect, now.model)
-    full = (now if place is None else now.without(place)).plus(effect, candidate)
+    place = replaced(effect, hypothesis.model)
+    full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, candidate)
     trial = fitted(full, extended(full.model, fit.path, fit.data), fit, loss, passes)
     after = full.refitted(trial.model)
     gain = np.nan_to_num(trial.loglik, nan=-1e3) - np.nan_to_num(null.loglik, nan=-1e3)
@@ -81,27 +81,28 @@ def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: Abst
     )
 
 
-def _covariance(now: Hypothesis, hessian, place: int) -> np.ndarray:
+def _covariance(hypothesis: Hypothesis, hessian, place: int) -> np.ndarray:
     """Covariance of the parameters of an effect, all else integrated out."""
-    prior, here = now.m_step.prior, blocks(now.model, now.m_step)[place]
+    prior, block = hypothesis.m_step.prior, blocks(hypothesis.model, hypothesis.m_step)[place]
     cov = np.linalg.inv(np.asarray(hessian))
-    cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)[here]
-    return cov[cut:, cut:][here, here] * np.outer(std, std)
+    cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)[block]
+    return cov[cut:, cut:][block, block] * np.outer(std, std)
 
 
-def certainty(candidate: Candidate, now: Hypothesis, hessian, place: int = -1) -> float:
+def certainty(candidate: Candidate, hypothesis: Hypothesis, hessian, place: int = -1) -> float:
     """Wald statistic of the strengths of the effect at `place`, jointly, in standard deviations [Wald 1943].
 
     Half its square is the log-likelihood that would be lost without the effect, to second order.
     """
     none = np.asarray(flat(candidate.start))
     strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
-    cov = _covariance(now, hessian, place)[np.ix_(strong, strong)]
-    away = (np.asarray(flat(now.model.effects[place])) - none)[strong]
+    cov = _covariance(hypothesis, hessian, place)[np.ix_(strong, strong)]
+    away = (np.asarray(flat(hypothesis.model.effects[place])) - none)[strong]
     return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
 
 
-def _amplitude(now: Hypothesis, hessian, place: int = -1) -> float:
+def _amplitude(hypothesis: Hypothesis, hessian, place: int = -1) -> float:
     """Standard deviations of the reported amplitude of an effect from zero."""
-    reported = estimates(now.model.effects[place], _covariance(now, hessian, place), now.model.system).get("amplitude")
+    model, cov = hypothesis.model, _covariance(hypothesis, hessian, place)
+    reported = estimates(model.effects[place], cov, model.system).get("amplitude")
     return reported.value / reported.std if reported and reported.std > 0 else np.inf

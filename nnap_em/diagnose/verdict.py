@@ -144,12 +144,12 @@ def needed(share: float, floor: float) -> bool:
     return share >= KEEP * floor
 
 
-def explains(own: float, more: float) -> bool:
+def explains(law: float, remainder: float) -> bool:
     """True where a named law stays beside its remainder.
 
-    The law removes the share `own`, the remainder the share `more` of what is left then.
+    The law removes the share `law`, the remainder the share `remainder` of what is left then.
     """
-    return own >= EQUIVALENT * (own + (1 - own) * more)
+    return law >= EQUIVALENT * (law + (1 - law) * remainder)
 
 
 def suspected(share: float, floor: float, chance: float) -> bool:

@@ -72,9 +72,11 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     kinds = _kinds(fields)
     for rate, (d, array, kind) in enumerate((("", "position", "theta"), ("d", "velocity", "dtheta"))):
         for i, joint in enumerate(machine.joints):
-            own = [sensor.name for sensor in machine.joint_sensors if (sensor.joint, sensor.rate) == (i, bool(rate))]
+            sensors = [
+                sensor.name for sensor in machine.joint_sensors if (sensor.joint, sensor.rate) == (i, bool(rate))
+            ]
             at = _first(fields, [d + joint.name, f"{array}[{joint.name}]"])
-            if at is None and (sensor := next((name for name in own if _first(fields, [name])), None)):
+            if at is None and (sensor := next((name for name in sensors if _first(fields, [name])), None)):
                 out[sensor] = _first(fields, [sensor])
             elif at := at or kinds.get(f"{kind}{i + 1}"):
                 out[d + joint.name] = at
@@ -118,8 +120,8 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
     motors = motors or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]
     out: dict[str, tuple[Address, str]] = {}
     for i, (name, joint) in enumerate(motors):
-        own = [name] if name in servos else [name, f"effort[{name}]"]
-        at = _first(fields, own) or (order[i] if len(order) == len(motors) else None)
+        names = [name] if name in servos else [name, f"effort[{name}]"]
+        at = _first(fields, names) or (order[i] if len(order) == len(motors) else None)
         at = at or next((at for at, word in fields if joint in word and COMMAND.search(word)), None)
         if name not in servos:
             at = at or kinds.get(f"input{i + 1}") or (kinds.get("input") if len(motors) == 1 else None)
@@ -132,9 +134,9 @@ def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.nda
     """Some of the log on uniform rows; of a CSV file its own."""
     if path.suffix.lower() != ".csv":
         return columns_table(path, columns)
-    given = numbers(path)
-    time = next((given[name] for name in given if meaning(name).kind == "time"), None)
-    return ({} if time is None else {"time": time}) | {name: given[at.path] for name, at in columns.items()}
+    table = numbers(path)
+    time = next((table[name] for name in table if meaning(name).kind == "time"), None)
+    return ({} if time is None else {"time": time}) | {name: table[at.path] for name, at in columns.items()}
 
 
 def _model(machine: Machine, file: str) -> Iterator[str]:

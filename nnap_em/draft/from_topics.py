@@ -103,6 +103,6 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     for name, place in columns.items():
         track = tracks[place.topic]
         y = track.values[place.path]
-        there = np.isfinite(y)
-        table[name] = np.interp(at, (track.t[there] - origin) * 1e-9, y[there]) if there.any() else 0 * at
+        finite = np.isfinite(y)
+        table[name] = np.interp(at, (track.t[finite] - origin) * 1e-9, y[finite]) if finite.any() else 0 * at
     return table

@@ -136,8 +136,8 @@ class LoadFriction(JointEffect):
         return [_grown(self, squared, 1 / float(around.torque[self.joint - 1]))]
 
     def _with_stribeck(self, velocity: float) -> "LoadFriction":
-        more = replace(self, stribeck=a(0.0), log_velocity=a(math.log(velocity)))
-        return more if self.load is None else replace(more, load_stribeck=a(0.0))
+        extended = replace(self, stribeck=a(0.0), log_velocity=a(math.log(velocity)))
+        return extended if self.load is None else replace(extended, load_stribeck=a(0.0))
 
     def _with_load(self) -> "LoadFriction":
         share = 1.0 if self.whole else 0.0
@@ -155,8 +155,8 @@ class LoadFriction(JointEffect):
     def _shares(self) -> tuple[Scalar | None, ...]:
         """Coefficients of motor and load, steady and at rest; None: no such number."""
         shares: list[Scalar | None] = []
-        for own, its in ((self.mu, self.load), (self.stribeck, self.load_stribeck)):
-            shares += [own, own if its is None and self.whole else its]
+        for motor, load in ((self.mu, self.load), (self.stribeck, self.load_stribeck)):
+            shares += [motor, motor if load is None and self.whole else load]
         return tuple(shares)
 
     def possible(self):
@@ -173,13 +173,13 @@ class LoadFriction(JointEffect):
         total = _through(motor, load, self.mu, self.load, whole=self.whole)
         if self.stribeck is None or self.log_velocity is None:
             return total
-        more = _through(motor, load, self.stribeck, self.load_stribeck, whole=self.whole)
+        stribeck = _through(motor, load, self.stribeck, self.load_stribeck, whole=self.whole)
         if self.square_motor is not None and self.square_load is not None:
             driving = jnp.where(
                 jnp.abs(motor) > jnp.abs(load), self.square_load * load**2, self.square_motor * motor**2
             )
-            more = more + jnp.where(motor * load > 0, driving, 0.0)
-        return total + more * jnp.exp(-((rate * jnp.exp(-self.log_velocity)) ** 2))
+            stribeck = stribeck + jnp.where(motor * load > 0, driving, 0.0)
+        return total + stribeck * jnp.exp(-((rate * jnp.exp(-self.log_velocity)) ** 2))
 
     def force(self, scene, memory):
         motor, rate = self.own(scene.drive), self.own(scene.v)

@@ -63,8 +63,8 @@ class PeriodicForce(JointEffect):
         x, count = np.linspace(0.0, 2.0, 121), self.harmonics
         angle = 2 * np.pi * x[:, None] * np.arange(1, count + 1)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
-        own = cov[: 2 * count, : 2 * count]
-        std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, own, basis), 0.0))
+        block = cov[: 2 * count, : 2 * count]
+        std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, block, basis), 0.0))
         mean = basis @ np.concatenate([self.sine, self.cosine])
         time = x / float(self.frequency)
         return Curve("time", "s", self.joint, system.force_unit(self.joint), False, time, mean, std)

@@ -162,12 +162,12 @@ class HardStop(PlaceEffect):
             low, high = float(around.low[j - 1]), float(around.high[j - 1])
             k, size = 20 * float(around.torque[j - 1]), 0.5 * (high - low)
             middle = 0.5 * (low + high)
-            make, given = partial(cls.of, joint=j), (np.log(k), np.log(0.02 * k), 2 * size, np.log(0.1 * k))
-            start, spread = make(1e3, -1e3, *given), make(0.2 * size, 0.2 * size, 1.0, 1.0, *given[2:])
+            make, numbers = partial(cls.of, joint=j), (np.log(k), np.log(0.02 * k), 2 * size, np.log(0.1 * k))
+            start, spread = make(1e3, -1e3, *numbers), make(0.2 * size, 0.2 * size, 1.0, 1.0, *numbers[2:])
             shares = (0.4, 0.55, 0.7, 0.85, 0.95, 1.1)
             for above, below in itertools.product(shares, shares):
                 up, down = middle + above * size, middle - below * size
-                out.append(Candidate(start, (make(up, down, *given),), spread))
+                out.append(Candidate(start, (make(up, down, *numbers),), spread))
         return out
 
     def possible(self):

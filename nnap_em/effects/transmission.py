@@ -92,8 +92,8 @@ class Backlash(Transmission):
         out = []
         for j, size in around.driven:
             inertia, k = MOTOR * around.inertia(j), 50 * size
-            rest = np.log([inertia, 0.5 * np.sqrt(k * inertia), k])
-            none, *loose = (cls.of(gap, *rest, joint=j) for gap in (0.0, 0.03, 0.1, 0.25))
+            numbers = np.log([inertia, 0.5 * np.sqrt(k * inertia), k])
+            none, *loose = (cls.of(gap, *numbers, joint=j) for gap in (0.0, 0.03, 0.1, 0.25))
             out += [Candidate(none, (play,), cls.of(0.1, 0.7, 1.0, 0.7, joint=j)) for play in loose]
         return out
 

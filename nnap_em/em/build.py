@@ -116,14 +116,14 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
     drive = np.zeros(dof)
     servos, valid = build_servos(rig), np.asarray(data.valid)
     for i, joint in enumerate(rig.input_joints):
-        given, position = u[..., i], system.coordinates[joint - 1]
+        torque, position = u[..., i], system.coordinates[joint - 1]
         if servos and servos[i].feeds_back and position not in rig.measured:
             drive[joint - 1] = mass[joint - 1] * acceleration[joint - 1]
             continue
         if servos and servos[i].feeds_back:
             q, scale = system.gears[i] * y[..., rig.measured.index(position)], u[..., len(servos) :]
-            given = torque_along(servos[i], given, q, scale, rig.dt)
-        drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(given[valid] ** 2))
+            torque = torque_along(servos[i], torque, q, scale, rig.dt)
+        drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(torque[valid] ** 2))
     speed = np.maximum(speed, 1e-6)
     return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 

@@ -48,17 +48,17 @@ def _sensitivities(
         x = state.mean
 
         def both(z, u):
-            now = prior.write(model, value.at[free].set(z[dof:]))
-            return now.transition(x, u, z[:dof]), now.emission(x, u, z[:dof])
+            changed = prior.write(model, value.at[free].set(z[dof:]))
+            return changed.transition(x, u, z[:dof]), changed.emission(x, u, z[:dof])
 
         def along(dz, du):
             return jax.jvp(both, (z, u), (dz, du))[1]
 
         def pushed(p):
-            now = prior.write(model, value.at[held].set(p))
-            scene = now.scene(middle, u)
+            changed = prior.write(model, value.at[held].set(p))
+            scene = changed.scene(middle, u)
             nothing = jnp.zeros(0, x.dtype)
-            return sum((e.force(scene, nothing) for e in now.effects if e.held), still)
+            return sum((e.force(scene, nothing) for e in changed.effects if e.held), still)
 
         moved, read = jax.vmap(along, in_axes=(0, -1), out_axes=-1)(jnp.eye(z.shape[0], dtype=z.dtype), by_z)
         by_force, feels = moved[:, :dof], read[:, :dof] if model.system.sensors else None

@@ -22,8 +22,8 @@ class ParameterPrior(eqx.Module):
     def places(self, model) -> list:
         """The parameters in the model."""
         return [
-            getattr(model.effects[int(at)], own) if at.isdigit() else model.parameter(name)
-            for name, (at, _, own) in ((name, name.partition(".")) for name in self.names)
+            getattr(model.effects[int(at)], field) if at.isdigit() else model.parameter(name)
+            for name, (at, _, field) in ((name, name.partition(".")) for name in self.names)
         ]
 
     def read(self, model) -> Float[Array, " param"]:

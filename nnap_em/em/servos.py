@@ -26,8 +26,8 @@ def build_servos(rig: Rig) -> tuple[Servo, ...]:
     numbers = {name: jnp.asarray(rig.parameters[name].mean, float) for name in {*rig.parameters} - {*rig.bodies}}
 
     def servo(column: str, kind: str) -> Servo:
-        there = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
-        values = {key: numbers[f"{column}.{key}"] for key in there}
+        keys = (key for key in KINDS[kind] if f"{column}.{key}" in numbers)
+        values = {key: numbers[f"{column}.{key}"] for key in keys}
         scales = ((key, rig.input_scales.get(f"{column}.{key}", {})) for key in values)
         flat = tuple((key, rig.scale_columns.index(name), at) for key, scale in scales for name, at in scale.items())
         return Servo(column, kind, values, flat)

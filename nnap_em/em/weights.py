@@ -30,8 +30,8 @@ class Weights(eqx.Module):
         """A model after a step to other weights, its machine among those that can be."""
         cut = w.shape[0] - self.prior.size
         unknown = model.unknown.with_weights(w[:cut])
-        there = self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
-        return eqx.tree_at(lambda m: m.system, there, there.system.reached_from(model.system))
+        written = self.prior.write(eqx.tree_at(lambda m: m.unknown, model, unknown), w[cut:])
+        return eqx.tree_at(lambda m: m.system, written, written.system.reached_from(model.system))
 
     @eqx.filter_jit
     def phi(self, unknown, w: Float[Array, " weight"]) -> Float[Array, " phi"]:

@@ -48,16 +48,16 @@ def branches(
         return ()
     out = []
     for sequence in beyond(first, second):
-        one = jax.tree.map(lambda a, s=sequence: a[s : s + 1], (data, first.state))
-        mean, loglik = (np.asarray(a[0]) for a in each(_paths, (model, second), one))
+        batch = jax.tree.map(lambda a, s=sequence: a[s : s + 1], (data, first.state))
+        mean, loglik = (np.asarray(a[0]) for a in each(_paths, (model, second), batch))
         angles = mean[:, : int(np.sum(data.valid[sequence])), list(second.angles)]
         smoothed = np.asarray(first.state.mean[sequence])[: angles.shape[1], list(second.angles)]
         for i, share in zip(*modes(loglik, angles), strict=True):
             gap = distance(angles[i], smoothed)
             most = int(np.argmax(gap.max(axis=0)))
-            there = np.flatnonzero(gap[:, most] > APART / 2)
+            rows = np.flatnonzero(gap[:, most] > APART / 2)
             if share >= LEAST and gap.max() > APART:
-                span = int(there[0]), int(there[-1])
+                span = int(rows[0]), int(rows[-1])
                 out.append(Branch(int(sequence), float(share), mean[i], second.angles[most], span))
     return tuple(out)
 

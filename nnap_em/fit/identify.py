@@ -60,8 +60,8 @@ class Identified(NamedTuple):
 
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
-        found = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
-        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{found}\n  {self.model}"
+        line = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
+        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{line}\n  {self.model}"
 
 
 class FrictionTable(NamedTuple):
@@ -124,14 +124,16 @@ def identify(
     """
     if start is None:
         rig = holding(rig, not_identifiable(rig, build_system(rig), data))
-    now = begin(rig, data, key=key) if start is None else start
-    now = now if smoother is None else now._replace(smoother=smoother(now.bank))
-    state = fit(now.state, data, now.smoother, now.m_step, epochs=epochs, schedule=schedule, watch=watch)
-    now = now._replace(state=state)
+    fitted = begin(rig, data, key=key) if start is None else start
+    fitted = fitted if smoother is None else fitted._replace(smoother=smoother(fitted.bank))
+    state = fit(fitted.state, data, fitted.smoother, fitted.m_step, epochs=epochs, schedule=schedule, watch=watch)
+    fitted = fitted._replace(state=state)
     if rig.memory and start is None:
-        found = remember(state, now.m_step, now.smoother, data, epochs=epochs, watch=watch)
-        now = now._replace(state=found.state, m_step=found.m_step, memory="\n".join(found.sentences))
-    return finished(now, data)
+        remembered = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
+        fitted = fitted._replace(
+            state=remembered.state, m_step=remembered.m_step, memory="\n".join(remembered.sentences)
+        )
+    return finished(fitted, data)
 
 
 PARTS = 2
@@ -161,8 +163,8 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
-    now = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    stated = widened(*now, key=jax.random.fold_in(fitted.state.key, 1))
+    problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
+    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, 1))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 
@@ -208,17 +210,17 @@ def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> Fr
 @eqx.filter_jit
 def _friction(weights: Weights, unknown, w, hessian, velocity, contacts: StateSpaceModel | None):
     """Torque at `velocity`, and its covariance; with the effects of `contacts`."""
-    here = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
-    jac = here.jacobian(unknown, w)[: velocity.size]
-    torque = here.phi(unknown, w)[: velocity.size]
+    at_velocity = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
+    jac = at_velocity.jacobian(unknown, w)[: velocity.size]
+    torque = at_velocity.phi(unknown, w)[: velocity.size]
     if contacts is not None and contacts.effects:
-        own = slice(w.shape[0] - weights.prior.size, None)
+        parameters = slice(w.shape[0] - weights.prior.size, None)
 
         def sliding(z):
             effects = weights.prior.write(contacts, z).effects
             return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T.ravel()
 
-        torque, jac = torque + sliding(w[own]), jac.at[:, own].add(jax.jacfwd(sliding)(w[own]))
+        torque, jac = torque + sliding(w[parameters]), jac.at[:, parameters].add(jax.jacfwd(sliding)(w[parameters]))
     half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True).T
     half = half.reshape(*velocity.shape, -1)
     return torque.reshape(velocity.shape), jnp.einsum("jaw,jbw->jab", half, half)

@@ -108,23 +108,23 @@ def _levels(model: StateSpaceModel, v: Float[Array, " dof"], q: Float[Array, "po
     return jnp.maximum(dry, 0.01 * network.scale), jnp.min(alone, axis=0)
 
 
-def contact(model: StateSpaceModel, found: Sizes, joint: int, level: float, distance: float) -> DynamicFriction:
+def contact(model: StateSpaceModel, scales: Sizes, joint: int, level: float, distance: float) -> DynamicFriction:
     """Dahl's contact of a joint, of some level [N m] and distance [rad].
 
     Its damper is a fifth of critical at the level of the map, and falls with the level.
     """
     j, step = joint - 1, model.dt / model.steps
-    damping = 0.4 * level * math.sqrt(found.inertia[j] / (found.level[j] * distance))
+    damping = 0.4 * level * math.sqrt(scales.inertia[j] / (scales.level[j] * distance))
     log = lambda x: jnp.asarray(math.log(x), float)  # noqa: E731
     return DynamicFriction(
         log_level=log(level),
         log_distance=log(distance),
         log_damping=log(damping),
         log_rise=log(RISE),
-        log_velocity=log(STRIBECK * found.speed[j]),
+        log_velocity=log(STRIBECK * scales.speed[j]),
         shape=jnp.zeros(SHAPES),
-        knee=0.01 * found.speed[j],
-        stiffest=found.inertia[j] / step**2,  # a radian of its own vibration in an integration step
+        knee=0.01 * scales.speed[j],
+        stiffest=scales.inertia[j] / step**2,  # a radian of its own vibration in an integration step
         fastest=jnp.asarray(2 / step, float),  # within the stability of Runge and Kutta's method, 2.78
         joint=joint,
     )
@@ -169,8 +169,8 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
     def one(mean, cov, seq):
         def step(m, slices):
             x, u = slices
-            rest = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
-            return integrate(rest, m, model.dt, model.steps), m
+            memory_rate = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
+            return integrate(memory_rate, m, model.dt, model.steps), m
 
         _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
         wide = jnp.zeros((mean.shape[0], states, states), cov.dtype)
@@ -182,13 +182,13 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
 
 def _score(common, one) -> tuple[Float[Array, " phi"], Float[Array, "phi phi"]]:
     """Score and information of one sequence, linear about its path: of the node torques, then of the parameters."""
-    (log_q, log_r, start, nodes), (here, path) = common, one
+    (log_q, log_r, start, nodes), (linear, path) = common, one
     dof = nodes.shape[0]
-    filtered = kalman_filter(log_q, log_r, start, here.affine, here.reading, here.seq)
+    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
     speed = path.mean[:, None, dof : 2 * dof]
-    torque = jax.vmap(lambda v, by_force: friction_columns(nodes, v, by_force))(speed, here.by_force)
-    columns = jnp.where(here.seq.active[:, None, None], jnp.concatenate([torque, here.by_parameter], axis=-1), 0.0)
-    jac = whitened_sensitivities(filtered, columns, reading_columns(nodes, speed, here), here.seq.observed)
+    torque = jax.vmap(lambda v, by_force: friction_columns(nodes, v, by_force))(speed, linear.by_force)
+    columns = jnp.where(linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter], axis=-1), 0.0)
+    jac = whitened_sensitivities(filtered, columns, reading_columns(nodes, speed, linear), linear.seq.observed)
     jac = jac.reshape(-1, jac.shape[-1])
     return jac.T @ filtered.innovation.ravel(), jac.T @ jac
 
@@ -199,7 +199,7 @@ def screen(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
-    found: Sizes,
+    scales: Sizes,
     distance: Float[np.ndarray, " dof"],
     joints: Sequence[int],
 ) -> Screen:
@@ -208,23 +208,25 @@ def screen(
 
     [Rao 1948, Proc. Camb. Phil. Soc. 44(1)]  One linearisation of the model, no EM.
     """
-    level = FAINT * found.level
-    contacts = [contact(model, found, j + 1, level[j], distance[j]) for j in joints]
+    level = FAINT * scales.level
+    contacts = [contact(model, scales, j + 1, level[j], distance[j]) for j in joints]
     faint, rule = with_contacts(model, rule, contacts, ("log_level",))
     path = extended(faint, path, data)
-    here: Local = locals_along(faint, rule.prior, path, data, TANGENT)
+    linear: Local = locals_along(faint, rule.prior, path, data, TANGENT)
     weights = rule.weights(faint)
     common = faint.log_q, faint.log_r, faint.start, weights.nodes
-    scores, informations = map(np.asarray, each(_score, common, (here, path)))
+    scores, informations = map(np.asarray, each(_score, common, (linear, path)))
     used = used & np.isfinite(scores).all(axis=1) & np.isfinite(informations).all(axis=(1, 2))
     score, information = scores[used].sum(axis=0), informations[used].sum(axis=0)
     prior, jac = map(np.asarray, weights.hessian(faint.unknown, weights.read(faint), weights.symmetry()))
     precision, score = prior + jac.T @ information @ jac, jac.T @ score
-    rest, own = slice(0, len(score) - len(joints)), slice(len(score) - len(joints), len(score))
-    precision[own, own] -= np.eye(len(joints))  # a level is free
-    both = np.linalg.solve(precision[rest, rest], np.column_stack([precision[rest, own], score[rest]]))
-    left = np.diag(precision[own, own] - precision[own, rest] @ both[:, :-1])  # each joint's contact alone
-    pull = score[own] - precision[own, rest] @ both[:, -1]
+    nuisance, levels = slice(0, len(score) - len(joints)), slice(len(score) - len(joints), len(score))
+    precision[levels, levels] -= np.eye(len(joints))  # a level is free
+    both = np.linalg.solve(
+        precision[nuisance, nuisance], np.column_stack([precision[nuisance, levels], score[nuisance]])
+    )
+    left = np.diag(precision[levels, levels] - precision[levels, nuisance] @ both[:, :-1])  # each joint's contact alone
+    pull = score[levels] - precision[levels, nuisance] @ both[:, -1]
     sign = np.sqrt(np.maximum(left, 1e-300))
     out = Screen(distance, *(np.zeros_like(distance) for _ in range(3)))
     at = list(joints)
@@ -265,32 +267,34 @@ def remember(
     A joint whose friction the model lacks pushes the others too: the one that shows memory best goes first, and the
     others are screened again with it in the model.
     """
-    now = _smoothed(state, rule, smoother, data)
-    joints = range(len(now.model.system.coordinates))
+    fitted = _smoothed(state, rule, smoother, data)
+    joints = range(len(fitted.model.system.coordinates))
     sentences: dict[int, str] = {}
     for _ in joints:
         left = [j for j in joints if not sentences.get(j, "").startswith(FOUND)]
-        found = sizes(now.model, now.path, data, now.used)
-        steps = np.geomspace(found.shortest, found.longest, DISTANCES)
-        tries = [screen(now.model, now.rule, now.path, data, now.used, found, step, left) for step in steps]
-        best = {j: max(tries, key=lambda one: one.wald[j]) for j in left}
-        sentences |= {j: _unseen(now.model, found, tries, j) for j in left}
+        scales = sizes(fitted.model, fitted.path, data, fitted.used)
+        steps = np.geomspace(scales.shortest, scales.longest, DISTANCES)
+        tries = [
+            screen(fitted.model, fitted.rule, fitted.path, data, fitted.used, scales, step, left) for step in steps
+        ]
+        best = {j: max(tries, key=lambda tested: tested.wald[j]) for j in left}
+        sentences |= {j: _unseen(fitted.model, scales, tries, j) for j in left}
         j = max(left, key=lambda j: best[j].wald[j], default=-1)
         if j < 0 or best[j].wald[j] < WALD:
             break
-        level = float(np.clip(best[j].level[j], 0.1 * found.level[j], found.level[j]))
-        bristle = contact(now.model, found, j + 1, level, best[j].distance[j])
-        trial = _with(now, bristle, smoother, data, epochs=epochs, watch=watch)
-        accepted, reason = _judged(now, trial, data)
+        level = float(np.clip(best[j].level[j], 0.1 * scales.level[j], scales.level[j]))
+        bristle = contact(fitted.model, scales, j + 1, level, best[j].distance[j])
+        trial = _with(fitted, bristle, smoother, data, epochs=epochs, watch=watch)
+        accepted, reason = _judged(fitted, trial, data)
         sentences[j] = f"{FOUND if accepted else REFUSED} ({reason})"
         if not accepted or trial is None:
             break
-        now = trial
-    return Remembered(now.state, now.rule, tuple(f"joint {j + 1}: {sentences[j]}" for j in joints))
+        fitted = trial
+    return Remembered(fitted.state, fitted.rule, tuple(f"joint {j + 1}: {sentences[j]}" for j in joints))
 
 
 def _with(
-    now: _Fit,
+    fitted: _Fit,
     bristle: DynamicFriction,
     smoother: AbstractSmoother,
     data: Dataset,
@@ -299,8 +303,8 @@ def _with(
     watch: Watch,
 ) -> _Fit | None:
     """EM from a fit on, over whole sequences, with a contact more; None where it diverges."""
-    model, rule = with_contacts(straight_at_rest(now.model, [bristle]), now.rule, [bristle])
-    begin, before = start_state(model, rule, key=jax.random.fold_in(now.state.key, 1)), now.state.epoch
+    model, rule = with_contacts(straight_at_rest(fitted.model, [bristle]), fitted.rule, [bristle])
+    begin, before = start_state(model, rule, key=jax.random.fold_in(fitted.state.key, 1)), fitted.state.epoch
     blank = np.full(len(data.t), -np.inf)
     begin = begin._replace(epoch=1, top=blank, loglik=blank[:1])  # past the first epoch, the noise settled
 
@@ -312,30 +316,30 @@ def _with(
         state = fit(begin, data, smoother, rule, epochs=epochs + 1, schedule=Schedule(first=longest), watch=later)
     except FitError:
         return None
-    loglik = np.concatenate([now.state.loglik, state.loglik[1:]])
+    loglik = np.concatenate([fitted.state.loglik, state.loglik[1:]])
     return _smoothed(state._replace(epoch=before + state.epoch - 1, loglik=loglik), rule, smoother, data)
 
 
-def _judged(now: _Fit, trial: _Fit | None, data: Dataset) -> tuple[bool, str]:
+def _judged(fitted: _Fit, trial: _Fit | None, data: Dataset) -> tuple[bool, str]:
     """True where a trial is likelier by `GAIN`, predicts better and loses no sequence; and the evidence."""
     if trial is None:
         return False, "EM diverges with it"
-    both = now.used & trial.used
-    gain = float(np.sum((trial.loglik - now.loglik)[both]))
-    before, after = (errors(followed(one.model, one.rule.prior, one.path, data), JUDGED) for one in (now, trial))
+    both = fitted.used & trial.used
+    gain = float(np.sum((trial.loglik - fitted.loglik)[both]))
+    before, after = (errors(followed(one.model, one.rule.prior, one.path, data), JUDGED) for one in (fitted, trial))
     falls = ratio(before, after, both)
     reason = f"{gain:.3g} nat likelier, squared multi-step error {falls:.3g} times that of the static map"
-    return bool(both.sum() == now.used.sum() and gain >= GAIN and falls < 1.0), reason
+    return bool(both.sum() == fitted.used.sum() and gain >= GAIN and falls < 1.0), reason
 
 
 FOUND = "memory"
 REFUSED = "the static map is kept, memory predicts no better"
 
 
-def _unseen(model: StateSpaceModel, found: Sizes, tries: Sequence[Screen], j: int) -> str:
+def _unseen(model: StateSpaceModel, scales: Sizes, tries: Sequence[Screen], j: int) -> str:
     """The static map is kept since no distance shows a contact, with the levels that would have been seen."""
     unit, angle = model.system.force_unit(j + 1), model.system.unit(model.system.coordinates[j])
-    least, level = WALD * max(one.std[j] for one in tries), found.level[j]
+    least, level = WALD * max(tested.std[j] for tested in tries), scales.level[j]
     text = f"the static map is kept, no memory from {tries[0].distance[j]:.2g} to {tries[-1].distance[j]:.2g} {angle}"
     if least > level:
         return f"{text}; the logs could not show it: a level below {least:.2g} {unit}, and friction is {level:.2g}"

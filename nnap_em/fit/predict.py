@@ -86,8 +86,8 @@ class Paths(NamedTuple):
 
         def one(x, u, table, parameters):
             force = jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table)
-            now = self.prior.write(self.model, parameters)
-            return now.transition(x, u, force), now.shown(x, u, force)
+            model = self.prior.write(self.model, parameters)
+            return model.transition(x, u, force), model.shown(x, u, force)
 
         return jax.vmap(one)(x, u, self.tables, self.parameters)
 
@@ -139,8 +139,8 @@ def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
     data = jax.device_put(data)
     path, key = smooth(fitted, data).state, jax.random.key(1)
     phi = phi_samples(fitted, DRAWN, key=key)
-    more = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key)
-    return each(_shown, fitted.model, (path._replace(cov=path.cov + more), data))
+    model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key)
+    return each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
 
 
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:

@@ -146,14 +146,14 @@ def _tree(fitted: Identified) -> dict[str, Any]:
 def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Callable[[str, Any], Any]) -> Any:
     """`node` anew, with `leaf` applied to what is data in it and `setting` to what is static."""
     if isinstance(node, eqx.Module):
-        made = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
+        rebuilt = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
         for field in dataclasses.fields(node):
-            here, value = f"{place}/{field.name}", getattr(node, field.name)
+            child, value = f"{place}/{field.name}", getattr(node, field.name)
             static = field.metadata.get("static", False)
             object.__setattr__(
-                made, field.name, setting(here, value) if static else _rebuild(value, here, leaf, setting)
+                rebuilt, field.name, setting(child, value) if static else _rebuild(value, child, leaf, setting)
             )
-        return made
+        return rebuilt
     if isinstance(node, Mapping):
         return {name: _rebuild(value, f"{place}/{name}", leaf, setting) for name, value in node.items()}
     names = getattr(node, "_fields", None)
@@ -179,9 +179,11 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
     seen = set()
 
-    def differs(place: str, found: str) -> None:
-        made = f"it was written by nnap_em {header['version']}, this is {__version__}"
-        refuse(path, f"another structure at {place.strip('/')}: {found} ({made})", "identify again with this version")
+    def differs(place: str, problem: str) -> None:
+        versions = f"it was written by nnap_em {header['version']}, this is {__version__}"
+        refuse(
+            path, f"another structure at {place.strip('/')}: {problem} ({versions})", "identify again with this version"
+        )
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
@@ -241,10 +243,10 @@ def _drawn(path: Path, sketch: Mapping[str, Any], noun: str, known: Mapping[str,
     if "kind" in sketch:
         if sketch["kind"] not in known:
             refuse(path, f"its {noun} {sketch['kind']!r} is not known here", "first import what adds it")
-        made = object.__new__(known[sketch["kind"]])
+        skeleton = object.__new__(known[sketch["kind"]])
         for name, part in sketch["parts"].items():
-            object.__setattr__(made, name, _drawn(path, part, noun, known))
-        return made
+            object.__setattr__(skeleton, name, _drawn(path, part, noun, known))
+        return skeleton
     if "items" in sketch:
         return tuple(_drawn(path, item, noun, known) for item in sketch["items"])
     return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else tuples(sketch["plain"])

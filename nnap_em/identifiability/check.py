@@ -96,19 +96,19 @@ def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tu
     return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
 
 
-def _mark(look: object, bad: object = False) -> str:
-    return BAD if bad else LOOK if look else OK
+def _mark(warning: object, bad: object = False) -> str:
+    return BAD if bad else LOOK if warning else OK
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
     rows = data.valid.sum(axis=1)
-    few = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
+    shortage = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
     short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
     long = "cut them into sequences of some seconds" if rows.max() * rig.dt > 20 else ""
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
-    mark = _mark(short or long or little, few)
+    mark = _mark(short or long or little, shortage)
     amount = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield CheckResult(mark, "length", "; ".join(filter(None, (amount, few or little, short, long))))
+    yield CheckResult(mark, "length", "; ".join(filter(None, (amount, shortage or little, short, long))))
     if test is None:
         yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
     else:
@@ -130,13 +130,13 @@ def _rough(train: Logs) -> Iterator[CheckResult]:
     """Readings masked on reading, and their share of each column."""
     total = int(np.asarray(train.data.valid).sum())
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
-        here = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
-        count, what = sum(entry.amount for entry in here), f"{column}: " if column else ""
-        text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(here)} of {len(train.files)} files"
+        entries = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
+        count, what = sum(entry.amount for entry in entries), f"{column}: " if column else ""
+        text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(entries)} of {len(train.files)} files"
         yield CheckResult(
             _mark(True, count > 0.3 * total),
             "rough",
-            f"{text}, most in {max(here, key=lambda entry: entry.amount).file}",
+            f"{text}, most in {max(entries, key=lambda entry: entry.amount).file}",
         )
 
 
@@ -159,18 +159,18 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
         seen, spread = reading_noise(signal), float(np.nanstd(signal))
         declared = rig.noise_std.get(name)
-        loud = max(seen, declared or 0.0) > 0.3 * spread
+        noisy = max(seen, declared or 0.0) > 0.3 * spread
         alone = name not in model.system.sensors  # of three axes one may sense nothing
-        drowned = "; the motion hardly rises above it: move more, or look at the units" if loud else ""
+        drowned = "; the motion hardly rises above it: move more, or look at the units" if noisy else ""
         if declared is None:
             text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
-            yield CheckResult(_mark(loud, loud and alone), "noise", text)
+            yield CheckResult(_mark(noisy, noisy and alone), "noise", text)
             continue
         ratio = seen / declared
         how = f"{name}: declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
         tame = "; the log was filtered, or less is true" if ratio < 0.1 else ""
         wild = "; declare more, or leave it out to have it estimated" if ratio > 3 else ""
-        mark = _mark(tame or wild or loud, (loud and alone) or ratio > 30)
+        mark = _mark(tame or wild or noisy, (noisy and alone) or ratio > 30)
         yield CheckResult(mark, "noise", how + tame + wild + drowned)
 
 
@@ -185,9 +185,11 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         if rig.kinds[name] != TORQUE:
             continue
         unit = system.force_unit(joint)
-        given = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
-        ratio = given / needed[joint - 1]
-        text = f"{name}: up to {given:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
+        torque = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
+        ratio = torque / needed[joint - 1]
+        text = (
+            f"{name}: up to {torque:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
+        )
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
@@ -284,20 +286,20 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
                 BAD, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
             )
             continue
-        rest = float(np.mean(np.abs(inner) < 0.05 * top))
+        near_rest = float(np.mean(np.abs(inner) < 0.05 * top))
         bands = np.histogram(inner, np.linspace(-top, top, 21))[0]
         covered = float(np.mean(bands >= 5))
         turns = int(sum(_turns(row, 0.05 * top) for row in v))
         text = f"joint {joint + 1}{seen}: {low:.3g} to {high:.3g} {unit}, {100 * covered:.0f} % of that range covered, "
-        text += f"{100 * rest:.0f} % of the time near rest, {turns} changes of direction"
+        text += f"{100 * near_rest:.0f} % of the time near rest, {turns} changes of direction"
         hints = [
             (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
             (turns < 4, "too few turns to tell Coulomb friction"),
-            (rest > 0.8, "it rests most of the time"),
+            (near_rest > 0.8, "it rests most of the time"),
             (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
         ]
-        given = [hint for holds, hint in hints if holds]
-        yield CheckResult(_mark(given and rig.friction), "motion", "; ".join([text, *given]))
+        remarks = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(remarks and rig.friction), "motion", "; ".join([text, *remarks]))
 
 
 def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales: Scales) -> Iterator[CheckResult]:
@@ -324,8 +326,8 @@ def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales
             ),
             (least > 0.1 * (high - low), "that is more than a tenth of its range: sample faster, or move more gently"),
         ]
-        given = [hint for holds, hint in hints if holds]
-        yield CheckResult(_mark(given), "memory", "; ".join([text, *given]))
+        remarks = [hint for holds, hint in hints if holds]
+        yield CheckResult(_mark(remarks), "memory", "; ".join([text, *remarks]))
 
 
 def _velocity(

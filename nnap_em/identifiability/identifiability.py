@@ -78,7 +78,7 @@ def _columns(
     q, v, a = (jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, dof)), float) for _ in range(3))
     u = jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, len(system.joints))), float)
     servos = tuple(unlimited(servo.at(None)) for servo in servos)
-    own = [name for name in names if any(name == f"{s.column}.{key}" for s in servos for key in s.values)]
+    of_servos = [name for name in names if any(name == f"{s.column}.{key}" for s in servos for key in s.values)]
 
     def driven(system, servos, q, v, u):
         if not servos:
@@ -88,31 +88,31 @@ def _columns(
 
     def force(values, a):
         numbers = dict(zip(names, values, strict=True))
-        changed = system.with_parameters({name: value for name, value in numbers.items() if name not in own})
-        now = tuple(servo.with_values({name: numbers[name] for name in own}) for servo in servos)
-        needed = lambda q, v, a, u: changed.mass(q) @ a + changed.bias(q, v) - driven(changed, now, q, v, u)  # noqa: E731
+        changed = system.with_parameters({name: value for name, value in numbers.items() if name not in of_servos})
+        changed_servos = tuple(servo.with_values({name: numbers[name] for name in of_servos}) for servo in servos)
+        needed = lambda q, v, a, u: changed.mass(q) @ a + changed.bias(q, v) - driven(changed, changed_servos, q, v, u)  # noqa: E731
         return jax.vmap(needed)(q, v, a, u).ravel()
 
     numbers = {f"{servo.column}.{key}": value for servo in servos for key, value in servo.values.items()}
-    values = [numbers[name] if name in own else system.parameter(name) for name in names]
+    values = [numbers[name] if name in of_servos else system.parameter(name) for name in names]
     if servos:
-        given = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
-        a = jax.jit(jax.vmap(given))(q, v, u)
+        accelerations = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
+        a = jax.jit(jax.vmap(accelerations))(q, v, u)
     slopes = jax.jit(jax.jacfwd(force))(values, a)
     powers = np.asarray(v)[:, :, None] ** np.arange(4)
     curves = np.einsum("rjp,ij->rijp", powers, np.eye(dof)).reshape(q.size, -1)
     return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves
 
 
-def sentences(found: Identifiability) -> list[str]:
+def sentences(result: Identifiability) -> list[str]:
     """Sentences of a report on parameters that are not identifiable."""
     out = []
-    if found.never:
-        out.append(f"no motion feels {', '.join(found.never)}: kept as declared; take out what you do not doubt")
-    if found.rubbed:
-        text = f"motions cannot tell {', '.join(found.rubbed)} from the learned friction of the joint"
+    if result.never:
+        out.append(f"no motion feels {', '.join(result.never)}: kept as declared; take out what you do not doubt")
+    if result.rubbed:
+        text = f"motions cannot tell {', '.join(result.rubbed)} from the learned friction of the joint"
         out.append(f"{text}: kept as declared, and friction is what is left; write a number where you know one")
-    for group in found.together:
+    for group in result.together:
         text = f"motions tell {', '.join(group)} only in combination"
         out.append(f"{text}: along the rest they keep what is declared, and their std says so")
     return out

@@ -37,8 +37,8 @@ def declare(root: Any) -> Declaration:
     _warn_of_left_out(root, machine)
     columns, joints, motored = _inputs(machine, root)
     motors = {motor.name: motor for motor in machine.motors} if motored else {}
-    given = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
-    drives = read_drives(root.table("input", absent={}), columns, given)
+    file_drives = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
+    drives = read_drives(root.table("input", absent={}), columns, file_drives)
     gears = tuple(_gear(motors.get(column), drives[column]) for column in columns)
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
@@ -138,7 +138,7 @@ def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ..
 
 
 def _place(machine: Machine, table: Any, joint: Any) -> int:
-    names = [one.name for one in machine.joints]
+    names = [declared.name for declared in machine.joints]
     if isinstance(joint, str):
         return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))
     if not isinstance(joint, int) or not 1 <= joint <= len(names):
@@ -150,19 +150,20 @@ def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
     """Every number of [model.uncertain], its mean that of the file where none is written."""
     table = model.table("uncertain", absent={})
     bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
-    given = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
-    given |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
+    means = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
+    means |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
     owners = [one.name for one in (*machine.bodies, *machine.joints)]
     for name, value in flat(table.items):
-        owner, _, own = name.partition(".")
+        owner, _, quantity = name.partition(".")
         if owner not in owners:
             table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
-        if name not in given:
-            known = [key.partition(".")[2] for key in given if key.partition(".")[0] == owner]
-            table.refuse(name, f"{owner!r} has no {own!r}" if own else "names no number", nearest(own, known))
-        declared = _declared(table, name, value, given[name])
+        if name not in means:
+            known = [key.partition(".")[2] for key in means if key.partition(".")[0] == owner]
+            problem = f"{owner!r} has no {quantity!r}" if quantity else "names no number"
+            table.refuse(name, problem, nearest(quantity, known))
+        declared = _declared(table, name, value, means[name])
         if owner in bodies:
-            bodies[owner][own] = declared.mean
+            bodies[owner][quantity] = declared.mean
         yield name, declared
     for body, values in bodies.items():
         if any(name.startswith(f"{body}.") for name, _ in flat(table.items)):
@@ -187,7 +188,7 @@ def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
         table.refuse(name, f"found {value!r}", _UNCERTAIN)
     if numbers[1] < 0:
         table.refuse(name, f"found std = {numbers[1]}", "write a standard deviation of 0 (trusted) or more")
-    own = name.partition(".")[2]
-    if (own in ("mass", *OF_JOINT) and numbers[0] < 0) or (own == "mass" and not numbers[0]):
+    quantity = name.partition(".")[2]
+    if (quantity in ("mass", *OF_JOINT) and numbers[0] < 0) or (quantity == "mass" and not numbers[0]):
         table.refuse(name, f"found mean = {numbers[0]}", "write a number above 0")
     return Declared(float(numbers[0]), float(numbers[1]))

@@ -29,9 +29,9 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
     """
     poses, joints = [], []
     for i, body in enumerate(machine.bodies):
-        pose, own = _held(body, [joint for joint in machine.joints if joint.body == i], values)
+        pose, remaining = _held(body, [joint for joint in machine.joints if joint.body == i], values)
         poses.append(pose)
-        joints += own
+        joints += remaining
     moved, had = {joint.body for joint in joints}, {joint.body for joint in machine.joints}
     carrier, within = {-1: -1}, {-1: Pose(np.zeros(3), np.eye(3))}
     for i, body in enumerate(machine.bodies):
@@ -57,8 +57,8 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         return _vector(within[body].place + within[body].turn @ np.asarray(at))
 
     def free(parts: tuple) -> tuple:
-        there = [part for part in parts if names[part.joint] in order]
-        return tuple(part._replace(joint=order[names[part.joint]]) for part in there)
+        present = [part for part in parts if names[part.joint] in order]
+        return tuple(part._replace(joint=order[names[part.joint]]) for part in present)
 
     return machine._replace(
         bodies=tuple(bodies),
@@ -107,11 +107,11 @@ def _held(body: Body, joints: list[Joint], values: Mapping[str, float]) -> tuple
         change = Pose(axis * way if joint.slide else anchor - turn @ anchor, turn)
         pose = pose.of(change)
         free = [
-            one._replace(
-                axis=_vector(turn.T @ np.asarray(one.axis)),
-                anchor=_vector(turn.T @ (np.asarray(one.anchor) - change.place)),
+            other._replace(
+                axis=_vector(turn.T @ np.asarray(other.axis)),
+                anchor=_vector(turn.T @ (np.asarray(other.anchor) - change.place)),
             )
-            for one in free
+            for other in free
         ]
     return pose, free
 

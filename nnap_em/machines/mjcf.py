@@ -287,8 +287,8 @@ def _carries(link: str, root: ET.Element) -> bool:
     for joint in root.findall("joint"):
         if joint.get("type") == "fixed" and _link(joint, "parent") == link:
             name = _link(joint, "child")
-            here = next(one for one in root.findall("link") if one.get("name") == name)
-            if here.find("inertial") is not None or _carries(name, root):
+            child = next(one for one in root.findall("link") if one.get("name") == name)
+            if child.find("inertial") is not None or _carries(name, root):
                 return True
     return False
 
@@ -565,18 +565,18 @@ def _drive(model: Any, i: int) -> tuple[str, dict[str, float]] | None:
         gain = gain * [1.0, 0.0, 0.0]
     if int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE):
         bias = np.zeros(3)
-    more = _late(model, i) | ({"bias": float(bias[0])} if bias[0] else {})
+    extras = _late(model, i) | ({"bias": float(bias[0])} if bias[0] else {})
     kp, kd = (float(0.0 - x) for x in bias[1:])
     if not np.any(gain[1:]):
-        if not np.any(bias) and not more:
+        if not np.any(bias) and not extras:
             return TORQUE, {}
         if kp == gain[0] > 0:
-            return "position", {"kp": kp, "kd": kd, **more}
+            return "position", {"kp": kp, "kd": kd, **extras}
         if kp == 0 and kd == gain[0] > 0:
-            return "velocity", {"kv": kd, **more}
-        return "affine", {"gain": float(gain[0]), "kp": kp, "kd": kd, **more}
+            return "velocity", {"kv": kd, **extras}
+        return "affine", {"gain": float(gain[0]), "kp": kp, "kd": kd, **extras}
     if not np.any(gain[:2]) and gain[2] < 0 and not np.any(bias[1:]):
-        return "damper", {"kv": float(-gain[2]), **more}
+        return "damper", {"kv": float(-gain[2]), **extras}
     return None
 
 
@@ -589,10 +589,10 @@ def _late(model: Any, i: int) -> dict[str, float]:
 def _limits(model: Any, i: int) -> tuple[float, float] | None:
     """Limits of what an actuator gives before its gear: its own, and those of all actuators of its joint."""
     joint, gear = int(model.actuator_trnid[i][0]), float(model.actuator_gear[i][0])
-    own = [model.actuator_forcerange[i]] if model.actuator_forcelimited[i] else []
+    ranges = [model.actuator_forcerange[i]] if model.actuator_forcelimited[i] else []
     if model.jnt_actfrclimited[joint]:
-        own.append(np.sort(np.asarray(model.jnt_actfrcrange[joint]) / gear))
-    return (max(float(x[0]) for x in own), min(float(x[1]) for x in own)) if own else None
+        ranges.append(np.sort(np.asarray(model.jnt_actfrcrange[joint]) / gear))
+    return (max(float(x[0]) for x in ranges), min(float(x[1]) for x in ranges)) if ranges else None
 
 
 def _joint_sensors(model: Any) -> Iterator[JointSensor]:

@@ -119,8 +119,8 @@ class DynamicFriction(JointEffect):
 
     def sliding(self, v):
         """Below the knee the map is a straight line, and the state rests at the level of the rate."""
-        own = v[self.joint - 1]
-        torque = jnp.exp(self.log_level) * self.level(own) * (self._line(own) - jnp.sign(own))
+        rate = v[self.joint - 1]
+        torque = jnp.exp(self.log_level) * self.level(rate) * (self._line(rate) - jnp.sign(rate))
         return jnp.zeros_like(v).at[self.joint - 1].set(torque)
 
     def _line(self, v: Scalar) -> Scalar:
@@ -149,6 +149,6 @@ def hysteresis(friction: DynamicFriction, amplitude: float, rows: int = 201) -> 
     def cycle(s, _):
         return jax.lax.scan(step, s, jnp.diff(way))
 
-    rest, _ = jax.lax.scan(step, jnp.zeros_like(level), 0.5 * jnp.diff(way[: rows // 2 + 1][::-1]))
-    last, before = jax.lax.scan(cycle, rest, None, length=10)
+    start, _ = jax.lax.scan(step, jnp.zeros_like(level), 0.5 * jnp.diff(way[: rows // 2 + 1][::-1]))
+    last, before = jax.lax.scan(cycle, start, None, length=10)
     return Hysteresis(way, -jnp.exp(friction.log_level) * jnp.append(before[-1], last))

@@ -35,8 +35,8 @@ def fed(
 
     `scale` are the columns that numbers of the servos are proportional to (`Servo.at`).
     """
-    given = jnp.stack([servo.at(scale).fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
-    return late(effects, servos, system, given, dt)
+    values = jnp.stack([servo.at(scale).fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
+    return late(effects, servos, system, values, dt)
 
 
 def late(
@@ -104,15 +104,15 @@ def _total(
 ) -> Float[Array, " dof"]:
     """`known` with the forces of the effects, and friction as it truly is, on top [N m]."""
     torque = scene.friction
-    for effect, own in _memories(effects, memory):
+    for effect, part in _memories(effects, memory):
         torque = effect.friction(torque, scene)
-        known = known + effect.force(scene, own)
+        known = known + effect.force(scene, part)
     return known + torque
 
 
 def drift(effects: Effects, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
     """Time derivative of the memory of all effects."""
-    return jnp.concatenate([memory[:0], *(effect.drift(scene, own) for effect, own in _memories(effects, memory))])
+    return jnp.concatenate([memory[:0], *(effect.drift(scene, part) for effect, part in _memories(effects, memory))])
 
 
 def read(

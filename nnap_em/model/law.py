@@ -138,9 +138,9 @@ def _fit_joint(
     jac = _slopes(value, v) * wide
     white = whitener @ jac
     posterior = np.linalg.inv(white.T @ white + np.eye(6))
-    rest = np.diag(cov) - np.sum((jac @ posterior) * jac, axis=1)
+    unexplained = np.diag(cov) - np.sum((jac @ posterior) * jac, axis=1)
     std = wide * np.sqrt(np.diag(posterior))
-    return LawFit(value, std, v, torque - _curve(value, v), np.sqrt(np.maximum(rest, (0.005 * scale) ** 2)))
+    return LawFit(value, std, v, torque - _curve(value, v), np.sqrt(np.maximum(unexplained, (0.005 * scale) ** 2)))
 
 
 def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> list[str]:

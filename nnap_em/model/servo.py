@@ -57,8 +57,8 @@ class Servo(eqx.Module):
 
     def with_values(self, values: Mapping[str, Scalar]) -> "Servo":
         """The drive with other numbers, those of `values` that are its own, by their names in the rig ("goal.kp")."""
-        own = {key: values.get(f"{self.column}.{key}", value) for key, value in self.values.items()}
-        return replace(self, values=own)
+        numbers = {key: values.get(f"{self.column}.{key}", value) for key, value in self.values.items()}
+        return replace(self, values=numbers)
 
     def at(self, columns: Float[Array, "*time column"] | None) -> "Servo":
         """The drive with its numbers as the columns that scale them stand, in one row or in all.

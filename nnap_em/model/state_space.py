@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..data.dataset import Dataset
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..numerics.gaussian import Gaussian
-from ..numerics.ode import apart, integrate
+from ..numerics.ode import in_loop, integrate
 from ..systems.base import AbstractSystem
 from . import hooks
 from .base import AbstractModel
@@ -72,8 +72,8 @@ class StateSpaceModel(AbstractModel):
         names = self.system.readable
         noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)
         reads = ", ".join(f"{name} (noise {std:.2g} {self.system.unit(name)})" for name, std in noise)
-        found = [self._described(effect) for effect in self.effects]
-        return "\n  ".join([f"{self.system}, a row every {self.dt:g} s", f"reads: {reads}", *found])
+        effects = [self._described(effect) for effect in self.effects]
+        return "\n  ".join([f"{self.system}, a row every {self.dt:g} s", f"reads: {reads}", *effects])
 
     def _described(self, effect: AbstractEffect) -> str:
         units, joint = effect.units_on(self.system), f" at joint {effect.joint}" if effect.joint else ""
@@ -157,7 +157,7 @@ class StateSpaceModel(AbstractModel):
             scene = self.scene(x, u)
             return self.system.senses(scene.q, scene.v, hooks.acceleration(self.effects, scene, x[2 * dof :], extra))
 
-        return jnp.concatenate([x[: 2 * dof], jnp.stack(apart(senses, x, count))])
+        return jnp.concatenate([x[: 2 * dof], jnp.stack(in_loop(senses, x, count))])
 
     def readable(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None

@@ -136,8 +136,8 @@ def _eliminated(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> 
 
     def step(both, k):
         row = both[k] / both[k, k]
-        rest = both - both[:, k][:, None] * row[None, :]
-        return jnp.where((place == k)[:, None], row[None, :], rest), None
+        eliminated = both - both[:, k][:, None] * row[None, :]
+        return jnp.where((place == k)[:, None], row[None, :], eliminated), None
 
     both = jnp.concatenate([a, b.reshape(b.shape[0], -1)], axis=1)
     return jax.lax.scan(step, both, place)[0][:, a.shape[0] :].reshape(b.shape)

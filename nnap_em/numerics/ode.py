@@ -42,8 +42,8 @@ class RK4(diffrax.AbstractSolver):
             y, y1 = carry
             t, ahead, share = slices
             slope = terms.vf(t, tuple(y) if isinstance(y0, tuple) else jnp.stack(y), args)
-            now = [a + ahead * slope[i] for i, a in enumerate(start)]
-            return (now, [a + share * slope[i] for i, a in enumerate(y1)]), None
+            point = [a + ahead * slope[i] for i, a in enumerate(start)]
+            return (point, [a + share * slope[i] for i, a in enumerate(y1)]), None
 
         start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
         (_, y1), _ = jax.lax.scan(stage, (start, start), (times, ahead, share))
@@ -74,7 +74,7 @@ def integrate(
     return jnp.stack(entries)
 
 
-def apart(
+def in_loop(
     function: Callable[[Float[Array, " state"]], Sequence[Float[Array, ""]]], x: Float[Array, " state"], count: int
 ) -> tuple[Float[Array, ""], ...]:
     """The `count` results of `function(x)` in a compiled loop of their own, as the stages of an interval are.

@@ -90,14 +90,14 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     return jax.tree.map(lambda a: a[:count], out) if padded > count else out
 
 
-def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " some"], tuple[Any, ...]]]:
+def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " entry"], tuple[Any, ...]]]:
     """Batches of as many entries as there are devices: indices, and the entries of `trees`; the last is repeated at the
     end. They serve work whose results, of all entries together, would not fit the memory.
     """
     every = jax.tree.map(np.asarray, trees)  # NumPy cuts by views, JAX by a program for every shape
     for first in range(0, count, jax.device_count()):
-        some = np.minimum(np.arange(first, first + jax.device_count()), count - 1)
-        yield some, jax.tree.map(lambda a, some=some: a[some], every)
+        indices = np.minimum(np.arange(first, first + jax.device_count()), count - 1)
+        yield indices, jax.tree.map(lambda a, indices=indices: a[indices], every)
 
 
 @functools.cache
@@ -105,11 +105,11 @@ def _program(function: Callable) -> Callable:
     """A program under the name of what it does."""
 
     def run(mesh: Mesh | None, group: int, common, batch):
-        numbers, rest = eqx.partition(common, eqx.is_array)
+        numbers, static = eqx.partition(common, eqx.is_array)
 
         def share(numbers, batch):
             """Work of one device."""
-            one = jax.vmap(lambda one: function(eqx.combine(numbers, rest), one))
+            one = jax.vmap(lambda one: function(eqx.combine(numbers, static), one))
             size = jax.tree.leaves(batch)[0].shape[0]
             if size == group:
                 return one(batch)
@@ -133,10 +133,10 @@ def at_home(tree: Any) -> Any:
     """
     home = jax.local_devices()[0]
     abroad = lambda a: isinstance(a, jax.Array | np.ndarray) and not _bound_to(a, home)  # noqa: E731
-    arrays, rest = eqx.partition(tree, abroad)  # to put a whole model where it is takes milliseconds
+    arrays, others = eqx.partition(tree, abroad)  # to put a whole model where it is takes milliseconds
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree)):
         return tree
-    return eqx.combine(jax.device_put(arrays, home), rest)
+    return eqx.combine(jax.device_put(arrays, home), others)
 
 
 def _bound_to(a: Any, device: Any) -> bool:
@@ -146,7 +146,7 @@ def _bound_to(a: Any, device: Any) -> bool:
 
 def _place(tree, sharding: NamedSharding):
     """Arrays that this process holds whole, where its devices' shares of them belong."""
-    arrays, rest = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
+    arrays, others = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
     leaves, structure = jax.tree.flatten(arrays)
     kinds = [jax.random.key_impl(a) if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else None for a in leaves]
     plain = [a if kind is None else jax.random.key_data(a) for a, kind in zip(leaves, kinds, strict=True)]
@@ -160,7 +160,7 @@ def _place(tree, sharding: NamedSharding):
     keyed = [
         a if kind is None else jax.random.wrap_key_data(a, impl=kind) for a, kind in zip(placed, kinds, strict=True)
     ]
-    return eqx.combine(jax.tree.unflatten(structure, keyed), rest)
+    return eqx.combine(jax.tree.unflatten(structure, keyed), others)
 
 
 def _gather(tree):

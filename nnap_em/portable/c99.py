@@ -75,19 +75,19 @@ def write_c(fitted: Identified, out: Path) -> list[str]:
     Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`.
     Raises ExportError, before anything is written, where a law has no plain C form.
     """
-    system, given = fitted.model.system, torques(fitted)
+    system, functions = fitted.model.system, torques(fitted)
     name = re.sub(r"\W", "_", out.stem)
     name = f"model_{name}" if name[:1].isdigit() else name
     dof = len(system.coordinates)
     still = jnp.zeros(dof)
     sources = [
-        unrolled(f"{name}_friction", given.friction, v=still),
-        unrolled(f"{name}_feedforward", given.feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
+        unrolled(f"{name}_friction", functions.friction, v=still),
+        unrolled(f"{name}_feedforward", functions.feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
     ]
     units = ", ".join(
         f"{q} [{system.unit(q)}], torque [{system.force_unit(j)}]" for j, q in enumerate(system.coordinates, 1)
     )
-    left = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in given.without]
+    left = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in functions.without]
     head = f"""/* {fitted.rig.name}: written by nnap_em {__version__}.  SI units.  Link with -lm.
    Joints: {units}.
    {name}_friction: friction torque at joint rates v.

@@ -181,9 +181,9 @@ def unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments:
         outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
     for mine, truth in zip((outputs,) if len(expected) == 1 else outputs, expected, strict=True):
         flat = np.asarray(truth, np.float64).reshape(4, -1)
-        own = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
+        computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
         bound = math.sqrt(jnp.finfo(truth.dtype).eps)
-        if not np.allclose(own, flat, rtol=bound, atol=bound, equal_nan=True):
+        if not np.allclose(computed, flat, rtol=bound, atol=bound, equal_nan=True):
             raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STEP}")
     return source
 

@@ -124,8 +124,8 @@ def _fit(
     columns += [np.ones_like(v), -np.ones_like(v)] if constant else []
     basis = np.stack(columns, axis=1)
     coefficients, _ = scipy.optimize.nnls(basis * weight[:, None], -torque * weight)
-    rest = torque + basis @ coefficients
-    share = np.sqrt(np.average(rest**2, weights=weight) / max(np.average(torque**2, weights=weight), 1e-300))
+    residual = torque + basis @ coefficients
+    share = np.sqrt(np.average(residual**2, weights=weight) / max(np.average(torque**2, weights=weight), 1e-300))
     offset = coefficients[-1] - coefficients[-2] if constant else 0.0
     breakaway = coefficients[0] + (coefficients[2] if dip else 0.0)
     top = np.max(np.abs(v))

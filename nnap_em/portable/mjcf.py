@@ -145,9 +145,9 @@ def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
         Motor(motor.name, motor.joint, motor.gear, motor.gear / inputs.get(motor.joint + 1, motor.gear))
         for motor in machine.motors
     ]
-    there = {motor.joint + 1 for motor in motors}
+    driven = {motor.joint + 1 for motor in motors}
     columns = zip(fitted.rig.input_columns, system.joints, strict=True)
-    return motors + [Motor(name, joint - 1, inputs[joint], 1.0) for name, joint in columns if joint not in there]
+    return motors + [Motor(name, joint - 1, inputs[joint], 1.0) for name, joint in columns if joint not in driven]
 
 
 def named(effect: AbstractEffect) -> str:
@@ -187,9 +187,9 @@ def _model(content: Content, motors: Sequence[Motor]) -> ET.Element:
 def _longest_step(content: Content) -> float:
     """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
     rates = [
-        own.bristle.stiffness * own.form.fastest / _level(own.form)
-        for own in content.joints
-        if own.bristle is not None and _bristled(own)
+        laws.bristle.stiffness * laws.form.fastest / _level(laws.form)
+        for laws in content.joints
+        if laws.bristle is not None and _bristled(laws)
     ]
     return max(min([STEP, *(STIFF / rate for rate in rates)]), SHORTEST)
 
@@ -208,59 +208,59 @@ def _mobility(system: Tree) -> np.ndarray:
 def _bodies(world: ET.Element, content: Content, mobility: np.ndarray) -> list[ET.Element]:
     machine, places = content.system.machine, []
     for i, body in enumerate(machine.bodies):
-        own = ET.SubElement(
+        element = ET.SubElement(
             places[body.parent] if body.parent >= 0 else world,
             "body",
             name=body.name,
             pos=_text(*body.place),
             xyaxes=_text(*(row[0] for row in body.turn), *(row[1] for row in body.turn)),
         )
-        places.append(own)
+        places.append(element)
         for j, joint in enumerate(machine.joints):
             if joint.body == i:
-                ET.SubElement(own, "joint", _joint(content, joint, content.joints[j], mobility[j]))
+                ET.SubElement(element, "joint", _joint(content, joint, content.joints[j], mobility[j]))
         mass, centre, inertia = content.system.body_numbers(i)
         if float(mass) > 0:
             full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-            ET.SubElement(own, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
+            ET.SubElement(element, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
         for site in machine.sites:
             if site.body == i:
-                ET.SubElement(own, "site", name=site.name, pos=_text(*site.place))
+                ET.SubElement(element, "site", name=site.name, pos=_text(*site.place))
     return places
 
 
-def _joint(content: Content, joint: Joint, own: JointContent, mobility: float) -> dict[str, str]:
+def _joint(content: Content, joint: Joint, laws: JointContent, mobility: float) -> dict[str, str]:
     """Attributes of a joint, those aside that are MuJoCo's own."""
-    viscous, bristled = own.form.viscous + own.viscous, _bristled(own)
-    given = {
+    viscous, bristled = laws.form.viscous + laws.viscous, _bristled(laws)
+    attributes = {
         "name": joint.name,
         "type": "slide" if joint.slide else "hinge",
         "axis": _text(*joint.axis),
         "pos": _text(*joint.anchor),
         "armature": _text(content.system.values.get(f"{joint.name}.armature", joint.armature)),
-        "damping": _text(viscous, own.drag) if own.drag else _text(viscous),
-        "frictionloss": _text(0.0 if bristled else own.form.coulomb),
+        "damping": _text(viscous, laws.drag) if laws.drag else _text(viscous),
+        "frictionloss": _text(0.0 if bristled else laws.form.coulomb),
     }
-    given |= {"ref": _text(joint.zero)} if joint.zero else {}
-    given |= _spring(own)
-    if own.stop is not None:
-        return given | {"range": _text(own.stop.low, own.stop.high)} | _contact(own.stop, mobility, "limit")
-    return given | ({"range": _text(*joint.range)} if joint.range else {})
+    attributes |= {"ref": _text(joint.zero)} if joint.zero else {}
+    attributes |= _spring(laws)
+    if laws.stop is not None:
+        return attributes | {"range": _text(laws.stop.low, laws.stop.high)} | _contact(laws.stop, mobility, "limit")
+    return attributes | ({"range": _text(*joint.range)} if joint.range else {})
 
 
-def _spring(own: JointContent) -> dict[str, str]:
+def _spring(laws: JointContent) -> dict[str, str]:
     """Stiffness and rest of a pull; a constant that has no rest goes to `_passive`."""
-    rest = _rest(own)
-    if not any(own.pull[1:]):
+    rest = _rest(laws)
+    if not any(laws.pull[1:]):
         return {}
-    _, b, c, d = own.pull
+    _, b, c, d = laws.pull
     slopes = -(b + rest * (2 * c + 3 * d * rest)), -(c + 3 * d * rest), -d
     return {"stiffness": _text(*(slopes if c or d else slopes[:1])), "springref": _text(rest)}
 
 
-def _rest(own: JointContent) -> float:
+def _rest(laws: JointContent) -> float:
     """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
-    a, b, c, d = own.pull
+    a, b, c, d = laws.pull
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
     real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])
     return float(min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0))
@@ -274,47 +274,47 @@ def _contact(contact: Contact, mobility: float, of: str) -> dict[str, str]:
     }
 
 
-def _rotor(world: ET.Element, tendons: ET.Element, name: str, own: JointContent, mobility: float) -> None:
+def _rotor(world: ET.Element, tendons: ET.Element, name: str, laws: JointContent, mobility: float) -> None:
     """The motor as a wheel of its own, joined to its joint by a tendon."""
-    rotor = own.rotor
+    rotor = laws.rotor
     assert rotor is not None
     body = ET.SubElement(world, "body", name=f"{name}_rotor")
     ET.SubElement(body, "joint", name=f"{name}_rotor", type="hinge", axis="0 0 1", armature=_text(rotor.inertia))
     tiny = _text(MASSLESS)
     ET.SubElement(body, "inertial", pos="0 0 0", mass=tiny, diaginertia=f"{tiny} {tiny} {tiny}")
-    given = {"name": f"{name}_transmission"}
+    attributes = {"name": f"{name}_transmission"}
     if rotor.play is None:
-        given |= {"stiffness": _text(rotor.stiffness), "damping": _text(rotor.damping), "springlength": "0"}
+        attributes |= {"stiffness": _text(rotor.stiffness), "damping": _text(rotor.damping), "springlength": "0"}
     else:
-        given |= {"range": _text(rotor.play.low, rotor.play.high)}
-        given |= _contact(rotor.play, mobility + 1 / (rotor.inertia + MASSLESS), "limit")
-    tendon = ET.SubElement(tendons, "fixed", given)
+        attributes |= {"range": _text(rotor.play.low, rotor.play.high)}
+        attributes |= _contact(rotor.play, mobility + 1 / (rotor.inertia + MASSLESS), "limit")
+    tendon = ET.SubElement(tendons, "fixed", attributes)
     ET.SubElement(tendon, "joint", joint=f"{name}_rotor", coef="1")
     ET.SubElement(tendon, "joint", joint=name, coef="-1")
 
 
 def _motor(actuators: ET.Element, content: Content, motor: Motor, step: float) -> None:
     name, joint = content.system.machine.joints[motor.joint].name, content.joints[motor.joint]
-    given = {"name": motor.name, "joint": f"{name}_rotor" if joint.rotor else name, "gear": _text(motor.gear)}
+    attributes = {"name": motor.name, "joint": f"{name}_rotor" if joint.rotor else name, "gear": _text(motor.gear)}
     drive = content.drives.get(motor.joint + 1, Drive())
-    more = _drive(drive, abs(motor.unit), step)
-    ET.SubElement(actuators, "general" if {"gainprm", "dyntype"} & set(more) else "motor", given | more)
+    options = _drive(drive, abs(motor.unit), step)
+    ET.SubElement(actuators, "general" if {"gainprm", "dyntype"} & set(options) else "motor", attributes | options)
 
 
 def _drive(drive: Drive, unit: float, step: float) -> dict[str, str]:
     """Attributes of the way from a control to a force; the state of a lag is held over a step, half a step late."""
-    more = {}
+    attributes = {}
     if math.isfinite(drive.before):
-        more["ctrlrange"] = _text(-drive.before / unit, drive.before / unit)
+        attributes["ctrlrange"] = _text(-drive.before / unit, drive.before / unit)
     if math.isfinite(drive.after):
-        more["forcerange"] = _text(-drive.after / unit, drive.after / unit)
+        attributes["forcerange"] = _text(-drive.after / unit, drive.after / unit)
     if drive.delay > 0:
-        more |= _late(drive.delay, step)
+        attributes |= _late(drive.delay, step)
     if drive.lag:
-        more |= {"dyntype": "filterexact", "dynprm": _text(max(drive.lag - 0.5 * step, 0.05 * step))}
+        attributes |= {"dyntype": "filterexact", "dynprm": _text(max(drive.lag - 0.5 * step, 0.05 * step))}
     if drive.gain != 1:
-        more["gainprm"] = _text(drive.gain)
-    return more
+        attributes["gainprm"] = _text(drive.gain)
+    return attributes
 
 
 def _late(delay: float, step: float) -> dict[str, str]:
@@ -323,33 +323,33 @@ def _late(delay: float, step: float) -> dict[str, str]:
     return {"delay": _text(late), "nsample": str(ROOM * (math.ceil(delay / step) + 1)), "interp": "linear"}
 
 
-def _passive(actuators: ET.Element, name: str, own: JointContent) -> None:
+def _passive(actuators: ET.Element, name: str, laws: JointContent) -> None:
     """Torques of a joint that MuJoCo has as those of a passive motor: cogging, a bristle, a constant."""
     still = {"joint": name, "input": "none", "motorconst": "0", "resistance": "1"}
 
-    def add(what: str, **given: str) -> None:
-        ET.SubElement(actuators, "dcmotor", {"name": f"{name}_{what}", **still, **given})
+    def add(what: str, **attributes: str) -> None:
+        ET.SubElement(actuators, "dcmotor", {"name": f"{name}_{what}", **still, **attributes})
 
-    for i, (amplitude, k, phase) in enumerate(own.tones, 1):  # poles are whole numbers: k is a gear
+    for i, (amplitude, k, phase) in enumerate(laws.tones, 1):  # poles are whole numbers: k is a gear
         add(f"cogging{i}", gear=_text(k), cogging=_text(amplitude / k, 1.0, phase))
-    constant = own.form.offset + _unheld(own)
+    constant = laws.form.offset + _unheld(laws)
     if constant:
         add("offset", cogging=_text(constant, 0.0, 0.5 * math.pi))
-    if _bristled(own):
-        form, bristle = own.form, own.bristle
+    if _bristled(laws):
+        form, bristle = laws.form, laws.bristle
         assert bristle is not None
         add("bristle", lugre=_text(*bristle, _level(form), form.breakaway, form.stribeck))
 
 
-def _unheld(own: JointContent) -> float:
+def _unheld(laws: JointContent) -> float:
     """Constant pull that no rest holds."""
-    a, b, c, d = own.pull
-    rest = _rest(own)
+    a, b, c, d = laws.pull
+    rest = _rest(laws)
     return a + rest * (b + rest * (c + rest * d)) if abs(a) > 0 else 0.0
 
 
-def _bristled(own: JointContent) -> bool:
-    return own.bristle is not None and own.form.breakaway > 0
+def _bristled(laws: JointContent) -> bool:
+    return laws.bristle is not None and laws.form.breakaway > 0
 
 
 def _sensors(
@@ -359,16 +359,16 @@ def _sensors(
     named = {sensor.name for sensor in machine.joint_sensors}
     for sensor in machine.joint_sensors:
         kind = "jointvel" if sensor.rate else "jointpos"
-        given = {"name": sensor.name, "joint": machine.joints[sensor.joint].name}
-        ET.SubElement(sensors, kind, given | _reading(content.sensors.get(sensor.name), step))
+        attributes = {"name": sensor.name, "joint": machine.joints[sensor.joint].name}
+        ET.SubElement(sensors, kind, attributes | _reading(content.sensors.get(sensor.name), step))
     dof = len(machine.joints)
     for name, sensor in content.sensors.items():
         if name in named or name not in machine.states or not sensor.delay:
             continue
         place = machine.states.index(name)
         kind = "jointvel" if place >= dof else "jointpos"
-        given = {"name": name, "joint": machine.joints[place % dof].name}
-        ET.SubElement(sensors, kind, given | _reading(sensor, step))
+        attributes = {"name": name, "joint": machine.joints[place % dof].name}
+        ET.SubElement(sensors, kind, attributes | _reading(sensor, step))
     for name, sensor in {one.name.rpartition(".")[0]: one for one in machine.sensors}.items():
         axes = _text(*(row[0] for row in sensor.turn), *(row[1] for row in sensor.turn))
         where = bodies[sensor.body] if sensor.body >= 0 else base

@@ -204,9 +204,9 @@ def _affine(model: Model, mean: np.ndarray, cov: np.ndarray, u: np.ndarray) -> A
     d = y - middle[..., None, :]
     slope = np.swapaxes(d, -1, -2) @ unit / (2 * n)
     matrix = np.swapaxes(np.linalg.solve(np.swapaxes(factor, -1, -2), np.swapaxes(slope, -1, -2)), -1, -2)
-    rest = np.swapaxes(d, -1, -2) @ d / (2 * n) - slope @ np.swapaxes(slope, -1, -2)
+    residual = np.swapaxes(d, -1, -2) @ d / (2 * n) - slope @ np.swapaxes(slope, -1, -2)
     offset = middle - np.einsum("...ij,...j->...i", matrix, mean)
-    return matrix, offset, 0.5 * (rest + np.swapaxes(rest, -1, -2))
+    return matrix, offset, 0.5 * (residual + np.swapaxes(residual, -1, -2))
 
 
 def _linear(function: Callable[..., Any], x: np.ndarray, u: np.ndarray, z: np.ndarray):

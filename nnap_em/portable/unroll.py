@@ -171,12 +171,12 @@ def _symbolic(value: np.ndarray) -> bool:
 
 
 def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    name, given = equation.primitive.name, equation.params
-    inner = next((given[key] for key in _CALLS if key in given), None)
+    name, params = equation.primitive.name, equation.params
+    inner = next((params[key] for key in _CALLS if key in params), None)
     if name == "scan":
-        return _scan(writer, given, operands)
+        return _scan(writer, params, operands)
     if name == "cond":
-        return _cond(writer, given["branches"], operands)
+        return _cond(writer, params["branches"], operands)
     if inner is not None:
         return _run(writer, *_opened(inner), operands)
     if not any(map(_symbolic, operands)):
@@ -186,15 +186,15 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
     if name in _SAME:
         return operands
     if name == "convert_element_type":
-        return [_each(writer, _converted(_dtype(equation.invars[0]).kind, given["new_dtype"].kind), operands)]
+        return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]
     if name == "integer_pow":
-        return [_each(writer, f"{{}} ** {given['y']}", operands)]
+        return [_each(writer, f"{{}} ** {params['y']}", operands)]
     if name in _ELEMENTWISE:
         return [_each(writer, _ELEMENTWISE[name], operands)]
     if name in _REDUCTIONS:
-        return [_reduce(writer, _ELEMENTWISE[_REDUCTIONS[name]], operands[0], given["axes"])]
+        return [_reduce(writer, _ELEMENTWISE[_REDUCTIONS[name]], operands[0], params["axes"])]
     if name == "dot_general":
-        return [_dot(writer, operands[0], operands[1], given["dimension_numbers"])]
+        return [_dot(writer, operands[0], operands[1], params["dimension_numbers"])]
     return [_scatter(writer, equation, operands)] if name in _SCATTERED else _move(equation, operands)
 
 
@@ -303,10 +303,10 @@ def _scatter(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray
 
 def _cond(writer: _Writer, branches: Sequence[core.ClosedJaxpr], operands: list[np.ndarray]) -> list[np.ndarray]:
     """Every branch, and the results of the one that holds."""
-    which, *rest = operands
+    which, *arguments = operands
     if not _symbolic(which):
-        return _run(writer, *_opened(branches[int(which.item())]), rest)
-    first, *others = (_run(writer, *_opened(branch), rest) for branch in branches)
+        return _run(writer, *_opened(branches[int(which.item())]), arguments)
+    first, *others = (_run(writer, *_opened(branch), arguments) for branch in branches)
     for k, other in enumerate(others, 1):
         held = _each(writer, "{} == {}", [which, np.asarray(k, object)])
         first = [
@@ -316,21 +316,21 @@ def _cond(writer: _Writer, branches: Sequence[core.ClosedJaxpr], operands: list[
     return first
 
 
-def _scan(writer: _Writer, given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+def _scan(writer: _Writer, params: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
     """A loop of fixed length, pass by pass."""
-    if given["length"] > _LONGEST:
-        raise UnrollError(f"a loop of {given['length']} passes")
-    if "ft_in" in given:  # jax 0.11 and newer
-        fixed, carry, along = map(list, given["ft_in"].update(operands).unpack())
+    if params["length"] > _LONGEST:
+        raise UnrollError(f"a loop of {params['length']} passes")
+    if "ft_in" in params:  # jax 0.11 and newer
+        fixed, carry, along = map(list, params["ft_in"].update(operands).unpack())
     else:
-        consts, last = given["num_consts"], given["num_consts"] + given["num_carry"]
+        consts, last = params["num_consts"], params["num_consts"] + params["num_carry"]
         fixed, carry, along = operands[:consts], operands[consts:last], operands[last:]
     carried = len(carry)
     rows: list[list[np.ndarray]] = []
-    order = range(given["length"])
-    for k in reversed(order) if given["reverse"] else order:
-        outputs = _run(writer, *_opened(given["jaxpr"]), [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
+    order = range(params["length"])
+    for k in reversed(order) if params["reverse"] else order:
+        outputs = _run(writer, *_opened(params["jaxpr"]), [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
         carry = outputs[:carried]
         rows.append(outputs[carried:])
-    rows = rows[::-1] if given["reverse"] else rows
+    rows = rows[::-1] if params["reverse"] else rows
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]

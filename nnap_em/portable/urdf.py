@@ -63,9 +63,9 @@ def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndar
     """Links and joints of one body at `pose` in the frame of its parent link; its link, and its frame in there."""
     machine = content.system.machine
     body = machine.bodies[i]
-    own = [j for j, joint in enumerate(machine.joints) if joint.body == i]
-    for k, j in enumerate(own):
-        joint, last = machine.joints[j], j == own[-1]
+    joints = [j for j, joint in enumerate(machine.joints) if joint.body == i]
+    for k, j in enumerate(joints):
+        joint, last = machine.joints[j], j == joints[-1]
         link = body.name if last else f"{body.name}_{k + 1}"
         anchor = _pose(np.eye(3), joint.anchor)
         element = ET.SubElement(root, "joint", name=joint.name, type=_kind(joint))
@@ -78,7 +78,7 @@ def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndar
         parent, pose = link, np.linalg.inv(anchor)
         if not last:
             _inertial(ET.SubElement(root, "link", name=link), MASSLESS, np.zeros(3), MASSLESS * np.eye(3))
-    if not own:
+    if not joints:
         element = ET.SubElement(root, "joint", name=f"{body.name}_mount", type="fixed")
         _origin(element, pose)
         ET.SubElement(element, "parent", link=parent)
@@ -104,9 +104,9 @@ def _limits(element: ET.Element, joint: Joint, drive: Drive) -> None:
     ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(FAR))
 
 
-def _dynamics(element: ET.Element, own: JointContent) -> None:
-    viscous = own.form.viscous + own.viscous
-    ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(own.form.coulomb))
+def _dynamics(element: ET.Element, laws: JointContent) -> None:
+    viscous = laws.form.viscous + laws.viscous
+    ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(laws.form.coulomb))
 
 
 def _inertial(link: ET.Element, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:

@@ -111,27 +111,27 @@ def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data
 def open_loop(
     along: Followed,
     weights: Weights,
-    extra: Callable[[Int[np.ndarray, " some"]], Iterable[Columns]] | None = None,
+    extra: Callable[[Int[np.ndarray, " sequence"]], Iterable[Columns]] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
 ) -> OpenLoop:
-    """Multi-step errors of all sequences and their derivatives; `extra` returns blocks of more columns of some.
+    """Multi-step errors of all sequences and their derivatives; `extra` returns further columns, in blocks.
 
-    Columns of all sequences, or of all candidates at six joints, would be gigabytes.
+    It takes indices of sequences: columns of all sequences, or of all candidates at six joints, would be gigabytes.
     """
     (rows, obs), dof = along.data.y.shape[1:], len(along.model.system.coordinates)
     grid = _grid(along.model, along.data, horizons)
 
-    def none(some) -> Iterable[Columns]:
-        yield Columns(*(jnp.zeros((some.size, 0, rows, n)) for n in (dof, obs)))
+    def none(indices) -> Iterable[Columns]:
+        yield Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (dof, obs)))
 
     columns, see = [], channels(along.model)
-    for some, part in turns(len(along.state), along.linear, along.gain, along.middle):
-        found: list[np.ndarray] = []
-        for block in (extra or none)(some):
+    for indices, part in turns(len(along.state), along.linear, along.gain, along.middle):
+        blocks: list[np.ndarray] = []
+        for block in (extra or none)(indices):
             sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]
-            own = sens.shape[-1] - block.force.shape[1]
-            found.append(sens[..., own if found else 0 :])  # those of what is estimated once
-        columns.append(np.concatenate(found, axis=-1))
+            estimated = sens.shape[-1] - block.force.shape[1]
+            blocks.append(sens[..., estimated if blocks else 0 :])  # those of what is estimated once
+        columns.append(np.concatenate(blocks, axis=-1))
     overlap = np.asarray(grid.ages) / grid.stride
     return OpenLoop(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
 
@@ -139,8 +139,8 @@ def open_loop(
 def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
     """The errors alone [rad, or m]; NaN where there is none."""
     grid = _grid(along.model, along.data, horizons)
-    found = each(_errors, (along.model, grid), (along.state, along.linear.seq))
-    return np.asarray(found)[..., channels(along.model)]
+    error = each(_errors, (along.model, grid), (along.state, along.linear.seq))
+    return np.asarray(error)[..., channels(along.model)]
 
 
 def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
@@ -191,24 +191,25 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
 
 
 def read_columns(
-    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], found: Columns
+    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], columns: Columns
 ) -> Float[Array, "time obs column"]:
-    """Change of the readings of one sequence by friction nodes, parameters and the columns `found`."""
+    """Change of the readings of one sequence by friction nodes, parameters and further `columns`."""
     dof = nodes.shape[0]
-    own, read = reading_columns(nodes, middle[:, None, dof : 2 * dof], linear), jnp.moveaxis(found.reading, 0, -1)
+    estimated = reading_columns(nodes, middle[:, None, dof : 2 * dof], linear)
+    read = jnp.moveaxis(columns.reading, 0, -1)
     if linear.reading_by_force is not None:
-        read = read + jnp.einsum("tod,ctd->toc", linear.reading_by_force, found.force)
-    return jnp.concatenate([own, read], axis=-1)
+        read = read + jnp.einsum("tod,ctd->toc", linear.reading_by_force, columns.force)
+    return jnp.concatenate([estimated, read], axis=-1)
 
 
 def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     """Change of the predictions of one sequence by every column."""
-    (nodes, grid), (linear, gain, middle, found) = common, one
+    (nodes, grid), (linear, gain, middle, columns) = common, one
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
     dof = nodes.shape[0]
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], linear.by_force)
-    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
-    read = read_columns(nodes, linear, middle, found)
+    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
+    read = read_columns(nodes, linear, middle, columns)
     push = jnp.where(
         linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter, moved], axis=-1), 0.0
     )
@@ -247,10 +248,10 @@ def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.
     if not error.size:
         return np.ones((error.shape[0], 1, *error.shape[2:]))
     size = np.ma.masked_invalid(np.abs(error))
-    whole, own = (np.ma.median(size, axis=over, keepdims=True) for over in ((0, 1), 1))
+    whole, single = (np.ma.median(size, axis=over, keepdims=True) for over in ((0, 1), 1))
     whole = np.ma.filled(whole, 1 / 1.4826)
-    own = np.where(np.ma.getmaskarray(own), whole, np.ma.filled(own, 1.0))
-    return 1.4826 * np.sqrt(whole * own) + 1e-12
+    single = np.where(np.ma.getmaskarray(single), whole, np.ma.filled(single, 1.0))
+    return 1.4826 * np.sqrt(whole * single) + 1e-12
 
 
 def huber(error, scale):
@@ -274,14 +275,14 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
     return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
 
 
-def weighed(found: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
+def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
     """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
-    error = np.where(used[:, None, None, None], found.error, np.nan)
+    error = np.where(used[:, None, None, None], predictions.error, np.nan)
     scale = robust_scale(error)
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.minimum(1.0, HUBER * scale / np.abs(error))
-    sound = np.isfinite(error) & np.isfinite(found.columns).all(axis=-1)
-    return np.where(sound, size / scale**2 / found.overlap[:, None], 0.0)
+    sound = np.isfinite(error) & np.isfinite(predictions.columns).all(axis=-1)
+    return np.where(sound, size / scale**2 / predictions.overlap[:, None], 0.0)
 
 
 # --- a fit to them

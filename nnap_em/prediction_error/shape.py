@@ -28,7 +28,7 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
         beside = others @ others.T / (SHAPE * np.sqrt(np.mean(value[joint] ** 2)) + 1e-12) ** 2
         precision[joint, joint] = beside + (1e-9 * np.trace(beside) / count + 1e-12) * np.eye(count)
         pull[joint] = beside @ value[joint]
-    own = slice(nodes.size, size)
-    precision[own, own] = np.eye(weights.prior.size)
-    pull[own] = value[own]
+    parameters = slice(nodes.size, size)
+    precision[parameters, parameters] = np.eye(weights.prior.size)
+    pull[parameters] = value[parameters]
     return precision, pull

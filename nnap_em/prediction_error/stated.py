@@ -76,15 +76,15 @@ def widened(
     weights = m_step.weights(model)
     other = discrepancy_columns(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
-    predictions = open_loop(along, weights, lambda some: [jax.tree.map(lambda a: a[some], other)])
+    predictions = open_loop(along, weights, lambda indices: [jax.tree.map(lambda a: a[indices], other)])
     prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
     errors, scores = _rows(predictions, weighed(predictions, used), len(jac))
-    own = errors.own @ jac
-    information = prior + own.T @ (errors.weight[:, None] * own)
+    estimated = errors.own @ jac
+    information = prior + estimated.T @ (errors.weight[:, None] * estimated)
     scores = (scores[used] - scores[used].mean(axis=0)) @ jac
     count = len(scores)
-    force = size(errors._replace(own=own), information)
-    shared = force * own.T @ (errors.weight[:, None] * errors.other)
+    force = size(errors._replace(own=estimated), information)
+    shared = force * estimated.T @ (errors.weight[:, None] * errors.other)
     sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
     strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
@@ -118,12 +118,12 @@ def of_states(
 
 def _moved(common, one) -> Float[Array, "time state state"]:
     """Change of one sequence."""
-    (log_q, log_r, start, nodes, draws), (linear, mean, found) = common, one
+    (log_q, log_r, start, nodes, draws), (linear, mean, columns) = common, one
     dof = nodes.shape[0]
     torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], linear.by_force)
-    other = jnp.einsum("tsd,ctd->tsc", linear.by_force, found.force)
+    other = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
     pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)
-    read = read_columns(nodes, linear, mean, found)
+    read = read_columns(nodes, linear, mean, columns)
     still = start._replace(mean=jnp.zeros_like(start.mean))
     seq = linear.seq._replace(y=jnp.zeros_like(linear.seq.y))
 
@@ -164,15 +164,15 @@ def discrepancy_columns(
     return Columns(force, jnp.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
 
 
-def size(errors: Errors, information: Float[np.ndarray, "own own"]) -> float:
+def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> float:
     """Standard deviation tau of the strengths of `other`, at its largest likelihood.
 
-    error = own x + tau other z + noise, with z standard normal and the size of the noise free; x is projected out as
-    far as the prior lets it. Errors that no such force explains give zero.
+    error = estimated x + tau other z + noise, with z standard normal and the size of the noise free; x is projected
+    out as far as the prior lets it. Errors that no such force explains give zero.
     """
     root = np.sqrt(errors.weight)[:, None]
-    own, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
-    other, error = (a - own @ np.linalg.solve(information, own.T @ a) for a in (other, error))
+    estimated, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
+    other, error = (a - estimated @ np.linalg.solve(information, estimated.T @ a) for a in (other, error))
     strength, turn = np.linalg.eigh(other.T @ other)
     strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
     if whole == 0.0 or not strength.any():
@@ -184,12 +184,12 @@ def size(errors: Errors, information: Float[np.ndarray, "own own"]) -> float:
 
 
 def _rows(
-    found: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
+    predictions: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
 ) -> tuple[Errors, Float[np.ndarray, "seq phi"]]:
     """The errors in a row, and the score of every sequence."""
-    columns = np.where(weight[..., None] > 0, found.columns, 0.0).astype(float)
-    error = np.where(weight > 0, found.error, 0.0)
+    columns = np.where(weight[..., None] > 0, predictions.columns, 0.0).astype(float)
+    error = np.where(weight > 0, predictions.error, 0.0)
     scores = np.einsum("skhoc,skho->sc", columns[..., :phi], weight * error)
     flat = columns.reshape(-1, columns.shape[-1])
-    count = float(np.sum((weight > 0) / found.overlap[:, None]))
+    count = float(np.sum((weight > 0) / predictions.overlap[:, None]))
     return Errors(error.ravel(), flat[:, :phi], flat[:, phi:], weight.ravel(), count), scores

@@ -24,14 +24,14 @@ def resolve(
     return out
 
 
-def declared_at(path: Path, topics: Sequence[Topic], given: Address, column: str) -> Address:
+def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
     """The address as the file has it."""
-    where = f"column {column!r} from {str(given)!r}"
-    topic = next((topic for topic in topics if topic.name == given.topic), None)
+    where = f"column {column!r} from {str(address)!r}"
+    topic = next((topic for topic in topics if topic.name == address.topic), None)
     if topic is None:
-        hint = near(given.topic, [topic.name for topic in topics])
-        raise DataError(f"{path}: {where}: there is no topic {given.topic!r}; {hint}")
-    return given._replace(path=field_of(path, topic, given.path, where))
+        hint = near(address.topic, [topic.name for topic in topics])
+        raise DataError(f"{path}: {where}: there is no topic {address.topic!r}; {hint}")
+    return address._replace(path=field_of(path, topic, address.path, where))
 
 
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:

@@ -45,13 +45,13 @@ def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
     for key in table:
         if key not in _KEYS:
             _refuse(path, f"[import] {key}", "unknown table or key", nearest(key, _KEYS))
-    given = table.get("input", INPUTS[0])
-    if given not in INPUTS:
-        _refuse(path, "[import] input", f"found {given!r}", nearest(str(given), INPUTS))
+    mode = table.get("input", INPUTS[0])
+    if mode not in INPUTS:
+        _refuse(path, "[import] input", f"found {mode!r}", nearest(str(mode), INPUTS))
     return Plan(
         _addresses(path, table, "columns", columns),
         _addresses(path, table, "duplicates", columns),
-        given == INPUTS[1],
+        mode == INPUTS[1],
         _seconds(path, table, "gap", NOTHING.gap),
         _seconds(path, table, "shortest", NOTHING.shortest),
         _seconds(path, table, "longest", NOTHING.longest) or NOTHING.longest,

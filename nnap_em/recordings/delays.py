@@ -122,12 +122,14 @@ def _part(
     cause, *around = (_between(signal, at[0] - REACH, at[-1] + REACH) for signal in (cause, *around))
     target = _difference(np.interp(at, effect.t, effect.y), pair.order, wide)
     first = (0, wide // 2, wide)[pair.order]
-    rest = _Rest(_explained(at[first : first + target.size], around))
-    target = rest(target)
+    unexplained = _Rest(_explained(at[first : first + target.size], around))
+    target = unexplained(target)
     size = math.sqrt(target @ target)
 
     def likeness(shift: float) -> float:
-        predicted = rest(_difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide))
+        predicted = unexplained(
+            _difference(integrals(cause, at - shift, pair.order, steps=pair.held), pair.order, wide)
+        )
         return float(predicted @ target) / max(math.sqrt(predicted @ predicted) * size, 1e-300)
 
     coarse = max(min(effect.interval, 0.005), REACH / 50)

@@ -33,13 +33,13 @@ def places(logs: Sequence[Resampled], test: float) -> list[str]:
 
 def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str], rig: Rig) -> None:
     """One CSV file a sequence; the clock begins at 0 in each, or runs on from the first log's, as the rig declares."""
-    rest = iter(files)
+    names = iter(files)
     for log in logs:
         used = [stretch for stretch in log.sequences if not stretch.why]
         for stretch, values in zip(used, log.values, strict=True):
             offset = 0.0 if rig.clock == "sequence" else (log.origin - logs[0].origin) * 1e-9 + stretch.start
             time = offset + rig.dt * np.arange(stretch.rows)
-            write_csv(folder / next(rest), {"time": time} | dict(values))
+            write_csv(folder / next(names), {"time": time} | dict(values))
 
 
 def completed(text: str, addresses: Mapping[str, Address]) -> str:

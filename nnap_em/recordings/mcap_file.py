@@ -17,9 +17,9 @@ from .recording import EXTRA, OTHER, Recording, Topic, Track, refuse
 SAMPLES = 20
 """Messages of a channel that are looked at for its fields: not every message needs to have them all."""
 STAMPS = [
-    (f"{place}.{seconds}", f"{place}.{rest}")
+    (f"{place}.{seconds}", f"{place}.{nanoseconds}")
     for place in ("header.stamp", "stamp", "timestamp", "header.timestamp")
-    for seconds, rest in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
+    for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 ]
 """Fields of a message that are the time at which it was measured: seconds, and nanoseconds of a second."""
 

@@ -69,8 +69,8 @@ def write_mcap(path: Path, logs: Logs, channels: Mapping[str, Channel]) -> None:
 
 def _schema(units: Mapping[str, str]) -> bytes:
     columns = {name: {"type": "number", "description": unit} for name, unit in units.items()}
-    own = {"file": {"type": "string"}, "time": {"type": "number", "description": "s"}}
-    return json.dumps({"type": "object", "properties": own | columns}).encode()
+    fixed = {"file": {"type": "string"}, "time": {"type": "number", "description": "s"}}
+    return json.dumps({"type": "object", "properties": fixed | columns}).encode()
 
 
 def _stamps(logs: Logs) -> list[np.ndarray]:

@@ -111,6 +111,6 @@ OTHER = "write it as ROS 2 CDR, JSON or protobuf, or name another topic"
 def near(word: str, known: Sequence[str], most: int = 12) -> str:
     """The hint for a misspelt name among many."""
     text = nearest(word, known)
-    first, mark, rest = text.partition("possible here: ")
-    names = rest.split(", ")
+    first, mark, tail = text.partition("possible here: ")
+    names = tail.split(", ")
     return first + mark + ", ".join(names[:most]) + (f", and {len(names) - most} more" if len(names) > most else "")

@@ -101,16 +101,16 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
 def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"]) -> Signal:
     """A column at its own times; messages without that number are left out."""
     y = recording.tracks[at.topic].values[at.path]
-    there = np.isfinite(y)
-    if np.count_nonzero(there) < 2:
+    finite = np.isfinite(y)
+    if np.count_nonzero(finite) < 2:
         problem = (
-            f"from {str(at)!r}: {np.count_nonzero(there)} numbers in {y.size} messages, the rest are NaN or absent"
+            f"from {str(at)!r}: {np.count_nonzero(finite)} numbers in {y.size} messages, the rest are NaN or absent"
         )
         hint = "name a field that holds numbers in [import.columns], or take the log out"
         refuse(recording.path, f"column {name!r}", problem, hint)
-    if there.all():
+    if finite.all():
         return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
-    return Signal(at.topic, t[there], y[there] * at.scale)
+    return Signal(at.topic, t[finite], y[finite] * at.scale)
 
 
 def _gridded(
@@ -129,13 +129,13 @@ def _gridded(
     _fine(recording.path, readings, rig.dt)
     at = grid(readings, start, end, rig.dt)
     longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
-    there = _there(inputs, readings, at, rig.dt, longest)
+    present = _present(inputs, readings, at, rig.dt, longest)
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
     columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
     segments = [
         _checked(segment, columns, rig.measured)
-        for segment in cut(there, shortest, max(round(plan.longest / rig.dt), 2))
+        for segment in cut(present, shortest, max(round(plan.longest / rig.dt), 2))
     ]
     used = [segment for segment in segments if not segment.why]
     if not used:
@@ -182,7 +182,7 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
         refuse(path, "[sampling] dt", problem, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
 
 
-def _there(
+def _present(
     inputs: Mapping[str, Signal],
     readings: Mapping[str, Signal],
     at: Float[np.ndarray, " row"],
@@ -190,13 +190,13 @@ def _there(
     longest: Mapping[str, float],
 ) -> Bool[np.ndarray, " row"]:
     """Rows in which every input is known, and some topic of readings is present."""
-    there = np.ones(at.size, bool)
+    present = np.ones(at.size, bool)
     for name, s in _one_each(inputs):
-        there &= commanded(s, at, dt, longest[name])
+        present &= commanded(s, at, dt, longest[name])
     seen = np.zeros(at.size, bool)
     for name, s in _one_each(readings):
         seen |= watched(s, at, dt, longest[name])
-    return there & seen
+    return present & seen
 
 
 def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:

@@ -88,7 +88,7 @@ def definitions(name: str, text: str) -> Types:
     types["builtin_interfaces/Duration"] = _TIME
     for i, part in enumerate(re.split(r"(?m)^=+\s*$", text)):
         head = re.match(r"\s*MSG:\s*(\S+)", part)
-        own = (name if i == 0 else head[1] if head else "").replace("/msg/", "/")
+        owner = (name if i == 0 else head[1] if head else "").replace("/msg/", "/")
         fields = []
         for line in part[head.end() if head else 0 :].splitlines():
             line = line.split("#")[0].strip()
@@ -98,18 +98,18 @@ def definitions(name: str, text: str) -> Types:
             if not match:
                 raise UnknownLayout(line)
             if not match[4]:  # else a constant
-                fields.append((_full(match[1], own), match[2], match[3]))
-        types[own] = fields or [("uint8", None, "structure_needs_at_least_one_member")]
+                fields.append((_full(match[1], owner), match[2], match[3]))
+        types[owner] = fields or [("uint8", None, "structure_needs_at_least_one_member")]
     return types
 
 
-def _full(kind: str, own: str) -> str:
+def _full(kind: str, owner: str) -> str:
     """The name of a type as other definitions call it."""
     if kind in _PRIMITIVES or kind in ("string", "wstring"):
         return kind
     short = {"time": "builtin_interfaces/Time", "duration": "builtin_interfaces/Duration", "Header": "std_msgs/Header"}
     kind = short.get(kind, kind).replace("/msg/", "/")
-    return kind if "/" in kind else f"{own.split('/')[0]}/{kind}"
+    return kind if "/" in kind else f"{owner.split('/')[0]}/{kind}"
 
 
 class _Walk:

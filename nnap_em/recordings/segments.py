@@ -72,23 +72,23 @@ def grid(readings: Mapping[str, Signal], start: float, end: float, dt: float) ->
 
 def commanded(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
     """Rows in which an input is known: for one interval after its last value before a gap."""
-    there = np.ones(at.size, bool)
+    known = np.ones(at.size, bool)
     for gap in gaps(signal, longest):
-        there &= (at < gap.start + max(signal.interval, dt) - SAME * dt) | (at >= gap.end - SAME * dt)
-    return there
+        known &= (at < gap.start + max(signal.interval, dt) - SAME * dt) | (at >= gap.end - SAME * dt)
+    return known
 
 
 def watched(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
     """Rows outside the gaps of a reading."""
-    there = np.ones(at.size, bool)
+    known = np.ones(at.size, bool)
     for gap in gaps(signal, longest):
-        there &= (at <= gap.start + SAME * dt) | (at >= gap.end - SAME * dt)
-    return there
+        known &= (at <= gap.start + SAME * dt) | (at >= gap.end - SAME * dt)
+    return known
 
 
-def cut(there: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Segment]:
-    """The stretches of rows that are there, the long ones in equal parts, the short ones marked as dropped."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
+def cut(present: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Segment]:
+    """The stretches of `present` rows, the long ones in equal parts, the short ones marked as dropped."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int))).reshape(-1, 2)
     segments = []
     for first, end in edges.tolist():
         parts = -(-(end - first) // longest)

@@ -55,15 +55,15 @@ def interpolated(
     width = t[right] - t[right - 1]
     x = np.clip(at, t[0], t[-1])
     exact = np.minimum(np.abs(x - t[right]), np.abs(x - t[right - 1])) <= slack
-    there = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((width <= reach) | exact)
+    known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((width <= reach) | exact)
     if signal.interval > SLOW * dt:
         nearest = np.round((t - at[0]) / dt).astype(int)
         hit = np.zeros(at.size, bool)
         hit[nearest[(nearest >= 0) & (nearest < at.size)]] = True
-        there &= hit
+        known &= hit
     share = (x - t[right - 1]) / width
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
-    return np.where(there, y, np.nan), there
+    return np.where(known, y, np.nan), known
 
 
 def integrals(signal: Signal, at: Float[np.ndarray, " x"], times: int, *, steps: bool) -> Float[np.ndarray, " x"]:

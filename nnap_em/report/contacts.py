@@ -56,11 +56,11 @@ class Contact(NamedTuple):
 def contacts(fitted: Identified) -> list[Contact]:
     """Contacts of a fit; standard deviations by the delta method, friction integrated out."""
     model, cov, out = fitted.model, covariance(fitted), []
-    for effect, own in zip(model.effects, blocks(model, fitted.m_step), strict=True):
-        parameters = estimates(effect, cov[own, own], model.system)
+    for effect, block in zip(model.effects, blocks(model, fitted.m_step), strict=True):
+        parameters = estimates(effect, cov[block, block], model.system)
         contact = cast(DynamicFriction, effect)
         torque, slopes = map(np.asarray, _loop(contact, parameters["distance"].value))
-        std = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", slopes, cov[own, own], slopes), 0.0))
+        std = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", slopes, cov[block, block], slopes), 0.0))
         loop = hysteresis(contact, parameters["distance"].value)
         out.append(Contact(contact.joint, parameters, loop._replace(torque=torque), std))
     return out
@@ -74,11 +74,11 @@ def _loop(effect: DynamicFriction, amplitude: float) -> tuple[Float[Array, " row
 
 
 @styled
-def hysteresis_figure(found: Sequence[Contact], names: Names) -> Figure:
+def hysteresis_figure(entries: Sequence[Contact], names: Names) -> Figure:
     """Torque over angle of every contact, with its 90 % band."""
-    figure = Figure(figsize=(max(4.4, 4.0 * len(found)), 3.7), layout="constrained")
-    axes = panels(figure, len(found), (1.0,))[0]
-    for ax, contact in zip(axes, found, strict=True):
+    figure = Figure(figsize=(max(4.4, 4.0 * len(entries)), 3.7), layout="constrained")
+    axes = panels(figure, len(entries), (1.0,))[0]
+    for ax, contact in zip(axes, entries, strict=True):
         angle, torque = np.asarray(contact.loop.angle), np.asarray(contact.loop.torque)
         half = len(angle) // 2 + 1
         for part in (slice(0, half), slice(half - 1, None)):

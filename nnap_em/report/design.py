@@ -141,9 +141,9 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
     for name, place in zip(prior.names, prior.places(model), strict=True):
         whose, unit = name, design.fitted.rig.unit(name)
         if name not in prior.declared:
-            at, _, own = name.partition(".")
+            at, _, field = name.partition(".")
             effect = model.effects[int(at)]
-            whose, unit = f"{words(key_of(effect))}, {own}", effect.units_on(model.system).get(own, "SI")
+            whose, unit = f"{words(key_of(effect))}, {field}", effect.units_on(model.system).get(field, "SI")
         labels += [whose] if np.size(place) == 1 else [f"{whose} {i + 1}" for i in range(np.size(place))]
         units += [unit] * np.size(place)
     return {

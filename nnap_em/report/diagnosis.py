@@ -33,7 +33,7 @@ from .tables import visited_nodes, write_friction, write_json
 def write_diagnosis(
     out: Path,
     closed: Closed,
-    found: list[Finding],
+    accepted: list[Finding],
     train: Logs,
     test: Logs | None,
     *,
@@ -43,13 +43,13 @@ def write_diagnosis(
 ) -> None:
     """Write the report of a closed loop into the folder `out`; `began` is `time.perf_counter()` at the start."""
     names, both = names_of(closed.before), {"before": closed.before, "after": closed.after}
-    sides = both if found else {"before": closed.before}
+    sides = both if accepted else {"before": closed.before}
     predicted = predictions(sides, test)
     error = errors(predicted, sides, test) if test else None
     if error:
         error.setdefault("after", error["before"])
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
-    partial = left["after"].without_effects() if found else left["before"]
+    partial = left["after"].without_effects() if accepted else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
     nodes = visited_nodes(velocities)
@@ -59,15 +59,15 @@ def write_diagnosis(
     figures = [
         *_error_pictures(error, predicted, tables, names, test),
         *_residual_pictures(left, partial, names),
-        *_found_pictures(found),
+        *_effect_pictures(accepted),
         *_search_pictures(closed.steps, closed.before.rig.named),
     ]
     disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     document = shared(closed.before, train, test, seed=seed, began=began) | {
-        "verdict": verdict(found, error, failed, rivals, suspects, closed.complete),
+        "verdict": verdict(accepted, error, failed, rivals, suspects, closed.complete),
         "complete": closed.complete,
-        "effects": [entry(f) for f in found],
+        "effects": [entry(f) for f in accepted],
         "interventions": [_disturbance(force, train.files) for force in closed.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
@@ -80,7 +80,7 @@ def write_diagnosis(
         "disagreements": [d._asdict() for d in disputed],
         "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
         "suspects": [suspect._asdict() for suspect in suspects],
-        "next": [*advice(found, disputed, rivals, suspects), *_experiment(closed.before.rig)],
+        "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(closed.before.rig)],
     }
     named = closed.before.rig.named
     write_json(out / "report.json", document, named)
@@ -149,14 +149,14 @@ def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: N
     ]
 
 
-def _found_pictures(found: list[Finding]) -> list[Picture]:
+def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
     """Learned functions, and what is left beside a law."""
     out = []
-    for finding in found:
+    for finding in accepted:
         if finding.curve is not None:
             name = words(key_of(finding.effect))
-            rest = f"What is left of {name}, a function of {finding.curve.signal}"
-            title = rest if finding.left else f"The learned {name}"
+            remainder = f"What is left of {name}, a function of {finding.curve.signal}"
+            title = remainder if finding.left else f"The learned {name}"
             caption = "With its 90 % band, without its mean."
             out.append(picture("found", title, caption, effect_figure(finding.curve)))
     return out

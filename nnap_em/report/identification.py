@@ -55,7 +55,7 @@ def write_identification(
     if error:
         caption = "On test sequences that the fit has not seen."
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
-    each = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
+    entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files)),
         "fit": error and {name: value for name, value in error.items() if name != "fit"} | error["fit"],
@@ -63,11 +63,11 @@ def write_identification(
         "noise": noise(fitted),
         "parameters": parameters(fitted),
         "friction_law": laws,
-        "friction_memory": [*fitted.memory.splitlines(), *(one.text for one in bristles)],
-        "contacts": [one.document() for one in bristles],
+        "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
+        "contacts": [bristle.document() for bristle in bristles],
         "log_likelihood": fitted.state.loglik.tolist(),
-        "epochs": each,
-        "left_out": each[-1]["left_out"],
+        "epochs": entries,
+        "left_out": entries[-1]["left_out"],
         "visited": ranges,
         "smoother": smoother,
         "model": "model.npz",

@@ -43,8 +43,8 @@ def timeline(document: Mapping[str, Any]) -> Figure:
             right.set_xlim(left=0.0)
         right.axvline(1e3 * document["dt"], color=ZERO, ls="--", lw=1.0, label="one row")
         left.grid(axis="y", visible=False)
-    more = len(document["logs"]) - len(logs)
-    head(figure, "Topics and sequences", list(grid.ravel()), f"{more} further logs are not drawn" if more else "")
+    undrawn = len(document["logs"]) - len(logs)
+    head(figure, "Topics and sequences", list(grid.ravel()), f"{undrawn} further logs are not drawn" if undrawn else "")
     return figure
 
 

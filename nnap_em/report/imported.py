@@ -33,8 +33,8 @@ def describe(
     seconds: float,
 ) -> dict[str, Any]:
     """All that import.json holds; times in seconds after the first message of a log."""
-    rest = iter(files)
-    entries = [_log(log, rest) for log in logs]
+    names = iter(files)
+    entries = [_log(log, names) for log in logs]
     rows = sum(s["rows"] for log in entries for s in log["sequences"] if s["file"])
     return {
         "format": 1,

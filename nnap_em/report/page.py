@@ -78,8 +78,8 @@ def _rounded(svg: bytes) -> bytes:
 
 def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
     """Pictures of a section in their order; those to choose from share a list."""
-    here = [picture for picture in pictures if picture.place == place]
-    return [list(group) for _, group in itertools.groupby(here, lambda p: p.title if p.choice else id(p))]
+    section = [picture for picture in pictures if picture.place == place]
+    return [list(group) for _, group in itertools.groupby(section, lambda p: p.title if p.choice else id(p))]
 
 
 def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
@@ -111,15 +111,25 @@ def rendered(template: str, **content: Any) -> str:
 def _environment() -> jinja2.Environment:
     """Templates that escape all text, with the words of a report as filters."""
     loader = jinja2.PackageLoader("nnap_em", "report")
-    made = jinja2.Environment(
+    environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters["grouped"] = grouped
+    environment.filters["grouped"] = grouped
     names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence")
-    made.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "look_first": _look_first}
-    made.tests |= {"finite": finite, "failed": _fails}
-    made.globals |= {"most": MOST, "meanings": MEANINGS, "words": WORDS, "level": LEVEL, "at": _at, "ratio": ratio}
-    return made
+    environment.filters |= {name: getattr(wording, name) for name in names} | {
+        "trust": _trust,
+        "look_first": _look_first,
+    }
+    environment.tests |= {"finite": finite, "failed": _fails}
+    environment.globals |= {
+        "most": MOST,
+        "meanings": MEANINGS,
+        "words": WORDS,
+        "level": LEVEL,
+        "at": _at,
+        "ratio": ratio,
+    }
+    return environment
 
 
 # --- what is worked out of the document

@@ -47,8 +47,8 @@ def _binned(x: Float[np.ndarray, "seq time"], r: Float[np.ndarray, "seq time"], 
     table = np.asarray(rows).T
     known = seen & (place >= 0) & (place < len(edges) - 1)
     known[known] = np.isfinite(table[0][place[known]])
-    rest = r[known] - table[0][place[known]]
-    share = 1 - np.mean(rest**2) / max(float(np.var(r[known])), 1e-300) if known.any() else 0.0
+    deviation = r[known] - table[0][place[known]]
+    share = 1 - np.mean(deviation**2) / max(float(np.var(r[known])), 1e-300) if known.any() else 0.0
     return _Bins(0.5 * (edges[1:] + edges[:-1]), *table, share=float(share))
 
 
@@ -130,8 +130,8 @@ def residual_figure(
     grid = figure.subplots(deep * dof, columns, squeeze=False).reshape(dof, -1)
     reaches = [_reach([curve for panel in row for curve in panel.curves]) for row in rows]
     for j, row in enumerate(rows):
-        alike = [r for k, r in enumerate(reaches) if names.rotary[k] == names.rotary[j]]
-        reach = max(reaches[j], 0.3 * max(alike))  # what matters little should look little
+        same_kind = [r for k, r in enumerate(reaches) if names.rotary[k] == names.rotary[j]]
+        reach = max(reaches[j], 0.3 * max(same_kind))  # what matters little should look little
         best = max(panel.share for panel in row)
         for c, (ax, panel) in enumerate(zip(grid[j], row, strict=False)):
             _draw(ax, panel, sides, bold=panel.share == best > 0.1)

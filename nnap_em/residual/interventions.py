@@ -91,8 +91,8 @@ def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
     size = np.abs(a)
     if not np.isfinite(size).any():
         return np.full((len(a), 1), np.inf)
-    own = [1.4826 * np.nanmedian(one) if np.isfinite(one).any() else 0.0 for one in size]
-    return np.maximum(np.nanquantile(size, 0.8) / 1.2816, np.asarray(own))[:, None] + 1e-300
+    single = [1.4826 * np.nanmedian(one) if np.isfinite(one).any() else 0.0 for one in size]
+    return np.maximum(np.nanquantile(size, 0.8) / 1.2816, np.asarray(single))[:, None] + 1e-300
 
 
 def window_mean(force: Float[np.ndarray, "seq time dof"], rows: int) -> WindowMean:
@@ -145,17 +145,19 @@ def places(residual: Residual, names: Names, dt: float) -> Places:
     return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(subspaces))
 
 
-def neighbours(here: Places, separation: int) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
+def neighbours(
+    samples: Places, separation: int
+) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
     """The places nearest to each in state space; True for those that count: of another moment, and one a moment."""
-    count = len(here.seq)
+    count = len(samples.seq)
     near = min(128, count)
-    distance, place = KDTree(here.state).query(here.state, k=near, distance_upper_bound=NEAR)
+    distance, place = KDTree(samples.state).query(samples.state, k=near, distance_upper_bound=NEAR)
     distance, place = (a.reshape(count, near) for a in (distance, place))
     known = np.isfinite(distance)
     place = np.where(known, place, 0)
-    seq, row = here.seq[place], here.row[place]
-    known &= (seq != here.seq[:, None]) | (np.abs(row - here.row[:, None]) >= separation)
-    moment = seq * (1 + here.row.max(initial=0) // separation) + row // separation
+    seq, row = samples.seq[place], samples.row[place]
+    known &= (seq != samples.seq[:, None]) | (np.abs(row - samples.row[:, None]) >= separation)
+    moment = seq * (1 + samples.row.max(initial=0) // separation) + row // separation
     counts = np.zeros(place.shape, bool)
     for k in range(near):
         twice = np.any(counts[:, :k] & (moment[:, :k] == moment[:, k : k + 1]), axis=1)
@@ -163,11 +165,11 @@ def neighbours(here: Places, separation: int) -> tuple[Int[np.ndarray, "place ne
     return place, counts
 
 
-def repeated(mean: Float[np.ndarray, " place"], here: Places, at: int, separation: int) -> float:
+def repeated(mean: Float[np.ndarray, " place"], samples: Places, at: int, separation: int) -> float:
     """The largest share of a force that acts wherever the signals of one joint are the same."""
-    away = here.away(at, separation) & np.isfinite(mean)
+    away = samples.away(at, separation) & np.isfinite(mean)
     shares = [0.0]
-    for subspace in here.subspaces:
+    for subspace in samples.subspaces:
         distance = np.where(away, np.linalg.norm(subspace - subspace[at], axis=1), np.inf)
         order = np.argsort(distance)[:OTHERS]
         order = order[distance[order] < VIEW]
@@ -187,29 +189,29 @@ def disturbances(
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
     force = np.where(known[..., None], residual.force, np.nan)
     force[:, 0] = np.nan  # no reading before it fixes the start
-    here, separation = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
-    if not here.seq.size:
+    samples, separation = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
+    if not samples.seq.size:
         return ()
-    place, counts = neighbours(here, separation)
+    place, counts = neighbours(samples, separation)
     lengths = list(dict.fromkeys(max(3, round(w / dt)) for w in WIDTHS))
     windows = [window_mean(force, rows) for rows in lengths]
     out: list[Intervention] = []
     for j in range(force.shape[-1]):
-        means = [b.mean[here.seq, here.row, j] for b in windows]
-        stds = [b.std[here.seq, here.row, j] for b in windows]
-        sure = np.stack([_sure(m, s, here, place, counts) for m, s in zip(means, stds, strict=True)])
+        means = [b.mean[samples.seq, samples.row, j] for b in windows]
+        stds = [b.std[samples.seq, samples.row, j] for b in windows]
+        sure = np.stack([_sure(m, s, samples, place, counts) for m, s in zip(means, stds, strict=True)])
         sure = np.where(np.abs(np.stack(means)) >= least[j], sure, 0.0) / np.where(counts.any(axis=1), 1.0, ALONE)
         while sure.max() >= bar:
             k, at = np.unravel_index(sure.argmax(), sure.shape)
-            i, row, size, std = int(here.seq[at]), int(here.row[at]), float(means[k][at]), float(stds[k][at])
+            i, row, size, std = int(samples.seq[at]), int(samples.row[at]), float(means[k][at]), float(stds[k][at])
             first, last = _extent(windows[0].mean[i, :, j], row, math.copysign(1.0, size))
-            beside = np.maximum(min(first, row) - here.row, here.row - max(last, row))
+            beside = np.maximum(min(first, row) - samples.row, samples.row - max(last, row))
             reach = np.asarray(lengths)[:, None] // 2  # of a window: those beside it average the same push
-            sure = np.where((here.seq == i) & (beside[None] <= reach), 0.0, sure)
+            sure = np.where((samples.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(residual.t[i, first]), float(residual.t[i, last])
             disturbance = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
             again = any(overlap(disturbance, other) for other in out)
-            if not again and repeated(means[k], here, int(at), separation) < REPEATED:
+            if not again and repeated(means[k], samples, int(at), separation) < REPEATED:
                 out.append(disturbance)
     return tuple(sorted((t for t in out if not any(_again(t, other, separation) for other in out)), key=in_order))
 
@@ -226,14 +228,14 @@ def in_order(disturbance: Intervention) -> tuple[int, int, int]:
     return disturbance.sequence, disturbance.first, disturbance.joint
 
 
-def _sure(mean, std, here: Places, place, counts) -> Float[np.ndarray, " place"]:
+def _sure(mean, std, samples: Places, place, counts) -> Float[np.ndarray, " place"]:
     """Geometric mean of the size of every window and its difference from its neighbours [standard deviations]."""
     total = np.where(counts & np.isfinite(mean[place]), mean[place], 0.0).sum(axis=1)
     nearby = total / np.maximum(counts.sum(axis=1), 1)
     new = mean - nearby
-    table = np.full((here.seq.max() + 1, here.row.max() + 1), np.nan)
-    table[here.seq, here.row] = new
-    product = mean / std * new / level(table)[here.seq, 0]
+    table = np.full((samples.seq.max() + 1, samples.row.max() + 1), np.nan)
+    table[samples.seq, samples.row] = new
+    product = mean / std * new / level(table)[samples.seq, 0]
     small = (np.abs(nearby) > REPEATED * np.abs(mean)) & (nearby * mean > 0)
     return np.where(small, 0.0, np.sqrt(np.maximum(np.nan_to_num(product), 0.0)))
 

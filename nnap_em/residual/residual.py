@@ -115,11 +115,12 @@ def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
 
     def both(x, kick, u, command):
         change = kick[:, dof : 2 * dof]
-        own = force(hooks.machine(model.effects, model.system, u.time), x, change)
+        remaining = force(hooks.machine(model.effects, model.system, u.time), x, change)
         if not model.effects:
-            return *own, *own
-        given = model.transition(x, u)[dof : 2 * dof] - plain.transition(x[: 2 * dof], command)[dof:]
-        return *own, *force(model.system, x, change + given[None])  # what the effects do to the rates over one sample
+            return *remaining, *remaining
+        # change of the rates by the effects over one sample
+        by_effects = model.transition(x, u)[dof : 2 * dof] - plain.transition(x[: 2 * dof], command)[dof:]
+        return *remaining, *force(model.system, x, change + by_effects[None])
 
     steps = jax.tree.map(lambda a: a[:-1], (posterior.state.mean, prepared.inputs, plain.inputs(seq)))
     forces = jax.vmap(both)(steps[0], posterior.kick, *steps[1:])

@@ -66,10 +66,10 @@ def disturbance_free(
         except FitError:  # too few rows are left: the fit of all rows stays
             break
         used, pieces = (cut, of) if of else (used, pieces)
-        more = [
+        added = [
             t for t in interventions(fitted, data, MORE * LEVEL) if not any(overlap(t, old) for old in disturbances)
         ]
-        if not more:
+        if not added:
             break
-        disturbances = tuple(sorted([*disturbances, *more], key=in_order))
+        disturbances = tuple(sorted([*disturbances, *added], key=in_order))
     return fitted, used, disturbances, pieces

@@ -74,8 +74,8 @@ class GaussianSmoother(AbstractSmoother):
         """
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
-        def again(_, now):
-            filtered = relinearised(model, now[1].state, seq, self.linearise)
+        def again(_, latest):
+            filtered = relinearised(model, latest[1].state, seq, self.linearise)
             return filtered, rts(filtered)
 
         smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))

@@ -135,8 +135,8 @@ def absorbed(state: Gaussian, reading: Reading, r, y, observed):
 def moved(state: Gaussian, affine: Affine, q: Float[Array, "state state"], active) -> tuple[Affine, Gaussian]:
     """The step that is made, none where it is not `active`, and the prediction of the next row."""
     stay = jnp.eye(state.mean.shape[0], dtype=state.mean.dtype)
-    rest = Affine(stay, jnp.zeros_like(state.mean), jnp.zeros_like(stay))
-    affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, rest)
+    identity = Affine(stay, jnp.zeros_like(state.mean), jnp.zeros_like(stay))
+    affine = jax.tree.map(lambda a, b: jnp.where(active, a, b), affine, identity)
     following = Gaussian(
         product(affine.matrix, state.mean) + affine.offset,
         symmetric(product(product(affine.matrix, state.cov), affine.matrix.T))
@@ -146,23 +146,23 @@ def moved(state: Gaussian, affine: Affine, q: Float[Array, "state state"], activ
     return affine, following
 
 
-def _filter(log_q, log_r, start: Gaussian, seq: Prepared, given, affine_at, reading_at) -> Filtered:
+def _filter(log_q, log_r, start: Gaussian, seq: Prepared, arguments, affine_at, reading_at) -> Filtered:
     """Kalman recursion.
 
-    `affine_at(state, given)` gives the transition that follows a filtered state, `reading_at(mean, given)` the
-    emission at a predicted mean, of what is `given` in the row.
+    `affine_at(state, arguments)` gives the transition that follows a filtered state, `reading_at(mean, arguments)` the
+    emission at a predicted mean; `arguments` are those of its row.
     """
     q, r = jnp.diag(jnp.exp(log_q)), jnp.exp(log_r)
 
     def step(predicted, slices):
-        y, observed, active, given = slices
-        reading = reading_at(predicted.mean, given)
+        y, observed, active, arguments = slices
+        reading = reading_at(predicted.mean, arguments)
         state, whitened, log_variance, gain = absorbed(predicted, reading, r, y, observed)
-        affine, following = moved(state, affine_at(state, given), q, active)
+        affine, following = moved(state, affine_at(state, arguments), q, active)
         return following, (state, predicted, whitened, log_variance, gain, affine, reading)
 
     _, (state, predicted, whitened, log_variance, gain, affine, reading) = jax.lax.scan(
-        step, start, (seq.y, seq.observed, seq.active, given)
+        step, start, (seq.y, seq.observed, seq.active, arguments)
     )
     count = jnp.sum(seq.observed).astype(whitened.dtype)
     loglik = -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi))
@@ -196,7 +196,13 @@ def kalman_filter(
 ) -> Filtered:
     """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
     return _filter(
-        log_q, log_r, start, seq, (affine, reading), lambda state, given: given[0], lambda mean, given: given[1]
+        log_q,
+        log_r,
+        start,
+        seq,
+        (affine, reading),
+        lambda state, arguments: arguments[0],
+        lambda mean, arguments: arguments[1],
     )
 
 

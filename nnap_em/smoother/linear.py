@@ -26,10 +26,10 @@ def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Fl
         unit = cubature(2 * n, mean.dtype)
         later = lower(cholesky(cov_next))
         left = cov - product(product(gain, cov_next), gain.T)
-        rest = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
+        factor = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
         spread_next = product(unit[:, :n], later.T)
         following = mean_next[None] + spread_next
-        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], rest.T), following
+        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], factor.T), following
 
     mean, cov = smoothed.state
     return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])

@@ -90,15 +90,15 @@ class Journal:
         header, arrays = read_arrays(path, KIND)
         by, of = header.get("by"), header.get("of")
         if by != self.by:
-            made, this = (" and ".join(f"{k} {v}" for k, v in (d or {}).items()) for d in (by, self.by))
-            refuse(path, f"made by {made}, this is {this}", "leave --resume out to begin anew")
+            origin, this = (" and ".join(f"{k} {v}" for k, v in (d or {}).items()) for d in (by, self.by))
+            refuse(path, f"made by {origin}, this is {this}", "leave --resume out to begin anew")
         for name, value in self.of.items():
             if (other := (of or {}).get(name)) != value:
                 option = isinstance(value, int) or name.startswith("--")
-                made = f"with {name} {other}, not {value}" if option else f"from another {name}"
+                origin = f"with {name} {other}, not {value}" if option else f"from another {name}"
                 again = f"resume with {name} {other}" if other is not None else f"resume without {name}"
                 hint = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
-                refuse(path, f"made {made}", f"{hint}, or give another --out")
+                refuse(path, f"made {origin}", f"{hint}, or give another --out")
         return header["leaves"], arrays
 
 

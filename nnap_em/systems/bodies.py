@@ -27,8 +27,8 @@ def names(body: Body) -> list[str]:
 def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Turn]:
     """Mass [kg], centre of mass [m] and inertia about it [kg m^2] in the body's frame."""
 
-    def at(what: str, given: float) -> Scalar:
-        return values.get(f"{body.name}.{what}", given)
+    def at(what: str, default: float) -> Scalar:
+        return values.get(f"{body.name}.{what}", default)
 
     x, y, z = (at(f"com.{axis}", body.centre[i]) for i, axis in enumerate(AXES))
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = (
@@ -49,27 +49,27 @@ def carried_by(
     for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
             continue
-        mass, centre, own = numbers(body, values)
+        mass, centre, tensor = numbers(body, values)
         if any(name.startswith(f"{body.name}.") for name in values):
-            mass = jnp.where(physical(mass, own), mass, jnp.nan)
-        inertias[mount.joint] = united(inertias[mount.joint], mounted(mass, centre, own, mount))
+            mass = jnp.where(physical(mass, tensor), mass, jnp.nan)
+        inertias[mount.joint] = united(inertias[mount.joint], mounted(mass, centre, tensor, mount))
         if place in loads:
             inertias[mount.joint] = united(inertias[mount.joint], carried(loads[place], mount.place, mount.turn))
     return inertias
 
 
-def mounted(mass: Scalar, centre: Three, own: Turn, mount: Mount) -> Inertia:
+def mounted(mass: Scalar, centre: Three, tensor: Turn, mount: Mount) -> Inertia:
     """A body as the joint's frame carries it."""
-    return inertia(mass, add(mount.place, apply(mount.turn, centre)), sandwich(mount.turn, own))
+    return inertia(mass, add(mount.place, apply(mount.turn, centre)), sandwich(mount.turn, tensor))
 
 
-def physical(mass: Scalar, own: Turn) -> Any:
+def physical(mass: Scalar, tensor: Turn) -> Any:
     """True where some distribution of mass has this inertia: half its trace less itself is positive, and so is the
     mass.
 
     [Wensing, Kim & Slotine 2018, IEEE RA-L 3(1), eq. 12: the pseudo-inertia]  By leading minors, with a margin.
     """
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = own
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor
     half = 0.5 * (xx + yy + zz)
     slack = MARGIN * half
     a, b, c = half - xx + slack, half - yy + slack, half - zz + slack
@@ -82,18 +82,18 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
     """`after`, but a body that is estimated in all its numbers and cannot be so is one on the way from `before`."""
     out = dict(after)
     for body in machine.bodies:
-        own = names(body)
-        if not set(own) <= set(after):
+        keys = names(body)
+        if not set(keys) <= set(after):
             continue
         goal = numbers(body, after)
-        there = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        reached = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
         fine = physical(goal[0], goal[2])
-        out |= {name: jnp.where(fine, after[name], one) for name, one in zip(own, there, strict=True)}
+        out |= {name: jnp.where(fine, after[name], one) for name, one in zip(keys, reached, strict=True)}
     return out
 
 
-def _together(mass: Scalar, centre: Three, own: Turn) -> Numbers:
-    return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in own]))
+def _together(mass: Scalar, centre: Three, tensor: Turn) -> Numbers:
+    return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in tensor]))
 
 
 def _in_order(body: Numbers) -> list[Scalar]:
@@ -157,14 +157,14 @@ def load(spot: LoadPoint, mass: Scalar, moment: Three) -> Inertia:
     """
     least = SLIGHT * spot.mass
     inverse = mass / jnp.square(jnp.maximum(jnp.abs(mass), least))
-    own = about(scaled(times(0.5, inverse), moment), moment)
-    second = summed(summed(about(scaled(times(0.5, mass), spot.point), spot.point), about(moment, spot.point)), own)
+    share = about(scaled(times(0.5, inverse), moment), moment)
+    second = summed(summed(about(scaled(times(0.5, mass), spot.point), spot.point), about(moment, spot.point)), share)
     return Inertia(mass, add(scaled(mass, spot.point), moment), second)
 
 
-def with_load(body: tuple[Scalar, Three, Turn], more: Inertia) -> tuple[Scalar, Three, Turn]:
+def with_load(body: tuple[Scalar, Three, Turn], added: Inertia) -> tuple[Scalar, Three, Turn]:
     """Mass, centre and inertia about it of a body with a load."""
-    total = united(inertia(*body), more)
+    total = united(inertia(*body), added)
     centre = scaled(1.0 / total.mass, total.moment)
     steiner = about(scaled(-0.5, total.moment), centre)
     return total.mass, centre, summed(total.second, steiner)

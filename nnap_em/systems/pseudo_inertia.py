@@ -49,6 +49,6 @@ def stepped(before: Numbers, after: Numbers) -> Numbers:
     inward = jax.scipy.linalg.solve_triangular(root, moved, lower=True)
     inward = jax.scipy.linalg.solve_triangular(root, inward.T, lower=True)
     by = root @ (jnp.tril(inward) - 0.5 * jnp.diag(jnp.diag(inward)))
-    own, its = jnp.diag(root), jnp.diag(by)
-    end = jnp.tril(root + by, -1) + jnp.diag(own * jnp.exp(its / own))
+    diagonal, by_diagonal = jnp.diag(root), jnp.diag(by)
+    end = jnp.tril(root + by, -1) + jnp.diag(diagonal * jnp.exp(by_diagonal / diagonal))
     return of_pseudo(end @ end.T)

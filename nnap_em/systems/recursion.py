@@ -62,10 +62,10 @@ class Motion(NamedTuple):
 NOTHING = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))
 
 
-def inertia(mass: Scalar, centre: Three, own: Turn) -> Inertia:
+def inertia(mass: Scalar, centre: Three, tensor: Turn) -> Inertia:
     """Inertia from that about the centre of mass."""
     moment = scaled(mass, centre)
-    return Inertia(mass, moment, summed(own, about(scaled(0.5, moment), centre)))
+    return Inertia(mass, moment, summed(tensor, about(scaled(0.5, moment), centre)))
 
 
 def united(a: Inertia, b: Inertia) -> Inertia:
@@ -102,15 +102,15 @@ def motions(
 ) -> list[Motion]:
     """Motions of the frames of all joints; that of the base stands last, so that -1 finds it."""
     chain: list[Motion] = [Motion(ZERO, ZERO, scaled(-1.0, gravity))]
-    for frame, pose, rate, more in zip(frames, poses, v, a, strict=True):
+    for frame, pose, rate, acceleration in zip(frames, poses, v, a, strict=True):
         spin, turns, rise = chain[frame.before]
         rise = add(rise, add(cross(turns, pose.place), cross(spin, cross(spin, pose.place))))
         spin, turns, rise = apply(pose.back, spin), apply(pose.back, turns), apply(pose.back, rise)
-        own, gain = (0.0, 0.0, rate), (0.0, 0.0, more)
+        velocity, gain = (0.0, 0.0, rate), (0.0, 0.0, acceleration)
         if frame.slide:
-            rise = add(rise, add(scaled(2.0, cross(spin, own)), gain))
+            rise = add(rise, add(scaled(2.0, cross(spin, velocity)), gain))
         else:
-            turns, spin = add(turns, add(cross(spin, own), gain)), add(spin, own)
+            turns, spin = add(turns, add(cross(spin, velocity), gain)), add(spin, velocity)
         chain.insert(-1, Motion(spin, turns, rise))
     return chain
 

@@ -98,14 +98,14 @@ class Tree(AbstractSystem):
 
     def loaded(self, joint, mass, moment):
         spot = self.spots[joint]
-        more = load(spot, mass, (moment[0], moment[1], moment[2]))
+        added = load(spot, mass, (moment[0], moment[1], moment[2]))
         held = self.loads.get(spot.body)
-        return replace(self, loads={**self.loads, spot.body: more if held is None else united(held, more)})
+        return replace(self, loads={**self.loads, spot.body: added if held is None else united(held, added)})
 
     def body_numbers(self, place: int) -> tuple[Scalar, Three, Turn]:
         """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a body with its load, in the body's frame."""
-        own = numbers(self.machine.bodies[place], self.values)
-        return with_load(own, self.loads[place]) if place in self.loads else own
+        unloaded = numbers(self.machine.bodies[place], self.values)
+        return with_load(unloaded, self.loads[place]) if place in self.loads else unloaded
 
     def __str__(self) -> str:
         numbers = {name: float(value) for name, value in self.values.items()}

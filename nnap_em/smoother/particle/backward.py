@@ -82,8 +82,8 @@ class ExactBackward(AbstractBackward):
         for i in range(f.shape[0]):
             within = within + f[i][outer] * x_next[i][:, None]
         within = upto(exp2(within), 0)
-        rest = jnp.minimum(target - before, within[:, -1] * (1 - jnp.finfo(target.dtype).eps))
-        inner = jnp.sum(within <= rest[:, None], axis=1)
+        remainder = jnp.minimum(target - before, within[:, -1] * (1 - jnp.finfo(target.dtype).eps))
+        inner = jnp.sum(within <= remainder[:, None], axis=1)
         return (outer * self.block + inner).astype(jnp.int32)
 
 
@@ -99,8 +99,8 @@ def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int
         uniform = uniforms(key_steps, time, backward.draws, num_paths, dtype)
         chosen = backward(x_next, f, log_w, log_ahead, ancestors[index], uniform)
         index = jnp.where(active, chosen, index)  # nothing is resampled on arrival in the padding
-        here = x[:, index]
-        return (index, here), (here, x_next - f[:, index])
+        state = x[:, index]
+        return (index, state), (state, x_next - f[:, index])
 
     h = history
     times = jnp.arange(h.x.shape[0] - 1, dtype=jnp.int32)

@@ -96,7 +96,7 @@ def particle_filter(
 
     def step(carry, slices):
         f, log_w, ess = carry
-        time, offset, arrive, leave, origin, origin_next, u, y, observed, now, following = slices
+        time, offset, arrive, leave, origin, origin_next, u, y, observed, present, following = slices
 
         def resample(old):
             f, log_w, _ = old
@@ -105,15 +105,15 @@ def particle_filter(
 
         f, log_w, ancestors = _where(arrive & (ess < 0.5 * size), resample, (f, log_w, everyone))
         noise = normals(key_noise, time, states, num_particles, dtype)
-        x = [jnp.where(arrive, a, b) for a, b in zip(now.move(f, noise), f, strict=True)]
+        x = [jnp.where(arrive, a, b) for a, b in zip(present.move(f, noise), f, strict=True)]
         state = jnp.stack([origin[i] + scale_[i] * x[i] for i in range(states)])
         f = jax.vmap(model.transition, in_axes=(1, None), out_axes=1)(state, u)
         f = [jnp.where(leave, (f[i] - origin_next[i]) / scale_[i], x[i]) for i in range(states)]
         log_ahead = jnp.where(leave, following.log_ahead(f), 0.0)
-        grown = log_w + log_g(state, u, y, observed) - now.log_psi(x) + log_ahead
+        grown = log_w + log_g(state, u, y, observed) - present.log_psi(x) + log_ahead
         alive = jnp.isfinite(grown) & (dot(f, f) < _FARTHEST)
-        some = jnp.any(alive)
-        grown = jnp.where(alive, grown, jnp.where(some, -jnp.inf, flat))  # where all are dead, all begin anew
+        any_alive = jnp.any(alive)
+        grown = jnp.where(alive, grown, jnp.where(any_alive, -jnp.inf, flat))  # where all are dead, all begin anew
         x, f = ([jnp.where(alive, row, 0.0) for row in rows] for rows in (x, f))
         log_ahead = jnp.where(alive, log_ahead, 0.0)
         top = jnp.max(grown)
@@ -123,7 +123,7 @@ def particle_filter(
         log_w = jnp.where(arrive, grown - total, log_w)
         ess = jnp.where(arrive, mass**2 / jnp.sum(w**2), ess)
         out = (jnp.stack(x), jnp.stack(f), log_w - log_ahead, log_ahead, ancestors, ess)
-        return (f, log_w, ess), (*out, jnp.where(some, jnp.where(arrive, total, 0.0), -jnp.inf).astype(exact))
+        return (f, log_w, ess), (*out, jnp.where(any_alive, jnp.where(arrive, total, 0.0), -jnp.inf).astype(exact))
 
     mean = [jnp.full(num_particles, m, dtype) for m in start.mean.astype(dtype)]
     log_ahead = jax.tree.map(lambda a: a[0], steps).log_ahead(mean)

@@ -35,8 +35,8 @@ class MetropolisBackward(AbstractBackward):
             e = [x_next[i] - f[i][index] for i in range(f.shape[0])]
             return -0.5 * dot(e, e) - log_ahead[index]
 
-        def step(now, uniform):
-            index, value = now
+        def step(carry, uniform):
+            index, value = carry
             choose, accept = uniform
             place = choose * paths
             whole = jnp.floor(place)

@@ -80,11 +80,11 @@ class Lookahead(AbstractProposal):
             seen = spread @ (spread.T @ later.precision)
             ahead = symmetric(later.precision - later.precision @ seen)  # (precision^-1 + noise)^-1
             linear = matrix.T @ (later.linear - seen.T @ later.linear - ahead @ miss)
-            now = _Readings(
+            combined = _Readings(
                 reading.precision + jnp.where(active, symmetric(matrix.T @ ahead @ matrix), 0.0),
                 reading.linear + jnp.where(active, linear, 0.0),
             )
-            return now, now
+            return combined, combined
 
         readings = _readings(model, seq, path)
         blank = jax.tree.map(lambda a: jnp.zeros_like(a[0]), readings)

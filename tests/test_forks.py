@@ -76,8 +76,8 @@ def known(question):
     )
     x = _moves(model, start, q.data)
     path = Gaussian(x, jnp.broadcast_to(1e-8 * jnp.eye(4), (*x.shape, 4)))
-    now = q.now.refitted(model)
-    return q._replace(declared=now, now=now, path=path, data=q.data._replace(y=x))
+    now = q.hypothesis.refitted(model)
+    return q._replace(declared=now, hypothesis=now, path=path, data=q.data._replace(y=x))
 
 
 def test_errors_are_those_of_the_model_run_alone(known):
@@ -120,7 +120,7 @@ def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
     _, q = question
     around = surroundings(question[0], q.model, q.data, q.path, ROWS)
     free = next(c for c in catalogue["unknown_function"].candidates(around) if len(c.probes) > 5)
-    q = q._replace(now=q.now.plus(free.start, free))
+    q = q._replace(hypothesis=q.hypothesis.plus(free.start, free))
     candidates = [*_candidates(question, "torsional_spring", "cogging"), free]
     probes = sum(len(c.probes) for c in candidates)
     whole = MultiStep().linearise(q, candidates)
@@ -170,10 +170,10 @@ def test_a_fit_to_multi_step_errors_finds_the_parameter(known):
 def test_a_law_that_is_there_removes_the_error(question, known):
     """Of readings that a machine with a spring would give, the model with the spring leaves less than without it."""
     (spring,) = _candidates(question, "torsional_spring")
-    true = known.now.plus(spring.probes[0], spring)
+    true = known.hypothesis.plus(spring.probes[0], spring)
     x = _moves(true.model, known.model.start.mean, known.data)
     seen = known._replace(path=known.path._replace(mean=x), data=known.data._replace(y=x))
-    both = (followed(m, rule.prior, seen.path, seen.data) for m, rule in (known.now[:2], true[:2]))
+    both = (followed(m, rule.prior, seen.path, seen.data) for m, rule in (known.hypothesis[:2], true[:2]))
     before, after = map(errors, both)
     assert ratio(before, before, seen.used) == 1.0
     assert ratio(before, after, seen.used) < 0.01

@@ -208,7 +208,9 @@ def _pretend(monkeypatch, worth: dict[str, float]):
     """Fits whose squared error is one, less what each law of theirs is worth."""
     left = lambda model: 1 - sum(worth[name] for name in _names(model))  # noqa: E731
     smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
-    monkeypatch.setattr(search, "smooth", lambda context, now, length: (smoothed._replace(now=now), np.ones(6, bool)))
+    monkeypatch.setattr(
+        search, "smooth", lambda context, now, length: (smoothed._replace(hypothesis=now), np.ones(6, bool))
+    )
     monkeypatch.setattr(search, "fitted", lambda now, *_: Trial(now.model, RULE, None, np.zeros(6), None))
     monkeypatch.setattr(MultiStep, "ratio", lambda self, null, full, *_: left(full.model) / left(null.model))
     monkeypatch.setattr(search, "extend", lambda context, now, length: _emstate(now.model, 1.0))
@@ -249,7 +251,7 @@ def _rounds(monkeypatch, *laws):
         if law is None:
             return Round(step, None, None)
         case = _case(law)
-        return Round(step, None, case._replace(after=fit.now.plus(law, case.screened.candidate)))
+        return Round(step, None, case._replace(after=fit.hypothesis.plus(law, case.screened.candidate)))
 
     smooth = search.smooth
     monkeypatch.setattr(search, "smooth", lambda *a: (lengths.append(a[2]), smooth(*a))[1])
@@ -284,7 +286,7 @@ def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, l
     rounds = search.screening_round
 
     def late(fit, context):
-        if not fit.now.found:
+        if not fit.hypothesis.found:
             return rounds(fit, context)
         if not left:
             raise TimeUp

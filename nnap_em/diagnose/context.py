@@ -79,81 +79,81 @@ def _cut(tree: _Tree, length: int) -> _Tree:
     return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if length <= SHORT else tree  # a view, no program
 
 
-def smooth(context: SearchContext, now: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
-    """`now` along its smoothed paths over `length` rows, and the sequences that are followed whole.
+def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
+    """`hypothesis` along its smoothed paths over `length` rows, and the sequences that are followed whole.
 
     A diverged sequence is most informative around its divergence: it is used up to 8, 3 or 1 rows after that moment,
     the longest stretch that the smoother still follows.
     """
     before, rows = context.before, context.data.t.shape[1]
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
-    posterior = e_step(now.model, every, smoother, key=before.state.key)
+    posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(kept(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    fit = SmoothedFit(context.declared, now, *both, whole, rows, context.pieces)
+    fit = SmoothedFit(context.declared, hypothesis, *both, whole, rows, context.pieces)
     if whole.all():
         return fit, whole
-    dof = len(now.model.system.coordinates)
-    kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(now.model.log_q))
+    dof = len(hypothesis.model.system.coordinates)
+    kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(hypothesis.model.log_q))
     large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.large_kick)
     first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
     row, used, cut = np.arange(every.t.shape[1]), whole, every
     for later in context.effort.later:
         early = every.valid & jnp.asarray(row < first[:, None] + later)
         cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
-        posterior = e_step(now.model, cut, smoother, key=before.state.key)
+        posterior = e_step(hypothesis.model, cut, smoother, key=before.state.key)
         used = np.asarray(kept(posterior, cut))
         if used.all():
             break
     return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
 
 
-def extend(context: SearchContext, now: Hypothesis, first: int) -> EMState:
-    """EM of `now` from a horizon of `first` rows to the whole length."""
+def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMState:
+    """EM of `hypothesis` from a horizon of `first` rows to the whole length."""
     before, longest = context.before, context.longest
     schedule = Schedule(first=min(first, longest), growth=1.6, hold=1)
     growing = math.ceil(math.log(longest / schedule.first) / math.log(1.6)) if longest > schedule.first else 0
 
     def run(model: StateSpaceModel) -> EMState:
-        begun = start_state(model, now.m_step, key=before.state.key)._replace(epoch=1)
-        return fit(begun, context.data, before.smoother, now.m_step, epochs=growing + 8, schedule=schedule)
+        begun = start_state(model, hypothesis.m_step, key=before.state.key)._replace(epoch=1)
+        return fit(begun, context.data, before.smoother, hypothesis.m_step, epochs=growing + 8, schedule=schedule)
 
     def looser(model: StateSpaceModel) -> StateSpaceModel:
         return eqx.tree_at(lambda m: m.log_q, model, model.log_q + LOOSER)
 
     try:
-        state = run(now.model)
+        state = run(hypothesis.model)
     except FitError:
-        state = run(looser(now.model))
+        state = run(looser(hypothesis.model))
     if np.isfinite(before.state.top).sum() > np.isfinite(state.top).sum():
         try:  # tracks that the model without it keeps are lost
             other = run(looser(cast(StateSpaceModel, state.best)))
             state = other if ahead(other.top, state.top) > 0 else state
         except FitError:
             pass
-    other = _afresh(context, now)
+    other = _afresh(context, hypothesis)
     state = other if other is not None and ahead(other.top, state.top) > 0 else state
     if context.loss.predicts:
-        state = _predicting(context, now, state)
+        state = _predicting(context, hypothesis, state)
     reached = np.nanmean(state.top)
     context.log(f"  fitted over the whole length in {state.epoch - 1} epochs: {reached:.1f} nat per sequence")
     return state
 
 
-def _afresh(context: SearchContext, now: Hypothesis) -> EMState | None:
-    """Fit of the laws of `now` with friction and noise from their start; None where `now` is likelier at first.
+def _afresh(context: SearchContext, hypothesis: Hypothesis) -> EMState | None:
+    """Fit with friction and noise from their start, and the same laws; None where `hypothesis` is likelier at first.
 
     Friction that was fitted without a law may stand in its place, too steep for the step of the integration, and no
     step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within .07 rad/s.
     """
     before = context.before
     declared = begin(before.rig, context.data, key=before.state.key)
-    fresh = Hypothesis(cast(StateSpaceModel, declared.model), declared.m_step, ()).having(now.additions)
+    fresh = Hypothesis(cast(StateSpaceModel, declared.model), declared.m_step, ()).having(hypothesis.additions)
     brief = horizon(context.data, SCHEDULE.first)
     state = start_state(fresh.model, fresh.m_step, key=before.state.key)
     try:
         state = fit(state, context.data, before.smoother, fresh.m_step, epochs=SCHEDULE.at_first)
-        own = e_step(now.model, brief, before.smoother, key=before.state.key)
+        own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)
         if ahead(state.top, np.asarray(own.loglik)) <= 0:
             return None
         context.log("  with friction from its start it is likelier over the first horizon, and is fitted from there")
@@ -162,21 +162,21 @@ def _afresh(context: SearchContext, now: Hypothesis) -> EMState | None:
         return None
 
 
-def _predicting(context: SearchContext, now: Hypothesis, state: EMState) -> EMState:
+def _predicting(context: SearchContext, hypothesis: Hypothesis, state: EMState) -> EMState:
     """A fit, or that of the model it began from where that predicts better.
 
     EM, by one-step likelihood, may go away from what the errors of many steps had taught.
     """
-    reached = now.refitted(cast(StateSpaceModel, state.best))
-    (a, one), (b, other) = (smooth(context, each, context.longest) for each in (now, reached))
+    reached = hypothesis.refitted(cast(StateSpaceModel, state.best))
+    (a, one), (b, other) = (smooth(context, each, context.longest) for each in (hypothesis, reached))
     if not (one & other).any():
         return state
     before, after = (errors(followed(f.model, f.m_step.prior, f.path, context.data), JUDGED) for f in (a, b))
     if ratio(before, after, one & other) <= 1:
         return state
-    begun = start_state(now.model, now.m_step, key=state.key)._replace(epoch=1)
+    begun = start_state(hypothesis.model, hypothesis.m_step, key=state.key)._replace(epoch=1)
     schedule = Schedule(first=context.longest)
-    return fit(begun, context.data, context.before.smoother, now.m_step, epochs=2, schedule=schedule)
+    return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)
 
 
 def trimmed(gain) -> float:

@@ -107,7 +107,7 @@ class MultiStep(AbstractLoss):
 
     def left(self, fit: SmoothedFit) -> float:
         """Product of what each refit left: a later law must remove the floor of the first error, not of the rest."""
-        removed = [evidence.removed for evidence in fit.now.found if evidence is not None]
+        removed = [evidence.removed for evidence in fit.hypothesis.found if evidence is not None]
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:

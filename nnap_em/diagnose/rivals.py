@@ -49,7 +49,7 @@ def instead(
     trials = []
     screened = sorted(screen(OneStep(), fit, same, shifts=0).screened, key=lambda s: -s.share.inside) if same else []
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
-        full = fit.now.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
+        full = fit.hypothesis.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
         path = extended(full.model, fit.path, fit.data)
         trials.append(refit(full.model, full.m_step.early(), path, fit.data, fit.used, passes=PASSES))
     return _with(fitted, max(trials, key=lambda trial: float(np.nansum(trial.loglik)))) if trials else None

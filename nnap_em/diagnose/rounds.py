@@ -50,7 +50,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     tried: list[Refit] = []
     fitting = fit, context.loss, context.effort.passes
     try:
-        null = fitted(fit.now, fit.path, *fitting) if admitted else None
+        null = fitted(fit.hypothesis, fit.path, *fitting) if admitted else None
         while admitted and len(tried) < context.effort.shortlist:
             first = min(s.band for s in admitted)
             entries = _entries([s for s in admitted if s.band == first], model)

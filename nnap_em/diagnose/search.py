@@ -125,7 +125,7 @@ def _share_without(context: SearchContext, hypothesis: Hypothesis, full, fit, pl
     both = fit._replace(used=fit.used & smoothed.used)
     if not both.used.any():  # without it no sequence is followed
         return math.inf
-    trial = fitted(reduced, smoothed.path, both._replace(now=reduced), context.loss, context.effort.passes)
+    trial = fitted(reduced, smoothed.path, both._replace(hypothesis=reduced), context.loss, context.effort.passes)
     return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
 
 

@@ -17,7 +17,7 @@ class SmoothedFit(NamedTuple):
 
     declared: Hypothesis
     """The declared model."""
-    now: Hypothesis
+    hypothesis: Hypothesis
     """The same with the effects that were accepted."""
     path: Gaussian
     data: Dataset
@@ -31,12 +31,12 @@ class SmoothedFit(NamedTuple):
     @property
     def model(self) -> StateSpaceModel:
         """Model of the hypothesis."""
-        return self.now.model
+        return self.hypothesis.model
 
     @property
     def m_step(self) -> ScoringMStep:
         """M-step that fits it."""
-        return self.now.m_step
+        return self.hypothesis.m_step
 
     @property
     def recording(self) -> Int[np.ndarray, " seq"]:

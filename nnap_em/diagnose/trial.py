@@ -63,7 +63,7 @@ def fitted(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: Abstr
 
 def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
     """A candidate in the model, or in the place of the law that it is another form of, refitted."""
-    candidate, hypothesis = screened.candidate, fit.now
+    candidate, hypothesis = screened.candidate, fit.hypothesis
     effect = seeded(candidate, screened.coefficients)
     place = replaced(effect, hypothesis.model)
     full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, candidate)

@@ -208,21 +208,21 @@ class MixtureSmoother(AbstractBranching):
         log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
         tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles, self.wide)
         paths = jax.vmap(lambda last: branch(tree, last))(jnp.arange(self.components))
-        smoothed, here = jax.vmap(rts)(paths), jnp.isfinite(tree.log_weight)
+        smoothed, followed = jax.vmap(rts)(paths), jnp.isfinite(tree.log_weight)
         if first is not None:
             paths, smoothed = jax.tree.map(lambda a: jnp.concatenate([a, a[:1]]), (paths, smoothed))
             smoothed = smoothed._replace(state=jax.tree.map(lambda a, b: a.at[-1].set(b), smoothed.state, first))
-            here = jnp.append(here, True)
+            followed = jnp.append(followed, True)
 
-        def follow(filtered, smoothed, here):
-            def again(_, now):
-                filtered = relinearised(model, now[1].state, seq, self.linearise)
+        def follow(filtered, smoothed, followed):
+            def again(_, last):
+                filtered = relinearised(model, last[1].state, seq, self.linearise)
                 return filtered, rts(filtered)
 
             posterior = linear_posterior(*jax.lax.fori_loop(0, self.iterations, again, (filtered, smoothed)))
-            return posterior._replace(loglik=jnp.where(here, self.loglik(model, seq, posterior.state), -jnp.inf))
+            return posterior._replace(loglik=jnp.where(followed, self.loglik(model, seq, posterior.state), -jnp.inf))
 
-        return jax.vmap(follow)(paths, smoothed, here)
+        return jax.vmap(follow)(paths, smoothed, followed)
 
     def loglik(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> Float[Array, ""]:
         """Log-likelihood of the readings by the model linearised about `path`."""

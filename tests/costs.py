@@ -101,6 +101,6 @@ class Costs:
 
     def pytest_terminal_summary(self, terminalreporter) -> None:
         """Print one line."""
-        compiled, found = self.total["programs"] - self.total["found"], self.total["found"]
-        line = f"{compiled} programs compiled in {self.total['seconds']:.0f} s, {found} more taken from the cache"
+        compiled, cached = self.total["programs"] - self.total["found"], self.total["found"]
+        line = f"{compiled} programs compiled in {self.total['seconds']:.0f} s, {cached} more taken from the cache"
         terminalreporter.write_line(line)

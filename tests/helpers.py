@@ -33,8 +33,8 @@ def optimised() -> Iterator[None]:
 
 def swing_rig(**changes) -> Rig:
     """The declaration of what `swing` writes."""
-    given = {"dt": 0.01, "clock": "sequence", "measured": ("theta1", "dtheta1")} | changes
-    return Rig("bench", "acrobot", {}, True, ("u",), (2,), noise_std={}, start={}, **given)
+    fields = {"dt": 0.01, "clock": "sequence", "measured": ("theta1", "dtheta1")} | changes
+    return Rig("bench", "acrobot", {}, True, ("u",), (2,), noise_std={}, start={}, **fields)
 
 
 def swing(rows: int = 201, dt: float = 0.01, phase: float = 0.0) -> dict[str, np.ndarray]:

@@ -45,18 +45,18 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
 
 def mistakes(source: str) -> list[tuple[int, str]]:
     """Line and reason of every docstring and comment to be rewritten."""
-    found = [(line, f"starts with {m[1]!r}") for line, text in docstrings(source) if (m := START.match(text.lstrip()))]
+    rows = [(line, f"starts with {m[1]!r}") for line, text in docstrings(source) if (m := START.match(text.lstrip()))]
     for line, text in (*docstrings(source), *comments(source)):
         words = BANNED.findall(re.sub(r"`[^`]*`", "", text))
-        found += [(line, f"has the word {word!r}") for word in words]
-    return sorted(found)
+        rows += [(line, f"has the word {word!r}") for word in words]
+    return sorted(rows)
 
 
 def in_package() -> dict[str, list[tuple[int, str]]]:
     """Mistakes by file of the package."""
     paths = {str(path.relative_to(ROOT / "nnap_em")): path for path in sorted((ROOT / "nnap_em").rglob("*.py"))}
-    found = {name: mistakes(path.read_text()) for name, path in paths.items()}
-    return {name: lines for name, lines in found.items() if lines}
+    rows = {name: mistakes(path.read_text()) for name, path in paths.items()}
+    return {name: lines for name, lines in rows.items() if lines}
 
 
 if __name__ == "__main__":

@@ -60,8 +60,8 @@ def _log_file(change: Callable[[str], str | bytes]) -> Callable[[Path], object]:
 
     def apply(folder: Path) -> None:
         path = folder / "train/01.csv"
-        found = change(path.read_text())
-        path.write_bytes(found if isinstance(found, bytes) else found.encode())
+        content = change(path.read_text())
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
     return apply
 

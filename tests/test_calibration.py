@@ -127,9 +127,9 @@ def test_truth_has_any_rank_among_the_trajectories():
         GaussianSmoother(StartBank((1,) * x.shape[-1]), Tangent()), num_particles=200, num_paths=99
     )
     keys = jax.random.split(jax.random.key(4), RUNS)
-    found = eqx.filter_jit(jax.vmap(lambda seq, key: smoother(model, prepare(model, seq), key=key)))(data, keys)
+    posterior = eqx.filter_jit(jax.vmap(lambda seq, key: smoother(model, prepare(model, seq), key=key)))(data, keys)
     rows = [0, ROWS // 2, ROWS - 2]
-    rank = np.sum(np.asarray(found.prev)[:, rows] < x[:, rows, None], axis=2)  # of 100 places
+    rank = np.sum(np.asarray(posterior.prev)[:, rows] < x[:, rows, None], axis=2)  # of 100 places
     count = np.stack([np.sum(rank // 10 == i, axis=0) for i in range(10)])
     p = scipy.stats.chisquare(count, axis=0).pvalue
     assert np.all(p > LEVEL / p.size)

@@ -42,11 +42,11 @@ def _logs(data: Dataset) -> Logs:
     return Logs(tuple(f"{i:03d}.csv" for i in range(len(data.t))), data, ("u", "x", "dx"))
 
 
-def _found(logs: Logs, rig: Rig | None = None, test: Logs | None = None) -> dict[str, list[tuple[str, str]]]:
-    found: dict[str, list[tuple[str, str]]] = {}
+def _report(logs: Logs, rig: Rig | None = None, test: Logs | None = None) -> dict[str, list[tuple[str, str]]]:
+    report: dict[str, list[tuple[str, str]]] = {}
     for mark, subject, text in check(rig or _rig(), logs, test, key=jax.random.key(0)):
-        found.setdefault(subject, []).append((mark, text))
-    return found
+        report.setdefault(subject, []).append((mark, text))
+    return report
 
 
 def _changed(logs: Logs, **parts) -> Logs:
@@ -54,11 +54,11 @@ def _changed(logs: Logs, **parts) -> Logs:
 
 
 def test_a_good_data_set_is_all_ok(slide):
-    found = _found(slide, test=slide)
-    assert {mark for answers in found.values() for mark, _ in answers} == {"ok"}
-    assert list(found) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
-    assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in found["length"][0][1]
-    assert "2 of 2 directions" in found["states"][0][1]
+    report = _report(slide, test=slide)
+    assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
+    assert list(report) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
+    assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in report["length"][0][1]
+    assert "2 of 2 directions" in report["states"][0][1]
 
 
 UPRIGHT = """
@@ -112,7 +112,7 @@ def test_bodies_that_make_no_machine_are_bad_and_nothing_else_is_tried():
     rig = Rig("a", "acrobot", values, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
     build_system(rig)
     rig = replace(rig, parameters={**values, "I2": Declared(-0.006, 0.0)})
-    mark, text = _found(logs, rig)["bodies"][0]
+    mark, text = _report(logs, rig)["bodies"][0]
     assert mark == "bad"
     assert "the declared masses and inertias make no machine" in text
     with pytest.raises(RigError, match="rig 'a': the declared masses and inertias make no machine"):
@@ -132,19 +132,19 @@ def test_the_gramian_of_a_double_integrator():
 
 def test_a_place_that_nothing_tells_is_named(slide):
     """A slide knows no place: its rate tells nothing of it, and friction does not mind."""
-    found = _found(_changed(slide, y=lambda y: y[..., 1:]), _rig(("dx",)))
-    ((mark, text),) = found["states"]
+    report = _report(_changed(slide, y=lambda y: y[..., 1:]), _rig(("dx",)))
+    ((mark, text),) = report["states"]
     assert mark == "look"
     assert "1 of 2 directions" in text
     assert "do not tell x" in text
 
 
 def test_readings_that_tell_no_velocity_are_bad(slide):
-    found = _found(slide, _rig(noise={"x": 50.0, "dx": 50.0}))
-    assert found["states"][0][0] == "bad"
-    assert "0 of 2" in found["states"][0][1]
-    assert found["noise"][0][0] == "bad"
-    assert "the motion hardly rises above it" in found["noise"][0][1]
+    report = _report(slide, _rig(noise={"x": 50.0, "dx": 50.0}))
+    assert report["states"][0][0] == "bad"
+    assert "0 of 2" in report["states"][0][1]
+    assert report["noise"][0][0] == "bad"
+    assert "the motion hardly rises above it" in report["noise"][0][1]
 
 
 CASES = {  # name: (change, subject, mark, words)
@@ -183,28 +183,28 @@ CASES = {  # name: (change, subject, mark, words)
 
 @pytest.mark.parametrize("change, subject, mark, words", CASES.values(), ids=CASES)
 def test_what_is_bad_is_found(slide, change, subject, mark, words):
-    answers = _found(_changed(slide, **change))[subject]
-    assert any(found == mark and words in text for found, text in answers), answers
+    answers = _report(_changed(slide, **change))[subject]
+    assert any(actual == mark and words in text for actual, text in answers), answers
 
 
 def test_a_filtered_log_is_noticed(slide):
-    answers = _found(slide, _rig(noise={"x": 1e-3, "dx": 0.1}))["noise"]
+    answers = _report(slide, _rig(noise={"x": 1e-3, "dx": 0.1}))["noise"]
     assert answers[1][0] == "look"
     assert "was filtered" in answers[1][1]
 
 
 def test_with_hardly_any_rows_nothing_else_is_asked(slide):
-    found = _found(_logs(Dataset(*(part[:, :2] for part in slide.data))))
-    assert list(found) == ["length", "test", "missing"]
-    assert found["length"][0][0] == "bad"
+    report = _report(_logs(Dataset(*(part[:, :2] for part in slide.data))))
+    assert list(report) == ["length", "test", "missing"]
+    assert report["length"][0][0] == "bad"
 
 
 def test_slow_sampling_is_noticed(slide):
     """Every 10th row: half a second of a sweep is five rows."""
     slow = Dataset(*(part[:, ::10] for part in slide.data))
-    found = _found(_logs(slow), _rig(dt=0.1))
-    assert found["sampling"][0][0] == "look"
-    assert "sample faster" in found["sampling"][0][1]
+    report = _report(_logs(slow), _rig(dt=0.1))
+    assert report["sampling"][0][0] == "look"
+    assert "sample faster" in report["sampling"][0][1]
 
 
 def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):
@@ -241,8 +241,8 @@ def test_the_acrobot_with_a_hidden_joint_passes():
     measured = tuple(("theta1", "theta2", "dtheta1", "dtheta2")[i] for i in model.measured)
     rig = Rig("a", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", measured, {}, {})
     data = Dataset(*(np.asarray(part) for part in data))
-    found = _found(Logs(tuple("abcd"), data, ("u", *measured)), rig)
-    assert "bad" not in {mark for answers in found.values() for mark, _ in answers}
-    assert "4 of 4 directions" in found["states"][0][1]
-    assert any("joint 2 (never seen, by the declared model)" in text for _, text in found["motion"])
+    report = _report(Logs(tuple("abcd"), data, ("u", *measured)), rig)
+    assert "bad" not in {mark for answers in report.values() for mark, _ in answers}
+    assert "4 of 4 directions" in report["states"][0][1]
+    assert any("joint 2 (never seen, by the declared model)" in text for _, text in report["motion"])
     assert jnp.isfinite(data.y).all()

@@ -96,11 +96,11 @@ for command in ("", "simulate", "init", "check", "identify", "diagnose", "compar
         assert stop.code == 0
 assert not {"jax", "numpy", "equinox", "matplotlib"} & set(sys.modules)
 """
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stderr
-    assert found.stdout.count("example") >= 9
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("example") >= 9
     for command in ("simulate bench", "identify bench --out fit", "predict fit bench/test", "smooth fit bench/test"):
-        assert f"nnap-em {command}" in found.stdout
+        assert f"nnap-em {command}" in process.stdout
 
 
 def test_version_is_that_of_the_package(capsys):
@@ -212,12 +212,12 @@ def test_particles_identify_as_well(bench, fit, tmp_path):
     argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")
     assert _run("identify", bench, "--out", tmp_path, *argv) == 0
     assert _files(tmp_path) == _files(fit)
-    found, other = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, fit))
+    particles, other = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, fit))
     assert read(tmp_path / "model.npz").notes["settings"] == {"smoother": "particle", "particles": 50, "seed": 0}
-    assert found["left_out"] == []
+    assert particles["left_out"] == []
     # the same first model: within what `fit` allows for the noise of a stochastic smoother
-    assert found["log_likelihood"][0] == pytest.approx(other["log_likelihood"][0], abs=0.5)
-    assert found["log_likelihood"][1] > found["log_likelihood"][0] + 10
+    assert particles["log_likelihood"][0] == pytest.approx(other["log_likelihood"][0], abs=0.5)
+    assert particles["log_likelihood"][1] > particles["log_likelihood"][0] + 10
     assert all(np.isfinite(values).all() for values in _read(tmp_path / "friction.csv").values())
 
 
@@ -297,31 +297,31 @@ def _no_json(word: str):
 
 def _messages(path: Path) -> dict[str, list[tuple[int, dict]]]:
     """Log time [ns] and content of every message, by topic."""
-    found: dict[str, list[tuple[int, dict]]] = {}
+    topics: dict[str, list[tuple[int, dict]]] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
             content = json.loads(message.data, parse_constant=_no_json)
             assert set(content) <= set(json.loads(schema.data)["properties"])
-            found.setdefault(channel.topic, []).append((message.log_time, content))
-    return found
+            topics.setdefault(channel.topic, []).append((message.log_time, content))
+    return topics
 
 
 def test_viewers_get_the_log_and_what_was_smoothed(bench, fit, tmp_path):
     path = tmp_path / "smoothed.mcap"
     assert _run("smooth", fit, bench / "test", "--out", tmp_path / "csv", "--mcap", path) == 0
-    found = _messages(path)
+    topics = _messages(path)
     fitted = load(fit / "model.npz")
     logs = read_logs(bench / "test", fitted.rig)
     left = residual(fitted, logs.data)
-    assert set(found) == {"/log", "/smoothed", "/one_row_ahead", "/missing_force"}
-    stamps = [t for t, _ in found["/log"]]
+    assert set(topics) == {"/log", "/smoothed", "/one_row_ahead", "/missing_force"}
+    stamps = [t for t, _ in topics["/log"]]
     assert stamps[0] == 0 and (np.diff(stamps) > 0).all()  # sequences follow each other
     for i, name in enumerate(_files(bench / "test")):
         log, smoothed = _read(bench / "test" / name), _read(tmp_path / "csv" / name)
         rows = len(log["time"])
 
         def column(topic, key, name=name):
-            messages = [m for _, m in found[topic] if m["file"] == name]
+            messages = [m for _, m in topics[topic] if m["file"] == name]
             return np.array([m.get(key, np.nan) for m in messages])
 
         for key in ("time", "u", "x"):
@@ -332,25 +332,25 @@ def test_viewers_get_the_log_and_what_was_smoothed(bench, fit, tmp_path):
         np.testing.assert_array_equal(column("/missing_force", "x"), left.force[i, :rows, 0])
         np.testing.assert_array_equal(column("/missing_force", "x_std"), left.force_std[i, :rows, 0])
         assert np.isfinite(left.force[i, : rows - 1]).all()
-        times = [t for t, m in found["/smoothed"] if m["file"] == name]
+        times = [t for t, m in topics["/smoothed"] if m["file"] == name]
         np.testing.assert_allclose(1e-9 * np.diff(times), np.diff(log["time"]), atol=1e-9)
 
 
 def test_viewers_get_the_prediction(bench, fit, tmp_path):
     path = tmp_path / "predicted.mcap"
     assert _run("predict", fit, bench / "test", "--given", "0.4", "--out", tmp_path / "csv", "--mcap", path) == 0
-    found = _messages(path)
+    topics = _messages(path)
     written = np.concatenate([_read(tmp_path / "csv" / name)["dx_std"] for name in _files(bench / "test")])
-    assert set(found) == {"/log", "/predicted"}
-    np.testing.assert_allclose([m["dx_std"] for _, m in found["/predicted"]], written, rtol=1e-11)
+    assert set(topics) == {"/log", "/predicted"}
+    np.testing.assert_allclose([m["dx_std"] for _, m in topics["/predicted"]], written, rtol=1e-11)
 
 
 @pytest.mark.parametrize("command", [("smooth",), ("predict", "--given", "0.4")], ids=lambda command: command[0])
 def test_mcap_needs_its_package(bench, fit, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    name, *given = command
+    name, *arguments = command
     path = tmp_path / "a.mcap"
-    assert _run(name, fit, bench / "test", *given, "--out", tmp_path / "csv", "--mcap", path) == 2
+    assert _run(name, fit, bench / "test", *arguments, "--out", tmp_path / "csv", "--mcap", path) == 2
     assert 'a.mcap: MCAP files cannot be written without mcap; pip install "nnap-em[logs]"' in capsys.readouterr().err
     assert not _files(tmp_path)
 
@@ -467,8 +467,8 @@ def test_test_sequences_do_not_change_the_fit(bench, fit, tmp_path):
 
 def test_json_has_null_for_what_is_no_number(tmp_path):
     tables.write_json(tmp_path / "x.json", {"a": [1.0, float("nan")], "b": {"c": float("inf"), "d": "é"}})
-    found = json.loads((tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
-    assert found == {"a": [1.0, None], "b": {"c": None, "d": "é"}}
+    content = json.loads((tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
+    assert content == {"a": [1.0, None], "b": {"c": None, "d": "é"}}
 
 
 def _bench_file(name: str, old: str, new: str):

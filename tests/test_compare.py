@@ -163,30 +163,30 @@ def test_between_two_runs_the_spread_has_a_closed_form():
     """tau^2 = (gap^2 - s_1^2 - s_2^2) / 2, and none where the stated errors explain the gap."""
     std = np.asarray([[0.3, 0.3], [0.4, 0.4]])
     value = np.asarray([[1.0, 1.0], [6.0, 1.49]])
-    found = pool(value, std)
+    pooled = pool(value, std)
     between = np.asarray([(5**2 - 0.3**2 - 0.4**2) / 2, 0.0])
     weight = 1 / (std**2 + between)
-    np.testing.assert_allclose(found.between**2, between, rtol=1e-12)
-    np.testing.assert_allclose(found.value, np.sum(weight * value, axis=0) / weight.sum(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(found.std, weight.sum(axis=0) ** -0.5, rtol=1e-12)
+    np.testing.assert_allclose(pooled.between**2, between, rtol=1e-12)
+    np.testing.assert_allclose(pooled.value, np.sum(weight * value, axis=0) / weight.sum(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(pooled.std, weight.sum(axis=0) ** -0.5, rtol=1e-12)
 
 
 def test_runs_that_are_equally_sure_are_pooled_to_their_mean():
     rng = np.random.default_rng(5)
     value = rng.normal(2.0, 3.0, (7, 4))
-    found = pool(value, np.full((7, 4), 0.5))
+    pooled = pool(value, np.full((7, 4), 0.5))
     variance = value.var(axis=0, ddof=1)
-    np.testing.assert_allclose(found.value, value.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(found.between**2, variance - 0.25, rtol=1e-12)
-    np.testing.assert_allclose(found.std**2, variance / 7, rtol=1e-12)
+    np.testing.assert_allclose(pooled.value, value.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(pooled.between**2, variance - 0.25, rtol=1e-12)
+    np.testing.assert_allclose(pooled.std**2, variance / 7, rtol=1e-12)
 
 
 def test_a_prior_that_all_runs_share_counts_once():
     """Runs that tell nothing leave the prior; those that tell something its precision and theirs."""
     same = np.full((3, 1), 2.0)
     np.testing.assert_allclose(pool(same, np.full((3, 1), 0.4), 0.4).std, 0.4, rtol=1e-6)
-    told = 1 / math.sqrt(1 / 0.4**2 + 1 / 0.2**2)
-    np.testing.assert_allclose(pool(same, np.full((3, 1), told), 0.4).std, (1 / 0.16 + 3 / 0.04) ** -0.5, rtol=1e-9)
+    std = 1 / math.sqrt(1 / 0.4**2 + 1 / 0.2**2)
+    np.testing.assert_allclose(pool(same, np.full((3, 1), std), 0.4).std, (1 / 0.16 + 3 / 0.04) ** -0.5, rtol=1e-9)
 
 
 # --- what else a reader is told
@@ -203,16 +203,16 @@ def _with_effect(fitted: Identified, mu: float) -> Identified:
 
 def test_effects_are_compared_and_those_of_one_fit_are_a_difference(unchanged):
     first, second = (fit.fitted for fit in unchanged.fits)
-    found = compare(_with_effect(first, 0.1), second, names=("may", "june"))
-    assert found.differences == ("load friction of u and dx at joint 1 is in may, not in june",)
-    assert found.numbers[-1].test is None and not found.changed
-    assert found.verdict.startswith("No tested quantity changed between may and june")
-    assert found.verdict.endswith("at 1%. Load friction of u and dx at joint 1 is in may, not in june.")
+    comparison = compare(_with_effect(first, 0.1), second, names=("may", "june"))
+    assert comparison.differences == ("load friction of u and dx at joint 1 is in may, not in june",)
+    assert comparison.numbers[-1].test is None and not comparison.changed
+    assert comparison.verdict.startswith("No tested quantity changed between may and june")
+    assert comparison.verdict.endswith("at 1%. Load friction of u and dx at joint 1 is in may, not in june.")
     name = "mu of load friction of u and dx at joint 1"
     for value, news in ((0.11, ()), (0.2, (name,))):  # known to .01 each
-        found = compare(_with_effect(first, 0.1), _with_effect(second, value), names=("may", "june"))
-        assert (found.differences, found.changed) == ((), news)
-        np.testing.assert_allclose(found.numbers[-1].std, 0.01, rtol=1e-6)
+        comparison = compare(_with_effect(first, 0.1), _with_effect(second, value), names=("may", "june"))
+        assert (comparison.differences, comparison.changed) == ((), news)
+        np.testing.assert_allclose(comparison.numbers[-1].std, 0.01, rtol=1e-6)
 
 
 def test_a_parameter_that_one_fit_keeps_is_a_difference(unchanged):
@@ -225,8 +225,8 @@ def test_a_parameter_that_one_fit_keeps_is_a_difference(unchanged):
         m_step=eqx.tree_at(lambda m: m.prior, second.m_step, empty),
         state=second.state._replace(hessian=second.state.hessian[:-1, :-1]),
     )
-    found = compare(first, kept, names=("a", "b"))
-    assert found.differences == ("m is estimated in a, kept as declared in b",)
+    comparison = compare(first, kept, names=("a", "b"))
+    assert comparison.differences == ("m is estimated in a, kept as declared in b",)
 
 
 @pytest.mark.parametrize("inside, warned", [(0.99, True), (1.01, False)])
@@ -238,12 +238,12 @@ def test_ranges_that_hardly_overlap_are_warned_of(fits, tmp_path, kind, inside, 
         (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
         row = {part: [factor * end if part == kind else end for end in ends] for part, ends in ranges.items()}
         (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"joint": 1} | row]}))
-    found = compare(tmp_path / "first", tmp_path / "grown")
-    assert len(found.warnings) == warned
+    comparison = compare(tmp_path / "first", tmp_path / "grown")
+    assert len(comparison.warnings) == warned
     if warned:
         first, other = ("-1 to 1", "-0.495 to 0.495 m/s") if kind == "velocity" else ("-4 to 4", "-1.98 to 1.98 N")
-        assert f"joint 1: the {kind} ranges of first {first} and grown {other} share 50%" in found.warnings[0]
-    low, high = found.curves[0].velocity[[0, -1]]
+        assert f"joint 1: the {kind} ranges of first {first} and grown {other} share 50%" in comparison.warnings[0]
+    low, high = comparison.curves[0].velocity[[0, -1]]
     assert high == -low == pytest.approx(LEAST_SHARED * inside if kind == "velocity" else 1.0)
 
 
@@ -257,8 +257,8 @@ def test_fits_without_a_common_velocity_have_no_curve(fits, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
         (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"velocity": ends, "load": None}]}))
-    found = compare(tmp_path / "first", tmp_path / "grown")
-    assert found.curves == () and "its friction is not compared" in found.warnings[0]
+    comparison = compare(tmp_path / "first", tmp_path / "grown")
+    assert comparison.curves == () and "its friction is not compared" in comparison.warnings[0]
 
 
 def test_fits_of_the_same_logs_are_warned_of(unchanged, tmp_path):

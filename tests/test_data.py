@@ -85,9 +85,9 @@ def test_a_rig_without_input_has_inputs_of_width_zero(tmp_path):
 def test_noise_is_not_taken_for_degrees(tmp_path):
     """At rest the differences of a noisy angle are many times a quiet rate: no units can be read from them."""
     rng = np.random.default_rng(0)
-    rest = {"time": 0.001 * np.arange(500), "u": np.zeros(500)}
-    rest |= {"theta1": rng.normal(0.0, 5e-3, 500), "dtheta1": rng.normal(0.0, 1e-4, 500)}
-    write_csv(tmp_path / "01.csv", rest)
+    log = {"time": 0.001 * np.arange(500), "u": np.zeros(500)}
+    log |= {"theta1": rng.normal(0.0, 5e-3, 500), "dtheta1": rng.normal(0.0, 1e-4, 500)}
+    write_csv(tmp_path / "01.csv", log)
     assert read_logs(tmp_path, swing_rig(dt=0.001)).files == ("01.csv",)
 
 

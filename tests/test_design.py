@@ -131,12 +131,12 @@ def test_information_is_the_mean_square_of_the_score(fit):
 
     @eqx.filter_jit
     def slope_of(known_fit, seq, x):
-        here, _, wide = linearised(known_fit, seq, x)
-        column, start = columns_of(known_fit, here, wide)[..., place], Gaussian(x[0], model.start.cov)
+        linear, _, wide = linearised(known_fit, seq, x)
+        column, start = columns_of(known_fit, linear, wide)[..., place], Gaussian(x[0], model.start.cov)
 
         def innovations(amount):
-            affine = here.affine._replace(offset=here.affine.offset + amount * column)
-            return kalman_filter(model.log_q, model.log_r, start, affine, here.reading, here.seq).innovation
+            affine = linear.affine._replace(offset=linear.affine.offset + amount * column)
+            return kalman_filter(model.log_q, model.log_r, start, affine, linear.reading, linear.seq).innovation
 
         return jax.jacfwd(innovations)(jnp.zeros(()))
 
@@ -207,9 +207,9 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     with pytest.warns(DeprecationWarning, match=r"Design\.expected"):
         assert design.told is design.expected
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
-    found = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
-    assert np.all(np.asarray(found.lowest) >= design.limits.lowest[None, None])
-    assert np.all(np.asarray(found.highest) <= design.limits.highest[None, None])
+    extremes = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
+    assert np.all(np.asarray(extremes.lowest) >= design.limits.lowest[None, None])
+    assert np.all(np.asarray(extremes.highest) <= design.limits.highest[None, None])
     assert isinstance(design.question, Several) and isinstance(design.question.criteria[0], Friction)
     whole, near = design.question.criteria[0].weight
     np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
@@ -240,8 +240,8 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     bounded = lambda **tables: dataclasses.replace(rig, limits=Bounds(**tables))  # noqa: E731
     plain = limits_of(rig, system, data, path, used)
     assert plain.low[0] == np.asarray(data.u).min() and plain.high[0] == np.asarray(data.u).max()
-    own = bounded(values={"u": (-1.0, 2.0), "x": (-0.5, 0.5)}, rate={"u": (-3.0, 3.0)}, start={"x": (-0.2, 0.3)})
-    expected = limits_of(own, system, data, path, used)
+    declared = bounded(values={"u": (-1.0, 2.0), "x": (-0.5, 0.5)}, rate={"u": (-3.0, 3.0)}, start={"x": (-0.2, 0.3)})
+    expected = limits_of(declared, system, data, path, used)
     assert (expected.low[0], expected.high[0], expected.rate[0]) == (-1.0, 2.0, 3.0)
     assert (expected.lowest[0], expected.highest[0], expected.first[0], expected.last[0]) == (-0.5, 0.5, -0.2, 0.3)
     with pytest.raises(DesignError, match=r"begin at x = 0.7, out of the limits .*\[limits.start\]"):

@@ -119,26 +119,26 @@ def test_reference_has_every_public_name():
 
 def test_every_folder_says_what_goes_in_and_out():
     for folder in FOLDERS:
-        told = (folder / "README.md").read_text()
-        assert told.startswith(f"# {folder.name}\n") and "\nIn: " in told and " Out: " in told, folder
-        for link in re.findall(r"\]\(([^)#]+)", told):
+        readme = (folder / "README.md").read_text()
+        assert readme.startswith(f"# {folder.name}\n") and "\nIn: " in readme and " Out: " in readme, folder
+        for link in re.findall(r"\]\(([^)#]+)", readme):
             assert (folder / link).exists(), f"{folder}: {link}"
 
 
 def test_every_file_that_is_named_is_there():
     """By its name, or by the end of its path."""
-    there = [f"/{p.relative_to(ROOT)}" for part in ("nnap_em", "tests", "examples", "benchmarks", "docs")
+    files = [f"/{p.relative_to(ROOT)}" for part in ("nnap_em", "tests", "examples", "benchmarks", "docs")
              for p in (ROOT / part).rglob("*.py")]  # fmt: skip
     for page in [*PAGES, ROOT / "benchmarks/README.md", *ROOT.glob("nnap_em/*/README.md")]:
         for named in re.findall(r"(?<![\w/])(\w[\w/]*\.py)\b", page.read_text()):
-            assert named in GENERATED or any(path.endswith(f"/{named}") for path in there), f"{page}: {named}"
+            assert named in GENERATED or any(path.endswith(f"/{named}") for path in files), f"{page}: {named}"
 
 
 def test_every_benchmark_has_its_row():
-    told = (ROOT / "benchmarks/README.md").read_text()
+    readme = (ROOT / "benchmarks/README.md").read_text()
     scripts = [path.name for path in (ROOT / "benchmarks").glob("*.py") if not path.name.startswith("planted_")]
-    assert [name for name in scripts if f"`{name}" not in told] == []
-    for page in re.findall(r"\]\(([^)#]+)", told):
+    assert [name for name in scripts if f"`{name}" not in readme] == []
+    for page in re.findall(r"\]\(([^)#]+)", readme):
         assert (ROOT / "benchmarks" / page).exists(), page
 
 

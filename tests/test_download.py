@@ -125,9 +125,9 @@ def test_a_file_that_the_server_has_not_is_told_with_its_address(published, tmp_
 def test_without_a_server_one_sentence_says_what_to_do(published, tmp_path):
     with _server(lambda *_: None) as (address, _):
         pass  # from here on nobody listens there
-    with pytest.raises(recordings.RecordingError, match=r"no connection to 127.*--from FOLDER$") as told:
+    with pytest.raises(recordings.RecordingError, match=r"no connection to 127.*--from FOLDER$") as refused:
         recordings.downloaded(address, tmp_path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_files_of_a_folder_are_checked(published, tmp_path):

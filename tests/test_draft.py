@@ -48,10 +48,10 @@ SYSTEMS = {  # columns, system given, the system, inputs and joints that must be
 
 @pytest.mark.parametrize("names, given, system, inputs", SYSTEMS.values(), ids=SYSTEMS)
 def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
-    found = _draft(tmp_path, *names, system=given)
-    assert not found.notes
-    assert found.missing == [name for name in specs[system].parameters if name != "g"]
-    (tmp_path / "rig.toml").write_text(_filled(found.text))
+    drafted = _draft(tmp_path, *names, system=given)
+    assert not drafted.notes
+    assert drafted.missing == [name for name in specs[system].parameters if name != "g"]
+    (tmp_path / "rig.toml").write_text(_filled(drafted.text))
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert (rig.system, rig.name, rig.dt, rig.clock, rig.friction) == (system, "bench", DT, "sequence", True)
     assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == inputs
@@ -65,8 +65,8 @@ def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
 @pytest.mark.parametrize("key", [name for name in specs["acrobot"].parameters if name != "g"])
 def test_a_line_that_is_not_filled_in_is_refused_by_name(tmp_path, key):
     text = _draft(tmp_path, "tau2", "theta1", "theta2").text
-    rest = re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text)
-    (tmp_path / "rig.toml").write_text(rest)
+    incomplete = re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text)
+    (tmp_path / "rig.toml").write_text(incomplete)
     with pytest.raises(RigError, match=rf"rig.toml: \[model\] {key}: missing .*write {key} = 0.2"):
         read_rig(tmp_path / "rig.toml", specs)
 
@@ -82,10 +82,10 @@ FROM_ZERO = {  # columns, then inputs and joints, and the names that the notes a
 @pytest.mark.parametrize("names, inputs, states", FROM_ZERO.values(), ids=FROM_ZERO)
 def test_joints_that_a_log_counts_from_0(tmp_path, names, inputs, states):
     zero = [name for name in names if ("u0" in names and name[0] == "u") or name[:2] == "dq"]
-    found = _draft(tmp_path, *names, system="acrobot")
-    assert f"columns = {list(inputs)}".replace("'", '"') in found.text
-    assert f"joints = {list(inputs.values())}" in found.text
-    said = "; ".join(found.notes)
+    drafted = _draft(tmp_path, *names, system="acrobot")
+    assert f"columns = {list(inputs)}".replace("'", '"') in drafted.text
+    assert f"joints = {list(inputs.values())}" in drafted.text
+    said = "; ".join(drafted.notes)
     assert re.findall(r"name it '(\w+)'", said) == states
     noted = dict(re.findall(r"column '(\w+)': counted from 0, so taken for joint (\d)", said))
     assert noted == {name: str(int(name[-1]) + 1) for name in (*inputs, *names) if name[0] == "q" or name in zero}
@@ -94,13 +94,13 @@ def test_joints_that_a_log_counts_from_0(tmp_path, names, inputs, states):
 @pytest.mark.parametrize("system", [*(name for name, spec in specs.items() if not spec.declare), "cart"])
 def test_every_machine_can_be_drafted_and_one_of_ones_own(tmp_path, system):
     """What is drafted and filled in is read."""
-    own = SystemSpec(("x", "theta1", "dx", "dtheta1"), ("mc", "stiffness", "mu"), {"lag": 0.0}, joints=2, driven=2)
-    known = {**specs, "cart": own}
+    cart = SystemSpec(("x", "theta1", "dx", "dtheta1"), ("mc", "stiffness", "mu"), {"lag": 0.0}, joints=2, driven=2)
+    known = {**specs, "cart": cart}
     path = tmp_path / "01.csv"
     write_csv(path, _log("u", known[system].states[0]))
-    found = draft(path, system, known)
-    assert found.missing == [name for name in known[system].parameters if name != "g"]
-    (tmp_path / "rig.toml").write_text(_filled(found.text))
+    drafted = draft(path, system, known)
+    assert drafted.missing == [name for name in known[system].parameters if name != "g"]
+    (tmp_path / "rig.toml").write_text(_filled(drafted.text))
     rig = read_rig(tmp_path / "rig.toml", known)
     assert rig.input_joints == (2 if system in ("acrobot", "cart") else 1,)
 
@@ -126,13 +126,13 @@ def test_a_clock_in_ms_and_no_clock_are_noticed(tmp_path):
     path = tmp_path / "01.csv"
     columns = _log("u", "x")
     write_csv(path, {"t_ms" if n == "time" else n: v * (1000 if n == "time" else 1) for n, v in columns.items()})
-    found = draft(path, None, specs)
-    assert found.notes == ("column 't_ms': name it 'time' and convert it from ms to s",)
-    assert f"dt = {DT}" in found.text
+    drafted = draft(path, None, specs)
+    assert drafted.notes == ("column 't_ms': name it 'time' and convert it from ms to s",)
+    assert f"dt = {DT}" in drafted.text
     write_csv(path, {name: columns[name] for name in ("u", "x")})
-    found = draft(path, None, specs)
-    assert found.notes == ("no column 'time': add one [s]",)
-    assert found.missing == ["m", "dt"]
+    drafted = draft(path, None, specs)
+    assert drafted.notes == ("no column 'time': add one [s]",)
+    assert drafted.missing == ["m", "dt"]
 
 
 def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
@@ -140,16 +140,16 @@ def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
     columns = _log("note", t0=5.0)
     columns["time"][7] += 0.1 * DT
     write_csv(path, columns)
-    found = draft(path, "slide", specs)
-    assert found.missing == ["m", "columns", "joints", "dt", "columns"]
-    assert "0.018 to 0.022 s apart: resample" in found.text
-    assert 'clock = "session"' in found.text
+    drafted = draft(path, "slide", specs)
+    assert drafted.missing == ["m", "columns", "joints", "dt", "columns"]
+    assert "0.018 to 0.022 s apart: resample" in drafted.text
+    assert 'clock = "session"' in drafted.text
 
 
 def test_noise_without_a_signal_is_not_declared(tmp_path):
     path = tmp_path / "01.csv"
-    rest = np.random.default_rng(0).normal(size=ROWS)
-    write_csv(path, _log("u") | {"x": rest, "dx": 0 * rest})
+    noise = np.random.default_rng(0).normal(size=ROWS)
+    write_csv(path, _log("u") | {"x": noise, "dx": 0 * noise})
     text = draft(path, None, specs).text
     assert re.search(r"(?m)^# x = ", text)
     assert re.search(r"(?m)^# dx = 0 ", text)
@@ -193,9 +193,9 @@ def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_p
         owner = read_rig(path, specs)
         if specs[owner.system].declare:
             continue  # a machine from a file: test_draft_machine.py
-        found = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
-        assert not found.notes
-        (tmp_path / "rig.toml").write_text(_filled(found.text))
+        drafted = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
+        assert not drafted.notes
+        (tmp_path / "rig.toml").write_text(_filled(drafted.text))
         rig = read_rig(tmp_path / "rig.toml", specs)
         assert (rig.dt, rig.clock) == (owner.dt, owner.clock)
         assert rig.measured[: len(owner.measured)] == owner.measured  # an owner may leave out the rates of a file

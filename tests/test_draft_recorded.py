@@ -50,20 +50,20 @@ def test_a_robot_is_drafted_and_imported(tmp_path, command, inputs):
 
 def test_hdf5_and_names_of_a_json_log(tmp_path):
     groups = {"arm": {"time": T, "q": Q, "qd": V}, "motor": {"time": T, "tau": np.cos(T)}}
-    found = draft_recorded(write_hdf5(tmp_path / "a.h5", groups), "pendubot", specs)
+    drafted = draft_recorded(write_hdf5(tmp_path / "a.h5", groups), "pendubot", specs)
     for line in ('"theta2" = "/arm:q[1]"', '"dtheta1" = "/arm:qd[0]"', '"tau" = "/motor:tau"', "dt = 0.004"):
-        assert line in found.text
+        assert line in drafted.text
     notes = [{"pos": float(q), "vel": float(v), "u": 0.5} for q, v in zip(Q[:, 0], V[:, 0], strict=True)]
     log = write_mcap(tmp_path / "a.mcap", {"/slide": (plain_json(), ns(T), notes)})
-    found = draft_recorded(log, None, specs)
-    assert 'type = "slide"' in found.text and '"dx" = "/slide:vel"' in found.text
+    drafted = draft_recorded(log, None, specs)
+    assert 'type = "slide"' in drafted.text and '"dx" = "/slide:vel"' in drafted.text
 
 
 def test_joints_are_called_as_a_machine_calls_them():
     """The seam for machines whose coordinates are the joints of a file."""
     topic = Topic("/js", "", None, ("position[hip]", "position[knee]", "velocity[knee]"))
-    found = joint_columns(topic, {"hip": "hip", "knee": "knee"})
-    assert {name: str(at) for name, at in found.items()} == {
+    columns = joint_columns(topic, {"hip": "hip", "knee": "knee"})
+    assert {name: str(at) for name, at in columns.items()} == {
         "hip": "/js:position[hip]", "knee": "/js:position[knee]", "dknee": "/js:velocity[knee]"
     }  # fmt: skip
     assert list(found_columns([topic])) == ["theta1", "theta2", "dtheta2"]

@@ -142,17 +142,17 @@ def _both(case: plant.Case, effects):
     start = plant.starts(case)[:3]
     if case.effects and case.effects[0]["name"] == "payload_step":
         t = t + case.effects[0]["time"] - 0.3
-    told = plant.noise_free(rig, plant.simulate(rig, start, u, t))
+    simulated = plant.noise_free(rig, plant.simulate(rig, start, u, t))
     out = []
     for model in (with_effects(declared_model(case), effects), declared_model(case)):
         rows = []
         for i in range(3):
             memory = model.start.mean.shape[0] - start.shape[1]
             clock = t[i] + plant.DT * np.arange(u.shape[1])
-            seq = Dataset(*map(jnp.asarray, (clock, u[i][:, None], told[i], np.ones(u.shape[1], bool))))
+            seq = Dataset(*map(jnp.asarray, (clock, u[i][:, None], simulated[i], np.ones(u.shape[1], bool))))
             rows.append(np.asarray(_roll(model, jnp.pad(jnp.asarray(start[i]), (0, memory)), seq)[1]))
         out.append(np.stack(rows))
-    return told, *out
+    return simulated, *out
 
 
 def test_every_effect_is_compared_with_the_simulator():
@@ -163,10 +163,10 @@ def test_every_effect_is_compared_with_the_simulator():
 @pytest.mark.parametrize("name", MAKE)
 def test_moves_as_the_independent_simulator_says(name):
     case = plant.Case(effects=CASES[name], steps=STEPS, hidden=False, seed=3)
-    told, mine, without = _both(case, (MAKE[name](CASES[name][0]),))
+    simulated, mine, without = _both(case, (MAKE[name](CASES[name][0]),))
     rows = slice(6, None)  # a late sensor reads the start until the delay is over; one step backward knows no start
-    effect = np.sqrt(np.mean((told - without)[:, rows] ** 2, axis=(0, 1)))
-    missed = np.sqrt(np.mean((told - mine)[:, rows] ** 2, axis=(0, 1)))
+    effect = np.sqrt(np.mean((simulated - without)[:, rows] ** 2, axis=(0, 1)))
+    missed = np.sqrt(np.mean((simulated - mine)[:, rows] ** 2, axis=(0, 1)))
     moved = effect > 1e-9
     assert moved.any()
     assert np.all(missed[moved] < CRUDE.get(name, 0.01) * effect.max() + 1e-4), (missed, effect)
@@ -182,8 +182,8 @@ def test_moves_as_the_independent_simulator_says(name):
 def test_a_spring_that_stiffens_and_detents_with_an_overtone(name, law):
     case = plant.Case(effects=({"name": name, "joint": 2, **law},), steps=STEPS, hidden=False, seed=3)
     made = MAKE[name](case.effects[0])
-    told, mine, without = _both(case, (made,))
-    assert np.abs(told - mine).max() < 0.01 * np.abs(told - without).max()
+    simulated, mine, without = _both(case, (made,))
+    assert np.abs(simulated - mine).max() < 0.01 * np.abs(simulated - without).max()
     for key, value in made.values().items():
         np.testing.assert_allclose(value, law[key], rtol=1e-6)
 
@@ -247,8 +247,8 @@ def test_slide_and_pendulum_know_their_effects():
     for system, effects in (("slide", "torsional_spring"), ("pendulum", "base_tilt")):
         effect = {"name": effects, "joint": 1, "k": 2.0, "theta0": 0.1, "angle": 0.2}
         case = plant.Case(system=system, effects=(effect,), steps=STEPS, hidden=False, seed=3)
-        told, mine, without = _both(case, (MAKE[effects](effect),))
-        assert np.abs(told - mine).max() < 0.01 * np.abs(told - without).max() + 1e-5
+        simulated, mine, without = _both(case, (MAKE[effects](effect),))
+        assert np.abs(simulated - mine).max() < 0.01 * np.abs(simulated - without).max() + 1e-5
 
 
 MORE = {"payload": {"centre_x", "centre_y", "centre_z"}}

@@ -110,12 +110,12 @@ def test_fit_is_the_maximum_likelihood_estimate(run):
         return eqx.tree_at(lambda m: (m.unknown, m.log_q, m.log_r), system, parts)
 
     loss = lambda p: -float(_loglik(model(p), run.logs.data))  # noqa: E731
-    found = minimize(
+    peak = minimize(
         loss, [0.5, np.log(1e-2), np.log(2e-3)], method="Nelder-Mead", options={"fatol": 1e-4, "xatol": 1e-5}
     )
     h = 1e-2 * np.eye(3)
     hessian = [
-        [loss(found.x + a + b) - loss(found.x + a - b) - loss(found.x - a + b) + loss(found.x - a - b) for a in h]
+        [loss(peak.x + a + b) - loss(peak.x + a - b) - loss(peak.x - a + b) + loss(peak.x - a - b) for a in h]
         for b in h
     ]
     std = np.sqrt(np.diag(np.linalg.inv(np.asarray(hessian) / 4e-4)))
@@ -123,10 +123,10 @@ def test_fit_is_the_maximum_likelihood_estimate(run):
     slope = -float(v @ _curve(best, v) / (v @ v))
     fitted = np.asarray([slope, 0.5 * float(best.log_q[1]), 0.5 * float(best.log_r[0])])
     # a network is a richer model than a line, and its weights have a prior: half a standard deviation
-    np.testing.assert_array_less(np.abs(fitted - found.x) / std, 0.5)
-    assert -found.fun - 1.0 < float(_loglik(best, run.logs.data))  # richer, so no less likely; a nat for the priors
+    np.testing.assert_array_less(np.abs(fitted - peak.x) / std, 0.5)
+    assert -peak.fun - 1.0 < float(_loglik(best, run.logs.data))  # richer, so no less likely; a nat for the priors
     truth = np.asarray([0.8, np.log(5e-3), np.log(1e-3)])
-    assert np.all(np.abs(found.x - truth) < 4 * std)
+    assert np.all(np.abs(peak.x - truth) < 4 * std)
 
 
 def test_likelihood_rises_at_the_full_horizon(run):

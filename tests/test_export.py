@@ -109,15 +109,15 @@ def test_the_predictor_agrees_with_predict_where_there_is_no_jax(case, tmp_path)
     (tmp_path / "use.py").write_text(CODE)
     _alone(tmp_path, "use.py")
     with np.load(tmp_path / "found.npz") as stored:
-        found = dict(stored)
-    np.testing.assert_array_equal(found["ahead"], wanted.ahead[0])
-    np.testing.assert_allclose(found["mean"], wanted.mean[0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found["std"], wanted.std[0], rtol=1e-6, atol=1e-6)
-    assert np.ptp(found["mean"][ROWS // 2 :, 0]) > 0.3  # it moves
+        arrays = dict(stored)
+    np.testing.assert_array_equal(arrays["ahead"], wanted.ahead[0])
+    np.testing.assert_allclose(arrays["mean"], wanted.mean[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(arrays["std"], wanted.std[0], rtol=1e-6, atol=1e-6)
+    assert np.ptp(arrays["mean"][ROWS // 2 :, 0]) > 0.3  # it moves
     if not fitted.model.effects:
         state = smooth(fitted, data).state  # of the model as it is: `nnap-em smooth` widens it by the model's own
-        np.testing.assert_allclose(found["smoothed"], state.mean[0], rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(found["cov"], state.cov[0], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(arrays["smoothed"], state.mean[0], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(arrays["cov"], state.cov[0], rtol=1e-6, atol=1e-9)
 
 
 def test_the_predictor_is_a_program(case, tmp_path):
@@ -127,14 +127,14 @@ def test_the_predictor_is_a_program(case, tmp_path):
     columns = {"time": data.t[0], "u": data.u[0, :, 0], "theta1": data.y[0, :, 0]}
     (tmp_path / "log.csv").write_text(csv_text(columns).replace("nan", ""))
     _alone(tmp_path, "predictor.py", "log.csv", "--given", str(GIVEN), "--out", "prediction.csv")
-    found = np.genfromtxt(tmp_path / "prediction.csv", delimiter=",", names=True)
-    assert found.dtype.names == ("time", "theta1", "dtheta1", "theta1_std", "dtheta1_std")
+    table = np.genfromtxt(tmp_path / "prediction.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("time", "theta1", "dtheta1", "theta1_std", "dtheta1_std")
     wanted = predict(fitted, data, GIVEN, key=jax.random.key(0), samples=SAMPLES)
     ahead = np.asarray(wanted.ahead[0])
     for i, name in enumerate(("theta1", "dtheta1")):
-        std = found[f"{name}_std"]
-        assert np.all(np.abs(found[name] - wanted.mean[0, :, i])[ahead] < 6 * std[ahead] / np.sqrt(SAMPLES))
-        np.testing.assert_allclose(found[name][~ahead], wanted.mean[0, ~ahead, i], rtol=1e-5, atol=1e-5)
+        std = table[f"{name}_std"]
+        assert np.all(np.abs(table[name] - wanted.mean[0, :, i])[ahead] < 6 * std[ahead] / np.sqrt(SAMPLES))
+        np.testing.assert_allclose(table[name][~ahead], wanted.mean[0, ~ahead, i], rtol=1e-5, atol=1e-5)
 
 
 def test_one_step_through_stablehlo(case):
@@ -151,17 +151,17 @@ def test_one_step_through_stablehlo(case):
 def test_the_json_has_the_numbers_of_the_model(case, tmp_path):
     fitted, _ = case
     export(fitted, tmp_path)
-    found = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
+    content = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
     value, std = parameter_table(fitted)["m"]
-    assert found["parameters"]["m"] == {"value": value, "std": std, "unit": "kg", "estimated": True}
-    assert found["parameters"]["g"] == {"value": 9.81, "std": 0.0, "unit": "m/s^2", "estimated": False}
-    assert found["noise"]["measurement_std"]["theta1"] == pytest.approx(1e-3)
-    assert found["dt"] == {"value": DT, "unit": "s"}
-    assert [effect["name"] for effect in found["effects"]] == [effect.name for effect in fitted.model.effects]
-    (joint,) = found["friction"]["joints"]
+    assert content["parameters"]["m"] == {"value": value, "std": std, "unit": "kg", "estimated": True}
+    assert content["parameters"]["g"] == {"value": 9.81, "std": 0.0, "unit": "m/s^2", "estimated": False}
+    assert content["noise"]["measurement_std"]["theta1"] == pytest.approx(1e-3)
+    assert content["dt"] == {"value": DT, "unit": "s"}
+    assert [effect["name"] for effect in content["effects"]] == [effect.name for effect in fitted.model.effects]
+    (joint,) = content["friction"]["joints"]
     velocity = jnp.asarray([joint["velocity"]])
     np.testing.assert_allclose(joint["torque"], friction_table(fitted, velocity).torque[0], rtol=1e-12)
-    network = found["friction"]["network"]  # by hand, from the JSON alone
+    network = content["friction"]["network"]  # by hand, from the JSON alone
     v, speed, knee, scale = 1.5, *(network[name][0] for name in ("speed", "knee", "scale"))
     h = np.array([v / speed, np.arcsinh(v / knee) / np.arcsinh(speed / knee)])
     *inner, last = network["layers"]
@@ -179,11 +179,11 @@ def test_a_slide_is_exported_in_newtons_and_metres():
     spring = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
     fitted = begin(rig, data, key=jax.random.key(0), effects=(spring,))
     fitted = fitted._replace(state=fitted.state._replace(hessian=jnp.eye(fitted.state.hessian.shape[0])))
-    found = parameters(fitted)
-    (effect,), (joint,) = found["effects"], found["friction"]["joints"]
+    content = parameters(fitted)
+    (effect,), (joint,) = content["effects"], content["friction"]["joints"]
     assert {n: p["unit"] for n, p in effect["parameters"].items()} == {"k": "N/m", "theta0": "m"}
     assert (joint["velocity_unit"], joint["torque_unit"]) == ("m/s", "N")
-    assert found["inputs"] == [{"name": "f", "joint": 1, "unit": "N"}]
+    assert content["inputs"] == [{"name": "f", "joint": 1, "unit": "N"}]
     assert "Inputs: f [N]." in predictor(fitted)
 
 

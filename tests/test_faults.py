@@ -55,7 +55,7 @@ def _order(command, rig: Path, out: Path, *more) -> list[str]:
     return [command[0], str(rig), "--out", str(out), *command[1:], *more]
 
 
-def _told(said: str) -> str:
+def _last_line(said: str) -> str:
     """The last line, which is no traceback."""
     assert "Traceback" not in said, said
     return said.strip().splitlines()[-1]
@@ -92,12 +92,12 @@ def _faulty(kind: str, when: int | str):
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         elif kind == "unwritable":
-            own = files.os
+            original = files.os
             files.os = types.SimpleNamespace(replace=_denied, getpid=os.getpid, fsync=os.fsync)
             try:
                 whole(path, content)
             finally:
-                files.os = own
+                files.os = original
         elif kind == "Ctrl-C before a write":
             os.kill(os.getpid(), signal.SIGINT)
         else:
@@ -162,11 +162,11 @@ def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, ca
         said = capsys.readouterr().err
         if "Ctrl-C" in kind:
             assert code == 130
-            assert re.search(r"stopped .*; to go on: nnap-em identify .*--resume", _told(said))
+            assert re.search(r"stopped .*; to go on: nnap-em identify .*--resume", _last_line(said))
         elif kind in ERRORS:
             assert code == 2
             file = when if isinstance(when, str) else r"unfinished/_toy-\w+\.npz"
-            assert re.search(rf"error: .*{file}: {ERRORS[kind]}; stopped .*; to go on: .*--resume", _told(said))
+            assert re.search(rf"error: .*{file}: {ERRORS[kind]}; stopped .*; to go on: .*--resume", _last_line(said))
             assert not list(out.rglob(".*.part"))
         else:
             assert code is None
@@ -214,8 +214,8 @@ def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
     run, before = _start(order), _steps(out)
     while run.poll() is None and count:
         time.sleep(0.005)
-        now = _steps(out)
-        count, before = count - (now != before), now
+        steps = _steps(out)
+        count, before = count - (steps != before), steps
     assert run.poll() is None, "it was over too soon"
     run.send_signal(kind)
     _, said = run.communicate(timeout=120)
@@ -231,7 +231,7 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     assert code == -signal.SIGKILL, said
     code, said = _struck(_order(command, rig, out, "--resume"), out, signal.SIGINT, 2)
     assert code == 130, said
-    assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _told(said))
+    assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _last_line(said))
     if command is DIAGNOSE:
         _answered_in_time(rig, out, capsys)
     code, said = _here(_order(command, rig, out, "--resume"), capsys)
@@ -254,7 +254,7 @@ def _answered_in_time(rig: Path, out: Path, capsys) -> None:
     steps = len(_steps(out))
     code, said = _here(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"), capsys)
     assert code == 0 and re.search(r"\[\d+:\d\d over\] ", said), said
-    assert re.search(r"finished steps kept; to go on: nnap-em diagnose .*--resume", _told(said))
+    assert re.search(r"finished steps kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
     report = json.loads((out / "report.json").read_text())
     assert not report["complete"] and not report["effects"]
     assert "The search was not finished" in report["verdict"] and report["verdict"] in said
@@ -332,7 +332,7 @@ def test_what_is_no_state_of_this_run_is_refused(rig, stopped, tmp_path, capsys,
     change(out, copy)
     before = {path: path.read_bytes() for path in out.rglob("*.npz")}
     assert cli.main(_order(command, copy, out, "--resume", *options)) == 2
-    assert re.search(rf"error: {_first(out)}: .*{reason}", _told(capsys.readouterr().err))
+    assert re.search(rf"error: {_first(out)}: .*{reason}", _last_line(capsys.readouterr().err))
     assert {path: path.read_bytes() for path in out.rglob("*.npz")} == before
 
 
@@ -343,17 +343,17 @@ def test_steps_of_another_version_are_refused(rig, stopped, tmp_path, capsys, mo
         patch.setattr(journal, "__version__", "9.9")
         assert cli.main(_order(DIAGNOSE, rig, out, "--resume")) == 2
     reason = rf"{_first(out)}: made by nnap_em 0\S* and jax {jax.__version__}, this is nnap_em 9\.9 .*; leave --resume"
-    assert re.search(reason, _told(capsys.readouterr().err))
+    assert re.search(reason, _last_line(capsys.readouterr().err))
     monkeypatch.setattr(journal, "KIND", journal.KIND._replace(format=2))
     assert cli.main(_order(DIAGNOSE, rig, out, "--resume")) == 2
-    assert re.search(rf"{_first(out)}: format 1 .*, this version reads format 2", _told(capsys.readouterr().err))
+    assert re.search(rf"{_first(out)}: format 1 .*, this version reads format 2", _last_line(capsys.readouterr().err))
 
 
 @pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=["identify", "diagnose"])
 def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys, command):
     (tmp_path / "file").write_text("")
     assert cli.main(_order(command, rig, tmp_path / "file" / "out")) == 2
-    assert _told(capsys.readouterr().err) == f"nnap-em: error: {tmp_path}/file/out: Not a directory"
+    assert _last_line(capsys.readouterr().err) == f"nnap-em: error: {tmp_path}/file/out: Not a directory"
 
 
 def test_ctrl_c_leaves_no_half_data_set(tmp_path, monkeypatch, capsys):
@@ -363,7 +363,7 @@ def test_ctrl_c_leaves_no_half_data_set(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("nnap_em.commands.simulate.write_csv", stop)
     order = ["simulate", str(tmp_path / "new"), "--system", "slide", "--sequences", "1", "--test", "0", "--steps", "9"]
     assert cli.main(order) == 130
-    assert _told(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
+    assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
     assert not list(tmp_path.iterdir())
 
 
@@ -380,7 +380,7 @@ def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_pa
 
     monkeypatch.setattr(check_command, "run", lost)
     assert cli.main(["check", str(tmp_path)]) == 130
-    assert _told(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
+    assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

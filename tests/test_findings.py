@@ -47,11 +47,11 @@ def _function(signal: str, joint: int, slope: float) -> AbstractEffect:
 def _closed(rig: Rig, *effects: AbstractEffect) -> Closed:
     """A search that found these, in this order."""
     before = begin(rig, _data(rig), key=jax.random.key(0))
-    now = Hypothesis(before.model, before.m_step)
+    hypothesis = Hypothesis(before.model, before.m_step)
     for effect in effects:
         candidate = Candidate(effect, (effect,), effect)
-        now = now.plus(effect, candidate, Found(100.0, 50.0, 1e-20))
-    model, rule, found = now
+        hypothesis = hypothesis.plus(effect, candidate, Found(100.0, 50.0, 1e-20))
+    model, rule, found = hypothesis
     size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
     state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))
     bank = before.bank.padded(model.log_q.shape[0])
@@ -64,27 +64,27 @@ def test_a_learned_rest_is_told_with_its_law_and_the_next_function_keeps_its_joi
     spring, other = findings(_closed(ARM, *effects))
     assert (spring.effect.name, other.effect.name) == ("torsional_spring", "unknown_function")
     assert "not quite of this form" in spring.sentence
-    for found, signal, joint, sign in ((spring, "theta2", 2, 1), (other, "theta1", 1, -1)):
-        assert (found.curve.signal, found.curve.joint) == (signal, joint)
-        assert np.sign(found.curve.mean[-1] - found.curve.mean[0]) == sign
-        assert (found.curve.std > 0).all()
+    for finding, signal, joint, sign in ((spring, "theta2", 2, 1), (other, "theta1", 1, -1)):
+        assert (finding.curve.signal, finding.curve.joint) == (signal, joint)
+        assert np.sign(finding.curve.mean[-1] - finding.curve.mean[0]) == sign
+        assert (finding.curve.std > 0).all()
     assert set(spring.parameters) == {"k", "theta0"} and not other.parameters
-    for found, sign in ((spring, 1), (other, -1)):  # weights along a line, their sum falls off at the ends
-        told = entry(found)["shape"]
-        middle = told["numbers"]["slope_middle"]
-        assert (told["kind"], middle["unit"], np.sign(middle["value"])) == ("cubic", "N m/rad", sign)
-        assert found.shape.words in found.sentence
+    for finding, sign in ((spring, 1), (other, -1)):  # weights along a line, their sum falls off at the ends
+        form = entry(finding)["shape"]
+        middle = form["numbers"]["slope_middle"]
+        assert (form["kind"], middle["unit"], np.sign(middle["value"])) == ("cubic", "N m/rad", sign)
+        assert finding.shape.words in finding.sentence
 
 
 def test_a_curve_has_the_units_of_its_machine():
-    (found,) = findings(_closed(SLIDE, _function("x", 1, 1.0)))
-    assert (found.curve.signal_unit, found.curve.unit) == ("m", "N")
-    assert "N/m" in found.sentence and "N m" not in found.sentence
+    (finding,) = findings(_closed(SLIDE, _function("x", 1, 1.0)))
+    assert (finding.curve.signal_unit, finding.curve.unit) == ("m", "N")
+    assert "N/m" in finding.sentence and "N m" not in finding.sentence
 
 
 def test_a_law_of_known_form_has_no_shape():
-    (found,) = findings(_closed(ARM, _spring(2)))
-    assert found.curve is None and found.shape is None and "shape" not in entry(found)
+    (finding,) = findings(_closed(ARM, _spring(2)))
+    assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)
 
 
 def _doubtful() -> Closed:
@@ -99,16 +99,18 @@ def _law(name: str) -> AbstractEffect:
 
 
 def test_a_recording_that_disagrees_is_named():
-    (told,) = disputes(_doubtful(), ("a.csv", "b.csv"))
-    assert (told.name, told.joint, told.files) == ("motor_gain", 2, ["b.csv"])
-    assert told.description == (
+    (dispute,) = disputes(_doubtful(), ("a.csv", "b.csv"))
+    assert (dispute.name, dispute.joint, dispute.files) == ("motor_gain", 2, ["b.csv"])
+    assert dispute.description == (
         "motor gain at joint 2 would remove 80% of the prediction error, "
         "but b.csv shows the opposite (up to 61% more error)"
     )
-    assert any("b.csv" in text for text in advice([], [told]))
+    assert any("b.csv" in text for text in advice([], [dispute]))
     both = _doubtful().last[-1].disputed[0]._replace(against=(0, 1))
-    (told,) = disputes(_doubtful()._replace(steps=(Step(ROWS, (), (), None, 3, disputed=(both,)),)), ("a.csv", "b.csv"))
-    assert "a.csv and b.csv show the opposite" in told.description
+    (dispute,) = disputes(
+        _doubtful()._replace(steps=(Step(ROWS, (), (), None, 3, disputed=(both,)),)), ("a.csv", "b.csv")
+    )
+    assert "a.csv and b.csv show the opposite" in dispute.description
     assert not disputes(_closed(ARM), ("a.csv", "b.csv"))
 
 

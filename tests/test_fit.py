@@ -184,17 +184,17 @@ def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
 def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
     nodes, asked = RULE.weights(MODEL).nodes.size, []
     columns = np.ones((4, 3, 2, 1, nodes + 1))
-    told = OpenLoop(np.ones((4, 3, 2, 1)), columns, np.ones(2))
+    prediction = OpenLoop(np.ones((4, 3, 2, 1)), columns, np.ones(2))
     monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "open_loop", lambda *_: told)
-    monkeypatch.setattr(multistep, "errors", lambda *_: told.error)
+    monkeypatch.setattr(multistep, "open_loop", lambda *_: prediction)
+    monkeypatch.setattr(multistep, "errors", lambda *_: prediction.error)
     monkeypatch.setattr(
         multistep, "friction_prior", lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
     )
-    monkeypatch.setattr(multistep, "_goal", lambda *given: asked.append(given[-2:]) or given[2])
+    monkeypatch.setattr(multistep, "_goal", lambda *arguments: asked.append(arguments[-2:]) or arguments[2])
     multistep.finish(MODEL, RULE, PATH, DATA, np.ones(4, bool), shaped=shaped)
     ((score, information),) = asked
-    weight = multistep.weighed(told, np.ones(4, bool)).sum()
+    weight = multistep.weighed(prediction, np.ones(4, bool)).sum()
     friction = np.arange(nodes + 1) < nodes
     np.testing.assert_allclose(score, weight - 3.0 * shaped * friction)
     np.testing.assert_allclose(information, weight + 7.0 * shaped * np.outer(friction, friction))
@@ -210,25 +210,25 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     nodes = RULE.weights(MODEL).nodes.size
     columns = slope * np.concatenate([np.zeros((*errors.shape, nodes)), np.ones((*errors.shape, 1))], axis=-1)
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
-    told, every, likelihood = (
+    prediction, every, likelihood = (
         OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2)),
         np.ones(4, bool),
         50,
     )
     monkeypatch.setattr(stated, "discrepancy_columns", lambda *_, **__: None)
     monkeypatch.setattr(stated, "followed", lambda *_: None)
-    monkeypatch.setattr(stated, "open_loop", lambda *_: told)
+    monkeypatch.setattr(stated, "open_loop", lambda *_: prediction)
     monkeypatch.setattr(stated, "size", lambda *_: force)
     hessian = jnp.full((1, 1), 1.0 + likelihood)
-    found, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
+    precision, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     assert size == force
-    weight = multistep.weighed(told, every)
+    weight = multistep.weighed(prediction, every)
     scores = slope * np.sum(weight * errors, axis=(1, 2, 3))
     disagree = np.sum((scores - scores.mean()) ** 2) * 4 / 3
     shared = force**2 * (1 + 4) * (slope * weight.sum()) ** 2
     spread = (disagree + shared) / (1.0 + slope**2 * weight.sum()) ** 2
-    assert float(found[0, 0]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
-    assert 1.0 <= float(found[0, 0]) <= 1.0 + likelihood + 1e-9
+    assert float(precision[0, 0]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
+    assert 1.0 <= float(precision[0, 0]) <= 1.0 + likelihood + 1e-9
 
 
 def _left(rng, tau: float) -> stated.Errors:
@@ -241,13 +241,13 @@ def _left(rng, tau: float) -> stated.Errors:
 @pytest.mark.parametrize("tau", [0.03, 0.3])
 def test_the_size_of_forces_unsaid_is_that_which_made_the_errors(tau):
     rng = np.random.default_rng(0)
-    sizes = [stated.size(here, 1.0 + 4.0 * here.own.T @ here.own) for here in (_left(rng, tau) for _ in range(8))]
+    sizes = [stated.size(case, 1.0 + 4.0 * case.own.T @ case.own) for case in (_left(rng, tau) for _ in range(8))]
     assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
 
 
 def test_noise_alone_tells_of_no_forces():
     rng = np.random.default_rng(1)
-    sizes = [stated.size(here, 1.0 + 4.0 * here.own.T @ here.own) for here in (_left(rng, 0.0) for _ in range(8))]
+    sizes = [stated.size(case, 1.0 + 4.0 * case.own.T @ case.own) for case in (_left(rng, 0.0) for _ in range(8))]
     assert min(sizes) == 0.0  # in half of the cases some is likelier by chance
     assert max(sizes) < 3 * 0.5 / np.sqrt(2000)  # how well the size of one force is told
 

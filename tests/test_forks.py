@@ -76,25 +76,25 @@ def known(question):
     )
     x = _moves(model, start, q.data)
     path = Gaussian(x, jnp.broadcast_to(1e-8 * jnp.eye(4), (*x.shape, 4)))
-    now = q.hypothesis.refitted(model)
-    return q._replace(declared=now, hypothesis=now, path=path, data=q.data._replace(y=x))
+    declared = q.hypothesis.refitted(model)
+    return q._replace(declared=declared, hypothesis=declared, path=path, data=q.data._replace(y=x))
 
 
 def test_errors_are_those_of_the_model_run_alone(known):
     """None on its own motion; on that of a heavier machine, the difference of the two from the same start."""
     grid, prior = grid_of(known.model.dt, ROWS), known.m_step.prior
-    found = errors(followed(known.model, prior, known.path, known.data))
-    assert found.shape == (4, len(grid.starts(ROWS)), 2, 2)
-    assert np.abs(found).max() < 1e-12
+    error = errors(followed(known.model, prior, known.path, known.data))
+    assert error.shape == (4, len(grid.starts(ROWS)), 2, 2)
+    assert np.abs(error).max() < 1e-12
     heavy = eqx.tree_at(lambda m: m.system.m2, known.model, 1.1 * known.model.system.m2)
-    found = errors(followed(heavy, prior, known.path, known.data))
+    error = errors(followed(heavy, prior, known.path, known.data))
     first, inputs = int(grid.starts(ROWS)[0]), jax.vmap(heavy.inputs)(known.data)
     x = known.path.mean[:, first]
     for k in range(first, first + grid.ages[0]):
         x = jax.vmap(heavy.transition)(x, jax.tree.map(lambda a, k=k: a[:, k], inputs))
     difference = known.path.mean[:, first + grid.ages[0], :2] - x[:, :2]
     # the filter is at the first start to the noise of its readings
-    np.testing.assert_allclose(found[:, 0, 0], difference, atol=0.05 * float(jnp.abs(difference).max()))
+    np.testing.assert_allclose(error[:, 0, 0], difference, atol=0.05 * float(jnp.abs(difference).max()))
 
 
 @pytest.mark.parametrize("name", ["torsional_spring", "base_tilt", "motor_gain"])
@@ -185,11 +185,11 @@ def test_friction_is_free_in_the_span_of_known_laws(bench):
     precision, _ = friction_prior(model, weights)
     nodes = np.asarray(weights.nodes)
     top, count = np.abs(nodes[0]).max(), nodes.shape[1]
-    own = precision[:count, :count]
+    block = precision[:count, :count]
     for law in (nodes[0] / top, np.tanh(nodes[0] / (0.03 * top))):
-        assert law @ own @ law < 1e-6 * np.trace(own)
+        assert law @ block @ law < 1e-6 * np.trace(block)
     even = np.abs(nodes[0]) / top  # friction that pushes one way
-    assert even @ own @ even > 1e-3 * np.trace(own) / count
+    assert even @ block @ even > 1e-3 * np.trace(block) / count
 
 
 def test_a_loud_recording_counts_by_the_root_of_its_loudness():

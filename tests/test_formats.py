@@ -158,8 +158,8 @@ def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):
     columns = _log() | {"u": np.arange(50, dtype=np.int32), "dtheta1": np.arange(50, dtype=np.float32)}
     table = pa.table(columns | {"theta1": pa.array([None, *range(49)], pa.float64()), "note": ["x"] * 50})
     pq.write_table(table, tmp_path / "01.parquet")
-    found = read_table(tmp_path / "01.parquet", ("u",), ("theta1", "dtheta1"))
-    np.testing.assert_array_equal(found.T, [np.arange(50), [np.nan, *range(49)], np.arange(50)])
+    rows = read_table(tmp_path / "01.parquet", ("u",), ("theta1", "dtheta1"))
+    np.testing.assert_array_equal(rows.T, [np.arange(50), [np.nan, *range(49)], np.arange(50)])
 
 
 def test_predictions_of_such_logs_are_csv_files(tmp_path):

@@ -66,8 +66,8 @@ def test_nothing_asks_lapack(dim):
         factor = cholesky(a)
         return lower(factor), upper_solve(factor, a), spd_solve(a, a)
 
-    told = str(jax.make_jaxpr(jax.vmap(all_of_it))(jnp.zeros((3, dim, dim))))
-    assert "cholesky[" not in told and "triangular_solve[" not in told
+    program = str(jax.make_jaxpr(jax.vmap(all_of_it))(jnp.zeros((3, dim, dim))))
+    assert "cholesky[" not in program and "triangular_solve[" not in program
 
 
 @pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
@@ -88,5 +88,5 @@ def test_product_and_upper_solve_are_numpys(dim):
     np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b)), a @ b, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b[:, 0])), a @ b[:, 0], rtol=1e-10, atol=1e-10)
     factor = np.linalg.cholesky(a)
-    found = upper_solve(cholesky(jnp.asarray(a)), jnp.asarray(b))
-    np.testing.assert_allclose(found, np.linalg.solve(factor.T, b), rtol=1e-8, atol=1e-8)  # condition number 1e3
+    solution = upper_solve(cholesky(jnp.asarray(a)), jnp.asarray(b))
+    np.testing.assert_allclose(solution, np.linalg.solve(factor.T, b), rtol=1e-8, atol=1e-8)  # condition number 1e3

@@ -18,13 +18,13 @@ PACKAGE = ROOT / "nnap_em"
 
 def _imports(path: Path) -> set[str]:
     """Folders of the package that a module imports from, at the top or inside a function."""
-    here, found = ("nnap_em", *path.relative_to(PACKAGE).parent.parts), set()
+    package, imported = ("nnap_em", *path.relative_to(PACKAGE).parent.parts), set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
-            base = here[: len(here) - node.level + 1]
+            base = package[: len(package) - node.level + 1]
             target = (*base, *(node.module or "").split("."))[1:]
-            found |= {target[0]} if target and target[0] else {alias.name for alias in node.names}
-    return found & set(FOLDERS)
+            imported |= {target[0]} if target and target[0] else {alias.name for alias in node.names}
+    return imported & set(FOLDERS)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
@@ -35,8 +35,8 @@ def test_a_folder_imports_only_from_those_above_it(folder):
 
 
 def test_every_folder_is_in_the_order():
-    there = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
-    assert there == set(FOLDERS)
+    folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    assert folders == set(FOLDERS)
     assert tuple(re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "README.md").read_text())) == FOLDERS
 
 
@@ -76,7 +76,7 @@ def test_a_readme_names_the_files_of_its_folder(folder):
     text = (PACKAGE / folder / "README.md").read_text()
     inner = {p.name for p in (PACKAGE / folder).iterdir() if p.is_dir() and p.name != "__pycache__"}
     files = {p.name for p in (PACKAGE / folder).glob("*.py") if p.name != "__init__.py"}
-    there = {f"`{name}`" for name in files} | {f"`{name}/`" for name in inner}
+    entries = {f"`{name}`" for name in files} | {f"`{name}/`" for name in inner}
     named = set(re.findall(r"`\w+(?:\.py|/)`", text))
-    assert there - named == set()
-    assert named - there - {f"`{p.name}`" for p in PACKAGE.rglob("*.py")} == set()
+    assert entries - named == set()
+    assert named - entries - {f"`{p.name}`" for p in PACKAGE.rglob("*.py")} == set()

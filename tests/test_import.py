@@ -137,10 +137,10 @@ def test_held_averaged_and_integrated_signals_are_their_closed_forms():
 
 def test_a_reading_is_interpolated_only_between_near_neighbours():
     s = Signal("a", np.array([0.0, 0.01, 0.02, 0.05, 0.06, 0.07]), np.arange(6.0))
-    y, there = interpolated(s, np.array([0.0, 0.005, 0.02, 0.03, 0.05, 0.065, 0.07, 0.08]), 0.01, 0.015)
-    np.testing.assert_array_equal(there, [True, True, True, False, True, True, True, False])
-    np.testing.assert_allclose(y[there], [0, 0.5, 2, 3, 4.5, 5], rtol=1e-12)
-    assert np.isnan(y[~there]).all()
+    y, valid = interpolated(s, np.array([0.0, 0.005, 0.02, 0.03, 0.05, 0.065, 0.07, 0.08]), 0.01, 0.015)
+    np.testing.assert_array_equal(valid, [True, True, True, False, True, True, True, False])
+    np.testing.assert_allclose(y[valid], [0, 0.5, 2, 3, 4.5, 5], rtol=1e-12)
+    assert np.isnan(y[~valid]).all()
 
 
 def test_slow_readings_stand_in_their_nearest_rows(tmp_path):
@@ -186,19 +186,19 @@ def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
         at = table[:, 0] + s["start"]
         at += kept[0] if kept[0] < commanded[0] else commanded[0]
         np.testing.assert_allclose(table[:, 1], np.cos(at), rtol=0, atol=1e-9)
-        there = np.isfinite(table[:, 2])
-        np.testing.assert_allclose(table[there, 2], np.sin(3 * at[there]), rtol=0, atol=1e-9)
-        assert np.sum(~there) == s["missing"]["theta1"] == (2 if readings == (3.0, 3.02) else 0)
+        valid = np.isfinite(table[:, 2])
+        np.testing.assert_allclose(table[valid, 2], np.sin(3 * at[valid]), rtol=0, atol=1e-9)
+        assert np.sum(~valid) == s["missing"]["theta1"] == (2 if readings == (3.0, 3.02) else 0)
     assert any("shorter than 50 rows" in s["why"] for s in document["sequences"]) == (readings == (3.0, 3.5) and
         commands == (3.6, 5.0))  # fmt: skip
     read_logs(tmp_path / "out/train", read_rig(tmp_path / "out/rig.toml", specs))
 
 
 def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
-    there = np.ones(1000, bool)
-    there[400:410] = False
-    found = cut(there, 50, 150)
-    assert [(p.first, p.end) for p in found] == [
+    valid = np.ones(1000, bool)
+    valid[400:410] = False
+    pieces = cut(valid, 50, 150)
+    assert [(p.first, p.end) for p in pieces] == [
         (0, 133), (133, 267), (267, 400), (410, 558), (558, 705), (705, 852), (852, 1000)
     ]  # fmt: skip
 
@@ -250,9 +250,9 @@ def test_a_delay_is_told_to_a_millisecond(driven, late, what):
     rng = np.random.default_rng(4)
     q, v = q + 1e-3 * rng.normal(size=q.size), v + 2e-2 * rng.normal(size=v.size)
     signals = {"u": Signal("/cmd", t_cmd, u), "q": Signal("/js", t + late, q), "v": Signal("/js", t + late, v)}
-    found = delay(Pair("u", "v" if what == "rate" else "q", 1 if what == "rate" else 2, True), signals, ("q", "v"))
-    assert abs(found.seconds - late) < 1e-3
-    assert found.std < 1e-3
+    estimate = delay(Pair("u", "v" if what == "rate" else "q", 1 if what == "rate" else 2, True), signals, ("q", "v"))
+    assert abs(estimate.seconds - late) < 1e-3
+    assert estimate.std < 1e-3
 
 
 def test_the_delay_of_a_duplicate_and_of_an_angle_behind_its_rate(driven):
@@ -276,8 +276,8 @@ def test_a_delay_is_reported_and_taken_out_as_asked_only(tmp_path, driven, capsy
     log, rig = write_mcap(tmp_path / "a.mcap", topics), _rig(tmp_path)
     assert _import(log, "--rig", rig, "--out", tmp_path / "as is", "--test", 0) == 0
     said = capsys.readouterr().err
-    (told,) = json.loads((tmp_path / "as is/import.json").read_text())["logs"][0]["delays"]
-    assert told["seconds"] == pytest.approx(0.012, abs=1e-3)
+    (entry,) = json.loads((tmp_path / "as is/import.json").read_text())["logs"][0]["delays"]
+    assert entry["seconds"] == pytest.approx(0.012, abs=1e-3)
     assert "/js is 12" in said and "nothing was shifted" in said and "--shift /js=-0.01" in said
     assert "/js is 12" in (tmp_path / "as is/import.html").read_text()
     assert _import(log, "--rig", rig, "--out", tmp_path / "mended", "--test", 0, "--shift", "/js=-0.012") == 0
@@ -317,9 +317,9 @@ def test_what_was_simulated_comes_back_from_mcap(tmp_path, clock):
         np.testing.assert_array_equal(back[:, 1], table[:, 1])  # commands are held, not interpolated
         # readings at stamps that are rounded to ns: 5e-10 s times 50 rad/s^2
         np.testing.assert_allclose(back[:, 2:], table[:, 2:], rtol=1e-11, atol=1e-7)
-    found = read_rig(tmp_path / "out/rig.toml", specs)
-    assert found.measured == rig.measured and '"/state:theta1"' in (tmp_path / "out/rig.toml").read_text()
-    read_logs(tmp_path / "out/train", found)
+    written = read_rig(tmp_path / "out/rig.toml", specs)
+    assert written.measured == rig.measured and '"/state:theta1"' in (tmp_path / "out/rig.toml").read_text()
+    read_logs(tmp_path / "out/train", written)
 
 
 def test_hdf5_and_csv_give_the_same_as_mcap(tmp_path):
@@ -418,8 +418,8 @@ def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
 
     joints = joint_states(("shoulder", "elbow"), *[np.ones((300, 2))] * 3)
     path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(T), joints)})
-    found = resolve(path, reader(path).topics(path), ("elbow",), ("shoulder", "dshoulder"), {})
-    assert {name: at.path for name, at in found.items()} == {
+    columns = resolve(path, reader(path).topics(path), ("elbow",), ("shoulder", "dshoulder"), {})
+    assert {name: at.path for name, at in columns.items()} == {
         "elbow": "effort[elbow]", "shoulder": "position[shoulder]", "dshoulder": "velocity[shoulder]"
     }  # fmt: skip
 

@@ -90,8 +90,8 @@ def test_a_function_of_the_second_input_is_found_at_its_joint(plain):
     bump = jnp.zeros(20).at[13:17].set(0.1)
     asked = _asked((UnknownFunction(bump, seed.start.axes, joint=2),))
     candidates = _functions(asked[-1])
-    found = candidates[int(np.argmax([v.share.inside for v in _screened(asked, candidates)]))].start
-    assert (found.joint, found.inputs_named()) == (2, ("tau2",))
+    best = candidates[int(np.argmax([v.share.inside for v in _screened(asked, candidates)]))].start
+    assert (best.joint, best.inputs_named()) == (2, ("tau2",))
 
 
 def test_a_drive_that_gives_less_for_more_is_none(plain):
@@ -103,8 +103,8 @@ def test_a_drive_that_gives_less_for_more_is_none(plain):
     size = float(axis.high)
     zone, ripple = -np.clip(u, -0.2 * size, 0.2 * size), 0.3 * size * np.sin(25 * u / size)
     place = Axis(("theta2",), -1.0, 1.0, False, 20)
-    for force, here, possible in ((zone, axis, True), (ripple, axis, False), (ripple, place, True)):
-        assert UnknownFunction(learned(force), (here,), joint=2).possible() == possible
+    for force, signal, possible in ((zone, axis, True), (ripple, axis, False), (ripple, place, True)):
+        assert UnknownFunction(learned(force), (signal,), joint=2).possible() == possible
 
 
 def test_nothing_is_learned_beyond_the_ends():
@@ -169,7 +169,7 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
     around = plain[-1]._replace(learned=True, session=True)
     named = [c.start for c in proposals(around) if c.start.joint == 2 and c.start.named]
     forms = {law.name: free_form(law, around) for law in named}
-    signals = {name: found[0].start.inputs_named() for name, found in forms.items() if found}
+    signals = {name: candidates[0].start.inputs_named() for name, candidates in forms.items() if candidates}
     place, rate = ("theta2",), ("theta2", "dtheta2")
     assert signals == {
         **dict.fromkeys(("torsional_spring", "cogging", "hard_stop"), place),

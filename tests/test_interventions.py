@@ -39,10 +39,10 @@ def _left(law=lambda x, v: 0.0 * x, push=0.0, seed=0, sequences=5, rows=501, noi
 
 @pytest.mark.parametrize("push", [1.0, -1.0])
 def test_a_push_is_found_with_its_time_sign_and_size(push):
-    (found,) = disturbances(_left(push=push), NAMES, DT, LEAST)
-    assert (found.sequence, found.joint, found.unit) == (2, 1, "N")
-    assert abs(found.from_s - 1.5) < 0.1 and abs(found.to_s - 1.8) < 0.1
-    assert abs(found.size - push) < 0.3 and 0 < found.std < 0.25
+    (disturbance,) = disturbances(_left(push=push), NAMES, DT, LEAST)
+    assert (disturbance.sequence, disturbance.joint, disturbance.unit) == (2, 1, "N")
+    assert abs(disturbance.from_s - 1.5) < 0.1 and abs(disturbance.to_s - 1.8) < 0.1
+    assert abs(disturbance.size - push) < 0.3 and 0 < disturbance.std < 0.25
 
 
 @pytest.mark.parametrize(
@@ -62,8 +62,8 @@ def test_what_all_recordings_repeat_is_no_touch(law):
 
 
 def test_a_push_beside_a_law_is_found():
-    (found,) = disturbances(_left(lambda x, v: -1.0 * x, push=3.0), NAMES, DT, LEAST)
-    assert found.sequence == 2 and abs(found.from_s - 1.5) < 0.1 and found.size > 0
+    (disturbance,) = disturbances(_left(lambda x, v: -1.0 * x, push=3.0), NAMES, DT, LEAST)
+    assert disturbance.sequence == 2 and abs(disturbance.from_s - 1.5) < 0.1 and disturbance.size > 0
 
 
 def test_a_recording_that_differs_all_the_time_is_no_touch():
@@ -105,8 +105,8 @@ def test_report_and_page_name_the_file(tmp_path):
     entry = _disturbance(TOUCH, ("a.csv", "b.csv"))
     write_json(tmp_path / "report.json", {"interventions": [entry]})
     (read,) = json.loads((tmp_path / "report.json").read_text())["interventions"]
-    told = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
-    assert read == told
+    expected = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
+    assert read == expected
     text = page({"effects": [], "interventions": [entry]})
     assert all(word in text for word in ("Touches from outside", "train/b.csv", "−0.60 ± 0.10 N m"))
     assert "Touches from outside" not in page({"effects": [], "interventions": []})

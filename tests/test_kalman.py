@@ -184,22 +184,22 @@ def test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings(r
     rows = jnp.arange(float(time)), p.u, jnp.ones(time, bool)
     one = lambda y: ROUTES[route](p.model, prepare(p.model, Dataset(rows[0], rows[1], y, rows[2])))  # noqa: E731
     smooth = jax.jit(jax.vmap(one))
-    found = smooth(y)
+    paths = smooth(y)
     dense = [_dense(p, observed) for observed in patterns]
     cov = np.stack([d.cov.reshape(time, n, time, n) for d in dense])
     mean = np.stack([d.mean.reshape(time, n) for d in dense])
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))  # noqa: E731
-    close(found.loglik, np.asarray([d.loglik for d in dense]))
-    close(found.state.mean, mean)
-    close(found.state.cov, np.einsum("pkikj->pkij", cov))
-    pair = np.asarray(jnp.concatenate([found.prev, found.next], axis=-1))
+    close(paths.loglik, np.asarray([d.loglik for d in dense]))
+    close(paths.state.mean, mean)
+    close(paths.state.cov, np.einsum("pkikj->pkij", cov))
+    pair = np.asarray(jnp.concatenate([paths.prev, paths.next], axis=-1))
     close(pair.mean(axis=2), np.concatenate([mean[:, :-1], mean[:, 1:]], axis=-1))
     away = pair - pair.mean(axis=2, keepdims=True)
     second = np.einsum("pkni,pknj->pkij", away, away) / pair.shape[2]
     blocks = [cov[:, k : k + 2, :, k : k + 2, :].reshape(-1, 2 * n, 2 * n) for k in range(time - 1)]
     close(second, np.stack(blocks, axis=1))
-    expected = found.next - jnp.einsum("ij,pknj->pkni", p.model.a, found.prev) - (p.u @ p.model.b.T)[:-1][None, :, None]
-    close(found.kick, expected)
+    expected = paths.next - jnp.einsum("ij,pknj->pkni", p.model.a, paths.prev) - (p.u @ p.model.b.T)[:-1][None, :, None]
+    close(paths.kick, expected)
 
 
 def test_rows_that_are_not_valid_are_not_read():
@@ -229,8 +229,8 @@ def test_likeliest_start_weighs_prior_and_readings():
         score = [_dense(p._replace(start=s), seen).loglik - 0.5 * a**2 for s, a in zip(each, away, strict=True)]
         smoother = GaussianSmoother(bank, Tangent())
         model = eqx.tree_at(lambda m: m.start, p.model, p.start)
-        found = eqx.filter_jit(smoother.likeliest)(model, Prepared(p.u, p.y, jnp.asarray(seen), _active(4)))
-        np.testing.assert_allclose(found.mean, starts.mean[int(np.argmax(score))], rtol=1e-14)
+        start = eqx.filter_jit(smoother.likeliest)(model, Prepared(p.u, p.y, jnp.asarray(seen), _active(4)))
+        np.testing.assert_allclose(start.mean, starts.mean[int(np.argmax(score))], rtol=1e-14)
         likeliest = int(np.argmax(np.asarray(score) + 0.5 * away**2))
         chosen.append((int(np.argmax(score)), likeliest))
     assert any(best != 4 for best, _ in chosen) and any(best != likeliest for best, likeliest in chosen)  # both weigh
@@ -443,10 +443,10 @@ def test_nile_likelihood_is_highest_at_the_published_variances():
         start = Gaussian(p.start.mean, jnp.exp(log[:1])[:, None])  # diffuse, conditioned on y_1
         return -kalman_filter(model.log_q, model.log_r, start, p.affine, _reading(p), seq).loglik
 
-    found = minimize(loss, np.log([1e4, 1e3]), jac=jax.jit(jax.grad(loss)), method="BFGS", options={"gtol": 1e-8})
+    optimum = minimize(loss, np.log([1e4, 1e3]), jac=jax.jit(jax.grad(loss)), method="BFGS", options={"gtol": 1e-8})
     # with the constants that their table leaves out: -632.54 in all
-    assert -found.fun + 99 / 2 * (LOG_2PI + 1) == pytest.approx(-492.07, abs=0.005)
-    np.testing.assert_array_less(np.abs(np.exp(found.x) - [15099.0, 1469.1]), [1.0, 0.1])  # a unit of the last digit
+    assert -optimum.fun + 99 / 2 * (LOG_2PI + 1) == pytest.approx(-492.07, abs=0.005)
+    np.testing.assert_array_less(np.abs(np.exp(optimum.x) - [15099.0, 1469.1]), [1.0, 0.1])  # a unit of the last digit
 
 
 @pytest.mark.parametrize("vague", [False, True], ids=["first reading", "vague"])

@@ -122,10 +122,10 @@ def around_rod(model):
 def test_torques_of_motor_and_load_apart_are_found_on_one_joint(tmp_path):
     """The law by the motor's torque alone is found first, then the share of the load's."""
     data = rod.logs(0, level=lambda u, c, v: np.abs(0.15 * u + 0.05 * c))
-    (found,) = findings(close_the_loop(rod.rig(tmp_path, pendulum=True), data, key=jax.random.key(0)))
-    assert found.effect.name == "load_friction" and found.effect.joint == 1
-    assert set(found.parameters) == {"mu", "mu_load"}
+    (finding,) = findings(close_the_loop(rod.rig(tmp_path, pendulum=True), data, key=jax.random.key(0)))
+    assert finding.effect.name == "load_friction" and finding.effect.joint == 1
+    assert set(finding.parameters) == {"mu", "mu_load"}
     for name, truth in (("mu", 0.15), ("mu_load", 0.05)):
-        told = found.parameters[name]
-        assert told.value == pytest.approx(truth, rel=0.05)
-        assert abs(told.value - truth) < 4 * told.std
+        estimate = finding.parameters[name]
+        assert estimate.value == pytest.approx(truth, rel=0.05)
+        assert abs(estimate.value - truth) < 4 * estimate.std

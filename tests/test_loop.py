@@ -36,8 +36,8 @@ def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):
     The same seed gives the same numbers.
     """
     case = SLIDE._replace(effects=(DRAG,))
-    first, found = _closed(case, tmp_path)
-    assert not found
+    first, lacking = _closed(case, tmp_path)
+    assert not lacking
     assert first.after is first.before
     again, _ = _closed(case, tmp_path)
     for a, b in zip(jax.tree.leaves(first.after.model), jax.tree.leaves(again.after.model), strict=True):
@@ -48,11 +48,11 @@ def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):
 def test_two_effects_of_a_slide_through_the_command(tmp_path):
     """Named and sized; the report exact to the interface; the reported errors those of `predict`."""
     plant.write(SLIDE._replace(effects=(SPRING, DEAD, DRAG)), tmp_path / "rig")
-    found = tmp_path / "found"
-    assert cli.main(["diagnose", str(tmp_path / "rig"), "--out", str(found), "--quiet"]) == 0
-    report = json.loads((found / "report.json").read_text())
+    out = tmp_path / "found"
+    assert cli.main(["diagnose", str(tmp_path / "rig"), "--out", str(out), "--quiet"]) == 0
+    report = json.loads((out / "report.json").read_text())
     _named_and_sized(report)
-    _exact_to_the_interface(report, (found / "report.html").read_text())
+    _exact_to_the_interface(report, (out / "report.html").read_text())
     _ends_over_the_whole_length(report["looks"])
     for side in ("before", "after"):
         _errors_of_predict(tmp_path, report, side)
@@ -62,9 +62,9 @@ def _named_and_sized(report):
     values = {e["name"]: e["parameters"] for e in report["effects"]}
     assert set(values) == {"torsional_spring", "dead_zone"}
     for name, parameter, truth in (("torsional_spring", "k", 20.0), ("dead_zone", "width", 1.0)):
-        told = values[name][parameter]
-        assert told["value"] == pytest.approx(truth, rel=0.05)
-        assert abs(told["value"] - truth) < 3 * told["std"]
+        estimate = values[name][parameter]
+        assert estimate["value"] == pytest.approx(truth, rel=0.05)
+        assert abs(estimate["value"] - truth) < 3 * estimate["std"]
     assert values["torsional_spring"]["k"]["unit"] == "N/m"
     assert report["error"]["after"]["x"][3] < 0.3 * report["error"]["before"]["x"][3]
 
@@ -96,9 +96,9 @@ def _errors_of_predict(folder, report, side):
     assert cli.main(["predict", str(model), str(folder / "rig" / "test"), "--given", "1.0", "--out", str(out)]) == 0
     square = []
     for path in sorted((folder / "rig" / "test").glob("*.csv")):
-        told, read = _table(out / path.name), _table(path)
+        predicted, read = _table(out / path.name), _table(path)
         ahead = (read["time"] > 1.0 + 1e-6) & (read["time"] <= 2.0 + 1e-6) & np.isfinite(read["x"])
-        square.append((told["x"] - read["x"])[ahead] ** 2)
+        square.append((predicted["x"] - read["x"])[ahead] ** 2)
     rms = np.sqrt(np.mean(np.concatenate(square)))
     assert report["error"][side]["x"][3] == pytest.approx(rms, rel=1e-6)
 
@@ -112,20 +112,20 @@ def _table(path):
 def test_the_verdict_claims_a_fall_only_where_there_is_one():
     """The same finding with a test error that falls, that rises, and that nobody knows."""
     effect = catalogue["payload"](jnp.zeros(()), joint=2)
-    found = [Finding(effect, {}, {}, (), "payload")]
+    laws = [Finding(effect, {}, {}, (), "payload")]
     error = {"horizons_s": [1.0], "before": {"theta1": [0.2]}, "after": {"theta1": [0.1]}}
-    assert "falls from 0.2 to 0.1" in verdict(found, error)
-    assert "do not trust" in verdict(found, error | {"after": {"theta1": [0.3]}})
+    assert "falls from 0.2 to 0.1" in verdict(laws, error)
+    assert "do not trust" in verdict(laws, error | {"after": {"theta1": [0.3]}})
     mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
-    assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(found, error | mixed)
+    assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(laws, error | mixed)
     other = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.4), ("after", 0.21, 0.1))}
-    assert "of theta2 falls from 0.4 to 0.1 and that of theta1 rises" in verdict(found, error | other)
+    assert "of theta2 falls from 0.4 to 0.1 and that of theta1 rises" in verdict(laws, error | other)
     worse = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.1), ("after", 0.19, 0.2))}
-    assert "of theta2 does not fall with it (0.1 before, 0.2 after): do not trust" in verdict(found, error | worse)
-    assert verdict(found, None) == "The model lacks a payload at joint 2."
-    sized = found[0]._replace(parameters={"mass": Estimate(0.4567, 0.0123, "kg"), "centre_x": Estimate(0.1, 0.2, "m")})
+    assert "of theta2 does not fall with it (0.1 before, 0.2 after): do not trust" in verdict(laws, error | worse)
+    assert verdict(laws, None) == "The model lacks a payload at joint 2."
+    sized = laws[0]._replace(parameters={"mass": Estimate(0.4567, 0.0123, "kg"), "centre_x": Estimate(0.1, 0.2, "m")})
     assert verdict([sized], None) == "The model lacks a payload at joint 2 (mass = 0.457 ± 0.012 kg)."
-    drawn = found[0]._replace(
+    drawn = laws[0]._replace(
         effect=catalogue["air_drag"](jnp.zeros(())),
         curve=Curve("x", "rad", 1, "N m", False, *np.asarray([[0.0, 1.0], [-1.0, 2.0], [0.1, 0.1]])),
     )

@@ -113,9 +113,9 @@ def test_derivatives_by_uncertain_numbers_are_those_of_the_mass_matrix(tmp_path)
         changed = system.with_parameters(values)
         return spd_solve(changed.mass(q), jnp.ones(3) - changed.bias(q, v))
 
-    found, truth = jax.jacfwd(own)(system.values), jax.jacfwd(other)(system.values)
+    derivative, truth = jax.jacfwd(own)(system.values), jax.jacfwd(other)(system.values)
     for name in names:
-        np.testing.assert_allclose(found[name], truth[name], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(derivative[name], truth[name], rtol=1e-8, atol=1e-8)
 
 
 def test_drive_is_that_of_mujocos_motors(tmp_path):
@@ -129,10 +129,10 @@ def test_drive_is_that_of_mujocos_motors(tmp_path):
 
 
 def test_acrobot_of_the_file_is_the_built_in_one():
-    own, built = tree(ROOT / "examples" / "machines" / "acrobot.xml"), examples["acrobot"]().model.system
+    parsed, built = tree(ROOT / "examples" / "machines" / "acrobot.xml"), examples["acrobot"]().model.system
     q, v = jnp.asarray([0.7, -1.9]), jnp.asarray([2.0, 5.0])
-    np.testing.assert_allclose(own.mass(q), built.mass(q), rtol=1e-13)
-    np.testing.assert_allclose(own.bias(q, v), built.bias(q, v), rtol=1e-12)
+    np.testing.assert_allclose(parsed.mass(q), built.mass(q), rtol=1e-13)
+    np.testing.assert_allclose(parsed.bias(q, v), built.bias(q, v), rtol=1e-12)
 
 
 # --- rig.toml
@@ -272,8 +272,8 @@ def test_a_load_of_no_mass_is_a_shift_of_the_centre_and_breaks_nothing(tmp_path)
 
     def forces(numbers):
         effect = catalogue["payload"](numbers[0], numbers[1:], system.spots[3].point, joint=3)
-        told = jnp.stack(list(effect.values().values()))
-        return jnp.concatenate([effect.physics(system, jnp.zeros(())).bias(q, v), told])
+        parameters = jnp.stack(list(effect.values().values()))
+        return jnp.concatenate([effect.physics(system, jnp.zeros(())).bias(q, v), parameters])
 
     still = forces(jnp.zeros(4))
     np.testing.assert_allclose(still[:3], system.bias(q, v), atol=1e-12)
@@ -293,12 +293,12 @@ def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_pa
     fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
     design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
     design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), expected=information, old=information)
-    found = parameter_entries(design)
-    assert {name: entry["unit"] for name, entry in found.items()} == {
+    entries = parameter_entries(design)
+    assert {name: entry["unit"] for name, entry in entries.items()} == {
         "link2.mass": "kg",
         "input delay at joint 2, delay": "s",
     }
-    assert found["input delay at joint 2, delay"]["value"] == pytest.approx(0.004)
+    assert entries["input delay at joint 2, delay"]["value"] == pytest.approx(0.004)
 
 
 def test_declared_bodies_that_cannot_be_are_refused(tmp_path):
@@ -319,10 +319,10 @@ def test_unphysical_bodies_have_no_numbers(tmp_path):
 def test_physical_says_the_same_as_the_pseudo_inertia(seed):
     rng = np.random.default_rng(seed)
     s = rng.normal(size=(3, 3))
-    own = s @ s.T + rng.uniform(-1.0, 1.0) * np.eye(3)
-    half = 0.5 * np.trace(own) * np.eye(3) - own
-    told = bool(physical(jnp.asarray(1.0), tuple(map(tuple, own))))
-    assert told == bool(np.linalg.eigvalsh(half).min() > 0)
+    inertia = s @ s.T + rng.uniform(-1.0, 1.0) * np.eye(3)
+    half = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    accepted = bool(physical(jnp.asarray(1.0), tuple(map(tuple, inertia))))
+    assert accepted == bool(np.linalg.eigvalsh(half).min() > 0)
 
 
 WHOLE = [f"link2.{what}" for what in ("mass", "com.x", "com.y", "com.z")]
@@ -358,8 +358,8 @@ def test_a_step_of_a_pseudo_inertia_is_itself_to_first_order():
 
     def missed(share: float) -> float:
         after = jax.tree.map(lambda a, b: a + share * b, before, way)
-        found = stepped(before, after)
-        return max(float(jnp.abs(a - b).max()) for a, b in zip(found, after, strict=True))
+        linear = stepped(before, after)
+        return max(float(jnp.abs(a - b).max()) for a, b in zip(linear, after, strict=True))
 
     assert missed(1e-4) < 0.3 * missed(2e-4)  # it falls with the square
     assert np.linalg.eigvalsh(np.asarray(pseudo(stepped(before, jax.tree.map(lambda a: -3.0 * a, before))))).min() > 0
@@ -370,9 +370,9 @@ def test_what_no_motion_feels_is_told(tmp_path):
         "[model.uncertain]\nlink1.mass = {std = 0.1}\nlink1.inertia.zz = {std = 0.1}\njoint1.armature = {std=1.0}"
     )
     rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
-    found = identifiability(rig, build_system(rig))
-    assert found.never == ()
-    assert found.together == (("link1.mass", "link1.inertia.zz", "joint1.armature"),)  # one axis, upright
+    result = identifiability(rig, build_system(rig))
+    assert result.never == ()
+    assert result.together == (("link1.mass", "link1.inertia.zz", "joint1.armature"),)  # one axis, upright
     uncertain = "[model.uncertain]\nlink1.com.z = {std=0.1}\nlink2.mass = {std=0.1}"
     rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
     assert identifiability(rig, build_system(rig)) == (("link1.com.z",), (), ())
@@ -508,8 +508,8 @@ def test_missing_meshes_do_not_matter_where_inertials_are_there(tmp_path):
     (tmp_path / "inner.xml").write_text(inner)
     (tmp_path / "outer.xml").write_text(f'<mujoco>{asset}<include file="inner.xml"/></mujoco>')
     (tmp_path / "plain.xml").write_text(inner.replace(shape, ""))
-    found, plain = (read_machine(tmp_path / name) for name in ("outer.xml", "plain.xml"))
-    assert found._replace(file="") == plain._replace(file="")
+    outer, plain = (read_machine(tmp_path / name) for name in ("outer.xml", "plain.xml"))
+    assert outer._replace(file="") == plain._replace(file="")
 
 
 # --- what is stored and handed on

@@ -70,8 +70,8 @@ def test_no_closed_cycle_gives_energy():
             after, taken = jax.lax.scan(step, s, jnp.arange(rows))
             return after, (jnp.sum(taken), jnp.sum(jnp.abs(taken)), after - s)
 
-        _, found = jax.lax.scan(period, jnp.zeros(()), None, length=30)
-        return jax.tree.map(lambda a: a[-1], found)
+        _, periods = jax.lax.scan(period, jnp.zeros(()), None, length=30)
+        return jax.tree.map(lambda a: a[-1], periods)
 
     taken, size, moved = energies(jax.random.split(jax.random.key(0), 16))
     assert np.abs(moved).max() < 1e-4  # the last period is closed
@@ -129,12 +129,12 @@ def _logs(stiffness: float | None, seed: int, sequences: int = 16, rows: int = 6
     u = amplitude * np.sin(2 * np.pi * t[:, None] / period + phase)
     q, v, s, y = rng.uniform(-1, 1, sequences), np.zeros(sequences), np.zeros(sequences), []
     inertia, h = PHYSICS["I"] + PHYSICS["m"] * PHYSICS["lc"] ** 2, dt / sub
-    for now in u:
+    for force in u:
         y.append(np.stack([q, v], axis=-1))
         for _ in range(sub):
             weight = PHYSICS["m"] * PHYSICS["g"] * PHYSICS["lc"] * np.sin(q)
             dry = np.tanh(v / 0.02) if stiffness is None else s
-            v = v + h * (now - weight - 0.08 * dry - 0.02 * v) / inertia
+            v = v + h * (force - weight - 0.08 * dry - 0.02 * v) / inertia
             q = q + h * v
             if stiffness is not None:
                 s = np.sign(v) + (s - np.sign(v)) * np.exp(-np.abs(v) * h * stiffness / 0.08)
@@ -158,12 +158,12 @@ def fitted():
 def test_a_fit_recovers_dahls_friction(fitted):
     """Within three of the stated standard deviations, which are themselves small."""
     assert fitted.memory.startswith("joint 1: memory")
-    (found,) = contacts(fitted)
+    (contact,) = contacts(fitted)
     for name, truth in (("coulomb", 0.08), ("stiffness", 4.0)):
-        number = found.parameters[name]
+        number = contact.parameters[name]
         assert abs(number.value - truth) < 3 * number.std < 0.4 * truth
-    assert found.joint == 1 and "presliding stiffness" in found.text and "N m/rad" in found.text
-    assert np.ptp(found.loop.torque) == pytest.approx(2 * 0.08 * np.tanh(1.0), rel=0.15)  # at its distance, by Dahl
+    assert contact.joint == 1 and "presliding stiffness" in contact.text and "N m/rad" in contact.text
+    assert np.ptp(contact.loop.torque) == pytest.approx(2 * 0.08 * np.tanh(1.0), rel=0.15)  # at its distance, by Dahl
 
 
 def test_the_table_is_the_torque_of_steady_sliding(fitted):

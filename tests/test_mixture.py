@@ -78,13 +78,13 @@ def _grid(model: _Fall, seq: Dataset) -> tuple[np.ndarray, np.ndarray, float]:
     seen = np.where(u[:, None] > 0, x[None], model.bend * x[None] ** 2)
     like = np.exp(-0.5 * (y[:, None] - seen) ** 2 / r) / np.sqrt(2 * np.pi * r)
     mean, var = np.asarray(model.start.mean)[0], np.asarray(model.start.cov)[0, 0]
-    now = np.exp(-0.5 * (x - mean) ** 2 / var) / np.sqrt(2 * np.pi * var) * width
+    density = np.exp(-0.5 * (x - mean) ** 2 / var) / np.sqrt(2 * np.pi * var) * width
     ahead, loglik = [], 0.0
     for k in range(len(y)):
-        now = (kernel @ now if k else now) * like[k]
-        loglik += np.log(now.sum())
-        now = now / now.sum()
-        ahead.append(now)
+        density = (kernel @ density if k else density) * like[k]
+        loglik += np.log(density.sum())
+        density = density / density.sum()
+        ahead.append(density)
     back, out = np.ones_like(x), []
     for k in reversed(range(len(y))):
         both = ahead[k] * back
@@ -168,27 +168,27 @@ def test_an_affine_model_has_one_posterior_whatever_is_split():
         step = chain.affine.matrix[:-1, 0, 0] * chain.state.mean[:-1, 0] + chain.affine.offset[:-1, 0]
         np.testing.assert_allclose(chain.predicted.mean[1:, 0], step, rtol=1e-12)  # each came from the one before it
     one = eqx.filter_jit(CubatureSmoother(StartBank((1,))))(model, seq)
-    found = _mixture(model, data)
-    np.testing.assert_allclose(found.state.mean[0], one.state.mean, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.state.cov[0], one.state.cov, rtol=1e-9)
-    np.testing.assert_allclose(found.loglik[0], one.loglik, rtol=1e-12)
+    posterior = _mixture(model, data)
+    np.testing.assert_allclose(posterior.state.mean[0], one.state.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(posterior.state.cov[0], one.state.cov, rtol=1e-9)
+    np.testing.assert_allclose(posterior.loglik[0], one.loglik, rtol=1e-12)
 
 
 def test_the_likelier_side_is_the_one_of_the_grid():
     """The side shows only at the end; before it a single Gaussian takes the one to which its mean leans."""
     model, data = _model(), _logs([1, -1], ROWS - 4)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
-    found = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
-    assert np.all(np.asarray(found.width) > WIDE)
+    mixture = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
+    assert np.all(np.asarray(mixture.width) > WIDE)
     for i in range(2):
         x, posterior, loglik = _grid(model, jax.tree.map(lambda a, i=i: a[i], data))
         mean = posterior @ x
         std = np.sqrt(posterior @ x**2 - mean**2)
-        off = (np.asarray(found.state.mean)[i, :, 0] - mean) / std
+        off = (np.asarray(mixture.state.mean)[i, :, 0] - mean) / std
         assert np.sqrt(np.mean(off**2)) < 0.3  # of a standard deviation: what linearisation costs
-        np.testing.assert_allclose(found.loglik[i], loglik, atol=0.7)
-        assert first.loglik[i] <= found.loglik[i]
-    assert first.loglik[1] < found.loglik[1] - 5  # it was on the other side
+        np.testing.assert_allclose(mixture.loglik[i], loglik, atol=0.7)
+        assert first.loglik[i] <= mixture.loglik[i]
+    assert first.loglik[1] < mixture.loglik[1] - 5  # it was on the other side
 
 
 def test_the_likelier_of_both_paths_is_taken():
@@ -199,10 +199,10 @@ def test_the_likelier_of_both_paths_is_taken():
     second = first._replace(
         loglik=loglik + jnp.asarray([1.0, -1.0, jnp.nan, -1.0]), state=jax.tree.map(lambda a: a + 1, first.state)
     )
-    found = _replaced(first, second, loglik.at[3].set(jnp.nan), np.arange(4))
-    moved = np.asarray(found.state.mean - first.state.mean)[:, 0, 0]
+    posterior = _replaced(first, second, loglik.at[3].set(jnp.nan), np.arange(4))
+    moved = np.asarray(posterior.state.mean - first.state.mean)[:, 0, 0]
     np.testing.assert_allclose(moved, [1.0, 0.0, 0.0, 1.0], atol=1e-12)
-    np.testing.assert_array_equal(found.loglik[1:3], first.loglik[1:3])
+    np.testing.assert_array_equal(posterior.loglik[1:3], first.loglik[1:3])
 
 
 def test_two_sides_that_nothing_decides_are_both_reported():
@@ -222,10 +222,10 @@ def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
     """The angle is read from the first row on."""
     model, data = _model(), _logs([1, -1], 0)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
-    found = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
-    assert np.all(np.asarray(found.width) < WIDE)
+    posterior = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
+    assert np.all(np.asarray(posterior.width) < WIDE)
     for a, b in zip(
-        jax.tree.leaves(first._replace(width=None)), jax.tree.leaves(found._replace(width=None)), strict=True
+        jax.tree.leaves(first._replace(width=None)), jax.tree.leaves(posterior._replace(width=None)), strict=True
     ):
         np.testing.assert_array_equal(a, b)
 

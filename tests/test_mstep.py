@@ -66,7 +66,7 @@ class _Case(NamedTuple):
     model: StateSpaceModel
     seq: Dataset
     posterior: Posterior
-    found: Quadratic
+    expansion: Quadratic
 
     @property
     def speed(self):
@@ -81,9 +81,9 @@ def _expand(model, prior, data: Dataset):
     posterior = jax.vmap(lambda seq: smoother(model, prepare(model, seq)))(data)
 
     def expand(posterior, seq):
-        here = local(model, prior, posterior.state, seq, Tangent())
-        read = readings_at(model, posterior, here.seq)
-        return quadratic(model.log_q, model.log_r, model.start, here, NODES, posterior, read)
+        linear = local(model, prior, posterior.state, seq, Tangent())
+        read = readings_at(model, posterior, linear.seq)
+        return quadratic(model.log_q, model.log_r, model.start, linear, NODES, posterior, read)
 
     return posterior, jax.vmap(expand)(posterior, data)
 
@@ -124,8 +124,8 @@ def _gradient(case: _Case) -> _Knobs:
         reading = jax.vmap(lambda x, u: linear_reading(noisy, x, u))(case.posterior.state.mean, seq.inputs)
         return kalman_filter(noisy.log_q, noisy.log_r, model.start, affine, reading, seq).loglik
 
-    now = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model))
-    flat, unravel = ravel_pytree(now)
+    start = _Knobs(model.log_q, model.log_r, zero, zero, MASS.read(model))
+    flat, unravel = ravel_pytree(start)
     shift = 1e-4 * jnp.eye(flat.shape[0])
     both = jax.vmap(lambda d: loglik(unravel(flat + d)) - loglik(unravel(flat - d)))(shift)
     return unravel(both / 2e-4)
@@ -161,23 +161,23 @@ def test_score_is_the_gradient_of_the_likelihood(name, request):
     case = request.getfixturevalue(name)
     gradient = _gradient(case)
     noise = jnp.concatenate([gradient.log_q, gradient.log_r])
-    np.testing.assert_allclose(case.found.noise_score, noise, rtol=1e-6, atol=1e-6)  # differences of step 1e-4
+    np.testing.assert_allclose(case.expansion.noise_score, noise, rtol=1e-6, atol=1e-6)  # differences of step 1e-4
     # the weights of the nodes sum to 1, so the sum of the node scores belongs to a constant force. On the slide exact;
     # the pendulum's Jacobian moves with force and mass, which the score takes at the mean only: 3 %
     rel = 1e-6 if name == "slide" else 0.03
-    assert float(jnp.sum(case.found.score[:-1])) == pytest.approx(float(gradient.force), rel=rel)
-    assert float(case.found.score[-1]) == pytest.approx(float(gradient.mass[0]), rel=rel)
+    assert float(jnp.sum(case.expansion.score[:-1])) == pytest.approx(float(gradient.force), rel=rel)
+    assert float(case.expansion.score[-1]) == pytest.approx(float(gradient.mass[0]), rel=rel)
 
 
 def test_torque_score_at_the_nodes_is_that_of_viscous_friction(slide):
     """The nodes interpolate, so sum_i v_i score_i belongs to a force proportional to velocity."""
-    found = slide.found.score[:-1] @ NODES[0]
+    score = slide.expansion.score[:-1] @ NODES[0]
     expected = -_gradient(slide).damping
     inside = active_steps(slide.seq.valid)[:-1]
     push, q = DT / float(slide.model.system.m), jnp.exp(slide.model.log_q[1])
     information = push**2 * jnp.sum(jnp.where(inside, slide.speed.mean(1) ** 2, 0.0)) / q
     # what differs: velocity within a step, of order (dt force / m), in units of the standard deviation
-    assert abs(float(found - expected)) < 0.05 * float(jnp.sqrt(information))
+    assert abs(float(score - expected)) < 0.05 * float(jnp.sqrt(information))
 
 
 def _dense_readings(model, seq: Dataset, log_q, log_r):
@@ -207,8 +207,8 @@ def test_information_is_the_dense_fisher_information(slide):
     columns = np.concatenate([force[None, :, None] * tent[:, None, :], mass[:-1, :, None]], axis=2)
     jac = sum(inside[k] * maps[k + 1] @ columns[k] for k in range(len(columns)))
     expected = jac.T @ np.linalg.solve(cov, jac)
-    found = slide.found.information
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())  # condition of cov: 1e4
+    value = slide.expansion.information
+    np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())  # condition of cov: 1e4
 
 
 def test_noise_information_is_fishers_on_average(slides):
@@ -221,9 +221,9 @@ def test_noise_information_is_fishers_on_average(slides):
     h = 1e-4
     slopes = [np.linalg.solve(cov(log), (cov(log + h * e) - cov(log - h * e)) / (2 * h)) for e in np.eye(4)]
     expected = np.asarray([[0.5 * np.trace(a @ b) for a in slopes] for b in slopes])
-    found = np.asarray(each.noise_information)
+    information = np.asarray(each.noise_information)
     np.testing.assert_array_less(
-        np.abs(found.mean(0) - expected), 4.5 * found.std(0) / np.sqrt(n) + 1e-6 * expected.max()
+        np.abs(information.mean(0) - expected), 4.5 * information.std(0) / np.sqrt(n) + 1e-6 * expected.max()
     )
     # and the scores of draws from the model scatter around 0 with that covariance (16 entries: 4.5 standard errors)
     score = np.asarray(each.noise_score)
@@ -326,11 +326,11 @@ def test_sequences_that_are_not_used_have_no_weight(slides):
     """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
     model, data, posterior, each = slides
     rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), shape=model.log_q, linearise=Tangent())
-    here = locals_along(model, MASS, posterior.state, data, Tangent())
-    read = readings_along(model, posterior, here.seq)
+    linear = locals_along(model, MASS, posterior.state, data, Tangent())
+    read = readings_along(model, posterior, linear.seq)
 
     def step(index, used):
-        parts = jax.tree.map(lambda a: a[np.asarray(index)], (here, posterior, read))
+        parts = jax.tree.map(lambda a: a[np.asarray(index)], (linear, posterior, read))
         far = jnp.where(jnp.asarray(used), 1.0, 1e3)
         spoilt = eqx.tree_at(lambda p: p[1].kick, parts, parts[1].kick * far[:, None, None, None])
         spoilt = eqx.tree_at(lambda p: p[1].state.mean, spoilt, spoilt[1].state.mean * far[:, None, None])

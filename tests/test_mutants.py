@@ -24,11 +24,11 @@ def test_every_mutant_is_a_change_of_one_place_and_names_a_test():
 
 def test_a_copy_is_green(tmp_path):
     """Their tests pass where nothing is broken."""
-    found = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN))
-    assert (found.passed, found.failed) == (2, 0), found.said
+    outcome = run(copy(tmp_path), *(mutant.test for mutant in CHOSEN))
+    assert (outcome.passed, outcome.failed) == (2, 0), outcome.said
 
 
 @pytest.mark.parametrize("mutant", CHOSEN, ids=lambda mutant: mutant.what.replace(" ", "-"))
 def test_a_broken_copy_is_red(mutant, tmp_path):
-    found = run(copy(tmp_path, mutant), mutant.test)
-    assert found.failed == 1 and found.asserted, found.said
+    outcome = run(copy(tmp_path, mutant), mutant.test)
+    assert outcome.failed == 1 and outcome.asserted, outcome.said

@@ -147,7 +147,7 @@ def test_clean_rig_has_one_column_of_errors_and_no_effect():
 
 def test_page_says_what_was_found_in_order():
     text = " ".join("".join(_parsed(page(WHOLE, FIGURES)).text).split())
-    told = (
+    parts = (
         "The model lacks a spring.",
         "0.81 → 0.0058 rad",
         "139 ×",
@@ -165,8 +165,8 @@ def test_page_says_what_was_found_in_order():
         "cogging at joint 1",
         "172 s",
     )
-    places = [text.find(part) for part in told]
-    assert min(places) >= 0, [part for part, place in zip(told, places, strict=True) if place < 0]
+    places = [text.find(part) for part in parts]
+    assert min(places) >= 0, [part for part, place in zip(parts, places, strict=True) if place < 0]
     assert places == sorted(places)
 
 
@@ -202,7 +202,7 @@ def test_images_are_told_apart_and_others_refused():
 
 
 @pytest.mark.parametrize(
-    ("key", "told"),
+    ("key", "text"),
     [
         (("torsional_spring", 1, None, ()), "torsional spring at joint 1"),
         (("unknown_function", 2, None, ("theta1", "u")), "unknown function of theta1 and u at joint 2"),
@@ -210,9 +210,9 @@ def test_images_are_told_apart_and_others_refused():
         (("sensor_bias", None, "x", ()), "sensor bias on x"),
     ],
 )
-def test_a_report_calls_an_effect_as_the_search_does(key, told):
-    assert words(key) == told
-    assert label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == told
+def test_a_report_calls_an_effect_as_the_search_does(key, text):
+    assert words(key) == text
+    assert label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == text
     assert label({}) == "unnamed"
 
 
@@ -255,7 +255,7 @@ def test_a_fit_has_a_page_of_its_own():
         "model": "model.npz",
     }
     text = " ".join("".join(_parsed(page(fitted, FIGURES)).text).split())
-    told = (
+    parts = (
         "Identification of arm",
         "Fitted the friction of 1 joint.",
         "0.020 rad",
@@ -268,8 +268,8 @@ def test_a_fit_has_a_page_of_its_own():
         "left out of the last epoch: 03.csv",
         "0.00500 rad (estimated)",
     )
-    places = [text.find(part) for part in told]
-    assert min(places) >= 0, [part for part, place in zip(told, places, strict=True) if place < 0]
+    places = [text.find(part) for part in parts]
+    assert min(places) >= 0, [part for part, place in zip(parts, places, strict=True) if place < 0]
     assert places == sorted(places)
     for absent in ("What was found", "could not be told apart", "Nothing is missing", "smaller by"):
         assert absent not in text

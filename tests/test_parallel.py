@@ -140,9 +140,9 @@ def alone(rig) -> dict[str, np.ndarray]:
 
 
 def _agree(out: Path, alone: dict[str, np.ndarray]) -> None:
-    found = _numbers(out)
-    assert len(found) > 5 and found.keys() == alone.keys()
-    for name, value in found.items():
+    numbers = _numbers(out)
+    assert len(numbers) > 5 and numbers.keys() == alone.keys()
+    for name, value in numbers.items():
         # as over devices; the Hessian in the file is a sum over all rows, and as much larger
         np.testing.assert_allclose(value, alone[name], rtol=1e-8, atol=1e-8, err_msg=name)
 

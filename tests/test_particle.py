@@ -183,9 +183,9 @@ def test_double_precision_gives_what_single_does():
     single, double = run(jax.random.split(jax.random.key(8), 100))
     assert single.loglik.dtype == double.loglik.dtype == jnp.float64
     exact = _guide(2).path(model, prepare(model, seq))
-    for found in (single, double):
-        _within(np.asarray(found.state.mean), np.asarray(exact[1].state.mean))
-        ratio = np.exp(np.asarray(found.loglik - exact[0].loglik))
+    for posterior in (single, double):
+        _within(np.asarray(posterior.state.mean), np.asarray(exact[1].state.mean))
+        ratio = np.exp(np.asarray(posterior.loglik - exact[0].loglik))
         assert abs(np.mean(ratio) - 1) < 4 * np.std(ratio, ddof=1) / 10
     spread = [
         np.log(np.diagonal(np.asarray(f.state.cov), axis1=-2, axis2=-1)).mean(axis=(1, 2)) for f in (single, double)

@@ -15,11 +15,11 @@ def test_mass_and_centre_of_a_load_on_one_joint_are_found(tmp_path):
     """Weight and inertia of a hinge give mass and centre in the plane of its motion; along the axis nothing is seen."""
     data = rod.logs(0, mass=MASS, at=PLACE)
     closed = close_the_loop(rod.rig(tmp_path), data, key=jax.random.key(0))
-    (found,) = findings(closed)
-    assert found.effect.name == "payload" and found.effect.joint == 1
-    told = found.parameters
+    (finding,) = findings(closed)
+    assert finding.effect.name == "payload" and finding.effect.joint == 1
+    estimates = finding.parameters
     for name, truth, within in (("mass", MASS, 0.1 * MASS), ("centre_x", PLACE[0], 0.02), ("centre_z", PLACE[1], 0.02)):
-        assert told[name].value == pytest.approx(truth, abs=within)
-        assert abs(told[name].value - truth) < 4 * told[name].std < 4 * within
-    assert told["centre_y"].std > 0.2  # nobody knows
-    assert told.keys() == catalogue["payload"].units.keys()
+        assert estimates[name].value == pytest.approx(truth, abs=within)
+        assert abs(estimates[name].value - truth) < 4 * estimates[name].std < 4 * within
+    assert estimates["centre_y"].std > 0.2  # nobody knows
+    assert estimates.keys() == catalogue["payload"].units.keys()

@@ -15,8 +15,8 @@ MODEL, _ = slide()
 
 
 def _surroundings(span: float = 5.0):
-    own = around(MODEL)
-    return own._replace(duration=(0.0, span), ending=span, inputs=("u",))
+    surroundings = around(MODEL)
+    return surroundings._replace(duration=(0.0, span), ending=span, inputs=("u",))
 
 
 def _sine(frequency: float = 0.96) -> PeriodicForce:
@@ -39,12 +39,12 @@ def test_the_waveform_is_the_sum_of_its_harmonics_and_repeats():
     sine, cosine = rng.normal(size=(2, 4))
     force = PeriodicForce(jnp.asarray(sine), jnp.asarray(cosine), jnp.asarray(2.0), harmonics=4, joint=1)
     turns = rng.uniform(size=50)
-    told = sum(
+    series = sum(
         s * np.sin(2 * np.pi * h * turns) + c * np.cos(2 * np.pi * h * turns)
         for h, (s, c) in enumerate(zip(sine, cosine, strict=True), start=1)
     )
-    np.testing.assert_allclose(force.waveform(jnp.asarray(turns)), told, atol=1e-12)
-    np.testing.assert_allclose(force.waveform(jnp.asarray(turns + 3.0)), told, atol=1e-10)
+    np.testing.assert_allclose(force.waveform(jnp.asarray(turns)), series, atol=1e-12)
+    np.testing.assert_allclose(force.waveform(jnp.asarray(turns + 3.0)), series, atol=1e-10)
     many = np.asarray(force.waveform(jnp.linspace(0.0, 1.0, 1000, endpoint=False)))
     np.testing.assert_allclose(force.values()["size"], np.sqrt(np.mean(many**2)), rtol=1e-9)
 

@@ -173,11 +173,11 @@ def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
     cut = ROWS - len(written["time"])
     seq = Dataset(DT * jnp.arange(ROWS, dtype=float), jnp.asarray(u), jnp.asarray(x), jnp.ones(ROWS, bool))
     readings = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), model.inputs(seq)))[cut:]
-    own = np.stack([written[name] for name in planted_make.STATES], axis=-1)
-    assert np.abs(own - x[cut:]).max() > 0.01
+    recorded = np.stack([written[name] for name in planted_make.STATES], axis=-1)
+    assert np.abs(recorded - x[cut:]).max() > 0.01
     # the library looks back along the equation of motion
-    atol = 1e-3 * np.abs(own - x[cut:]).max() if tag == "late" else 1e-12
-    np.testing.assert_allclose(own, readings, rtol=0, atol=atol)
+    atol = 1e-3 * np.abs(recorded - x[cut:]).max() if tag == "late" else 1e-12
+    np.testing.assert_allclose(recorded, readings, rtol=0, atol=atol)
     np.testing.assert_array_equal(written["tau1"], u[cut:, 0])
     assert written["time"][0] == 0
 
@@ -265,85 +265,85 @@ def _true(law: str, joint: int | None = None, channel: str | None = None, **valu
     return entry | {"share": 0.3, "parameters": values}
 
 
-def _told(name: str, joint: int | None = None, channel: str | None = None, inputs=(), **values: float) -> dict:
+def _entry(name: str, joint: int | None = None, channel: str | None = None, inputs=(), **values: float) -> dict:
     numbers = {n: {"value": v, "std": 0.01, "unit": ""} for n, v in values.items()}
     return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs), "parameters": numbers}
 
 
-def _record(true: list[dict], told: list[dict], after: float = 0.2, **more) -> dict:
+def _record(true: list[dict], entries: list[dict], after: float = 0.2, **more) -> dict:
     horizons = [0.1, 0.25, 0.5, 1.0]
     error = {"horizons_s": horizons, "before": {"theta1": [0.4] * 4}, "after": {"theta1": [after] * 4}}
     truth = {"rig": "r", "split": "look", "strength": "strong" if true else "none", "effects": true}
     record = {"case": "r-x-strong" if true else "r-recorded", "truth": truth, "code": "", "log_seconds": 5.0}
     record |= {"seconds": 1.0, "processor_seconds": 1.0}
-    return record | {"report": {"effects": told, "error": error} | more}
+    return record | {"report": {"effects": entries, "error": error} | more}
 
 
 RIGHT = [
-    (_true("spring", 2, k=0.3, theta0=0.1), [_told("torsional_spring", 2, k=0.31, theta0=0.2)]),
-    (_true("spring", 2, k=0.3, theta0=0.1), [_told("unknown_function", 2, inputs=["theta2"])]),
-    (_true("bump", 1, amplitude=0.3), [_told("unknown_function", 1, inputs=["theta1"])]),
-    (_true("patch", 1, amplitude=0.3), [_told("unknown_function", 1, inputs=["dtheta1", "theta1"])]),
-    (_true("onesided", 2, loss=0.3), [_told("unknown_function", 2, inputs=["tau2"])]),
-    (_true("onesided", 2, loss=0.3), [_told("unknown_function", 2, inputs=["tau2"], loss=0.31)]),
-    (_true("load", 1, mu=0.3), [_told("unknown_function", 1, inputs=["tau1", "dtheta1"], mu=0.29)]),
-    (_true("bias", None, "theta1", bias=0.1), [_told("base_tilt", angle=-0.1)]),
+    (_true("spring", 2, k=0.3, theta0=0.1), [_entry("torsional_spring", 2, k=0.31, theta0=0.2)]),
+    (_true("spring", 2, k=0.3, theta0=0.1), [_entry("unknown_function", 2, inputs=["theta2"])]),
+    (_true("bump", 1, amplitude=0.3), [_entry("unknown_function", 1, inputs=["theta1"])]),
+    (_true("patch", 1, amplitude=0.3), [_entry("unknown_function", 1, inputs=["dtheta1", "theta1"])]),
+    (_true("onesided", 2, loss=0.3), [_entry("unknown_function", 2, inputs=["tau2"])]),
+    (_true("onesided", 2, loss=0.3), [_entry("unknown_function", 2, inputs=["tau2"], loss=0.31)]),
+    (_true("load", 1, mu=0.3), [_entry("unknown_function", 1, inputs=["tau1", "dtheta1"], mu=0.29)]),
+    (_true("bias", None, "theta1", bias=0.1), [_entry("base_tilt", angle=-0.1)]),
     (
         _true("late", None, "all", delay=0.02),
-        [_told("input_delay", 2, delay=0.02), _told("input_delay", 1, delay=0.02)],
+        [_entry("input_delay", 2, delay=0.02), _entry("input_delay", 1, delay=0.02)],
     ),
-    (_true("gain", 1, gain=0.8), [_told("motor_gain", 2, gain=1.25)]),
+    (_true("gain", 1, gain=0.8), [_entry("motor_gain", 2, gain=1.25)]),
     (
         _true("ripple", 2, k=4.0, amplitude=0.3, phase=0.1),
-        [_told("cogging", 2, k=k, amplitude=0.3, phase=0.1) for k in (4, 8)],
+        [_entry("cogging", 2, k=k, amplitude=0.3, phase=0.1) for k in (4, 8)],
     ),
     (
         _true("square", 2, amplitude=0.3, frequency=1.0),
-        [_told("base_vibration", frequency=1.0, amplitude=1.0, phase=0.0)],
+        [_entry("base_vibration", frequency=1.0, amplitude=1.0, phase=0.0)],
     ),
 ]
 WRONG = [
-    (_true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 1, k=0.3, theta0=0.1)),
-    (_true("spring", 2, k=0.3, theta0=0.1), _told("unknown_function", 2, inputs=["theta1"])),
-    (_true("onesided", 2, loss=0.3), _told("unknown_function", 2, inputs=["tau1"])),
-    (_true("bias", None, "theta2", bias=0.1), _told("base_tilt", angle=-0.1)),
-    (_true("late", None, "all", delay=0.02), _told("input_delay", 2, delay=0.02)),
-    (_true("gain", 1, gain=0.8), _told("motor_gain", 2, gain=0.8)),
+    (_true("spring", 2, k=0.3, theta0=0.1), _entry("torsional_spring", 1, k=0.3, theta0=0.1)),
+    (_true("spring", 2, k=0.3, theta0=0.1), _entry("unknown_function", 2, inputs=["theta1"])),
+    (_true("onesided", 2, loss=0.3), _entry("unknown_function", 2, inputs=["tau1"])),
+    (_true("bias", None, "theta2", bias=0.1), _entry("base_tilt", angle=-0.1)),
+    (_true("late", None, "all", delay=0.02), _entry("input_delay", 2, delay=0.02)),
+    (_true("gain", 1, gain=0.8), _entry("motor_gain", 2, gain=0.8)),
     (
         _true("square", 2, amplitude=0.3, frequency=1.0),
-        _told("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0),
+        _entry("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0),
     ),
 ]
 
 
-@pytest.mark.parametrize(("true", "told"), RIGHT)
-def test_a_right_name_counts(true, told):
-    judged = score(_record([true], told), {})
+@pytest.mark.parametrize(("true", "entries"), RIGHT)
+def test_a_right_name_counts(true, entries):
+    judged = score(_record([true], entries), {})
     assert judged.right and not judged.extras
     assert all(judged.near)
 
 
-@pytest.mark.parametrize(("true", "told"), WRONG)
-def test_another_law_or_place_is_wrong_and_an_extra(true, told):
-    judged = score(_record([true], [told]), {})
+@pytest.mark.parametrize(("true", "entry"), WRONG)
+def test_another_law_or_place_is_wrong_and_an_extra(true, entry):
+    judged = score(_record([true], [entry]), {})
     assert judged.named == 0 and judged.extras == 1
 
 
 def test_parameters_are_held_against_the_truth():
     true = _true("cogging", 1, amplitude=0.2, k=5.0, phase=3.1)
-    judged = score(_record([true], [_told("cogging", 1, amplitude=0.25, k=5.01, phase=-3.1)]), {})
+    judged = score(_record([true], [_entry("cogging", 1, amplitude=0.25, k=5.01, phase=-3.1)]), {})
     assert judged.near == (False, True, True)  # the phase is .08 rad away, across half a turn
     assert judged.inside == (False, True, False)
 
 
 def test_the_log_ratio_is_1_where_the_effect_is_gone_and_worse_is_told():
-    true, told = _true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 2, k=0.3, theta0=0.1)
+    true, entry = _true("spring", 2, k=0.3, theta0=0.1), _entry("torsional_spring", 2, k=0.3, theta0=0.1)
     control = _record([], [])
     control["report"]["error"]["before"]["theta1"] = [0.1] * 4
-    assert score(_record([true], [told], after=0.1), {"r": control}).ratio == pytest.approx(1.0)
-    assert score(_record([true], [told], after=0.2), {"r": control}).ratio == pytest.approx(0.5)
-    assert score(_record([true], [told], after=0.41), {"r": control}).raised
-    assert not score(_record([true], [told], after=0.4), {"r": control}).worse
+    assert score(_record([true], [entry], after=0.1), {"r": control}).ratio == pytest.approx(1.0)
+    assert score(_record([true], [entry], after=0.2), {"r": control}).ratio == pytest.approx(0.5)
+    assert score(_record([true], [entry], after=0.41), {"r": control}).raised
+    assert not score(_record([true], [entry], after=0.4), {"r": control}).worse
 
 
 def test_touches_are_held_against_the_truth():
@@ -358,10 +358,10 @@ def test_touches_are_held_against_the_truth():
 
 
 def test_the_table_counts_what_was_and_what_was_not_reported():
-    true, told = _true("spring", 2, k=0.3, theta0=0.1), _told("torsional_spring", 2, k=0.3, theta0=0.1)
+    true, entry = _true("spring", 2, k=0.3, theta0=0.1), _entry("torsional_spring", 2, k=0.3, theta0=0.1)
     failed = _record([true], []) | {"case": "r-y-strong", "failed": "not done after 1200 s"}
     del failed["report"]
-    text = table([_record([true], [told]), failed, _record([], [_told("dead_zone", 1, width=0.1)])])
+    text = table([_record([true], [entry]), failed, _record([], [_entry("dead_zone", 1, width=0.1)])])
     assert (
         "| strong | 2 | 1 of 2 | 1 of 2 | 0 of 2 | 1 of 1 | 1.00 (1) |" not in text
     )  # the control's error is the same

@@ -172,8 +172,8 @@ def test_a_force_of_time_and_sensors_of_the_module_are_those_of_the_library(tmp_
     write_mjcf(fitted, tmp_path / "out.xml")
     laws = _module(beside(tmp_path / "out.xml"))
     actuator = laws.Actuator(mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), laws.LAWS)
-    found = actuator.torque(np.zeros(2), np.zeros(2), np.zeros(2), 0.37)
-    np.testing.assert_allclose(found, [float(force.waveform(a(1.3 * 0.37))), 0.0], rtol=1e-9, atol=1e-12)
+    torque = actuator.torque(np.zeros(2), np.zeros(2), np.zeros(2), 0.37)
+    np.testing.assert_allclose(torque, [float(force.waveform(a(1.3 * 0.37))), 0.0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(actuator.reading(np.array([0.5, 0.4])), [0.52, 0.44], rtol=1e-12)
 
 
@@ -249,8 +249,8 @@ def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, mass)
-        own = np.diag([joint.armature for joint in machine.joints])
-        np.testing.assert_allclose(mass, fitted.model.system.mass(a(q)) - own, atol=1e-9)
+        armature = np.diag([joint.armature for joint in machine.joints])
+        np.testing.assert_allclose(mass, fitted.model.system.mass(a(q)) - armature, atol=1e-9)
 
 
 def test_draws_have_the_spread_of_the_posterior(tmp_path):

@@ -31,7 +31,7 @@ def _names(dof: int) -> Names:
     return Names(coordinates, rates, angles, ("u",), (dof,), coordinates + rates)
 
 
-def _found(dof: int, seed: int = 0, **changes) -> Residual:
+def _residual(dof: int, seed: int = 0, **changes) -> Residual:
     """What a right model would leave, of states that move."""
     rng = np.random.default_rng(seed)
     shape = (SEQUENCES, ROWS)
@@ -62,30 +62,30 @@ def _table(dof: int) -> FrictionTable:
 def drawn(request):
     """The number of joints, and all figures that have a panel for each."""
     dof = request.param
-    names, found, table = _names(dof), _found(dof), _table(dof)
-    pair = found.state[0], np.ones((ROWS, 2 * dof))
-    visited = list(found.state[..., dof:].reshape(-1, dof).T)
+    names, residual, table = _names(dof), _residual(dof), _table(dof)
+    pair = residual.state[0], np.ones((ROWS, 2 * dof))
+    visited = list(residual.state[..., dof:].reshape(-1, dof).T)
     values = {name: [0.1, 1.0] for name in names.measured}
     error = {"horizons_s": [0.1, 1.0], "before": values, "after": values}
     both = {"before": pair, "after": pair}
-    lost = _found(dof, used=np.arange(SEQUENCES) > 0)
+    lost = _residual(dof, used=np.arange(SEQUENCES) > 0)
     return dof, {
-        "residual": residual_figure(lost, names, _found(dof, 1)),
-        "innovation": innovation_figure(lost, names, found),  # the two may follow different sequences
+        "residual": residual_figure(lost, names, _residual(dof, 1)),
+        "innovation": innovation_figure(lost, names, residual),  # the two may follow different sequences
         "error": error_figure(error, names),
         "friction": friction_figure({"before": table, "after": table}, names, visited),
-        "prediction": prediction_figure(found.t[0], found.state[0], names, both, 1.0),
+        "prediction": prediction_figure(residual.t[0], residual.state[0], names, both, 1.0),
     }
 
 
 def test_the_longest_test_sequences_are_those_to_choose_from():
     """The five longest of seven are kept, longest first."""
-    found, names = _found(1), _names(1)
+    residual, names = _residual(1), _names(1)
     length = np.asarray([50, 200, 60, 70, 80, 90, 40, 100])
     valid = np.arange(ROWS) < length[:, None]
-    data = Dataset(found.t, found.u, found.state, valid)
+    data = Dataset(residual.t, residual.u, residual.state, valid)
     files = tuple(f"{n}.csv" for n in length)
-    prediction = Prediction(jnp.asarray(found.state), jnp.ones_like(found.state), jnp.asarray(valid))
+    prediction = Prediction(jnp.asarray(residual.state), jnp.ones_like(residual.state), jnp.asarray(valid))
     pictures = _prediction_pictures({"before": prediction}, names, Logs(files, data, ()))
     assert [picture.choice for picture in pictures] == ["200.csv", "100.csv", "90.csv", "80.csv", "70.csv"]
     (alone,) = _prediction_pictures({"before": prediction}, names, Logs(files[:1], Dataset(*(a[:1] for a in data)), ()))
@@ -93,9 +93,9 @@ def test_the_longest_test_sequences_are_those_to_choose_from():
 
 
 def test_sequences_for_which_a_page_has_no_room_are_left_out(monkeypatch):
-    found, names = _found(1), _names(1)
-    prediction = Prediction(*(jnp.asarray(a) for a in (found.state, np.ones_like(found.state), found.valid)))
-    logs = Logs(tuple("abcdefgh"), Dataset(found.t, found.u, found.state, found.valid), ())
+    residual, names = _residual(1), _names(1)
+    prediction = Prediction(*(jnp.asarray(a) for a in (residual.state, np.ones_like(residual.state), residual.valid)))
+    logs = Logs(tuple("abcdefgh"), Dataset(residual.t, residual.u, residual.state, residual.valid), ())
     whole = _prediction_pictures({"before": prediction}, names, logs)
     for count in (1, 3):
         room = sum(len(picture.image) for picture in whole[:count]) + 1
@@ -105,9 +105,9 @@ def test_sequences_for_which_a_page_has_no_room_are_left_out(monkeypatch):
 
 def test_a_rounded_drawing_is_smaller_and_in_the_same_places():
     """Coordinates of all paths within half a hundredth of a point; what scales them is untouched."""
-    found, names = _found(1), _names(1)
-    pair = found.state[0], np.ones((ROWS, 2))
-    figure = prediction_figure(found.t[0], found.state[0], names, {"before": pair}, 1.0)
+    residual, names = _residual(1), _names(1)
+    pair = residual.state[0], np.ones((ROWS, 2))
+    figure = prediction_figure(residual.t[0], residual.state[0], names, {"before": pair}, 1.0)
     image = io.BytesIO()
     figure.savefig(image, format="svg")
     plain, rounded = image.getvalue(), picture("error", "", "", figure).image
@@ -146,10 +146,10 @@ def test_axes_name_joints_and_have_the_units_of_the_machine(drawn):
 
 
 def test_the_cause_of_a_force_has_the_largest_share():
-    found = _found(2)
-    force = found.force.copy()
-    force[..., 0] = 0.3 * force[..., 0] + 2 * np.sin(3 * found.state[..., 0])
-    figure = residual_figure(found._replace(force=force), _names(2), _found(2, 1))
+    residual = _residual(2)
+    force = residual.force.copy()
+    force[..., 0] = 0.3 * force[..., 0] + 2 * np.sin(3 * residual.state[..., 0])
+    figure = residual_figure(residual._replace(force=force), _names(2), _residual(2, 1))
     shares = {ax.get_xlabel(): float(ax.get_title(loc="right").split()[0]) for ax in figure.axes[:6] if ax.get_xlabel()}
     best = max(shares, key=lambda name: shares[name])
     assert best.startswith("θ₁") and shares[best] > 80
@@ -157,17 +157,17 @@ def test_the_cause_of_a_force_has_the_largest_share():
 
 
 def test_of_many_joints_the_likeliest_causes_are_drawn():
-    found = _found(7)
-    force = found.force.copy()
-    force[..., 3] += 4 * np.sin(3 * found.state[..., 5])
-    figure = residual_figure(found._replace(force=force), _names(7))
+    residual = _residual(7)
+    force = residual.force.copy()
+    force[..., 3] += 4 * np.sin(3 * residual.state[..., 5])
+    figure = residual_figure(residual._replace(force=force), _names(7))
     row = [ax for ax in figure.axes[12:16]]
     assert "joint 4" in row[0].get_ylabel() and row[0].get_xlabel().startswith("θ₆")
 
 
 @pytest.mark.parametrize("used", [0, 1, SEQUENCES])
 def test_few_sequences_can_be_drawn(used):
-    figure = residual_figure(_found(2, used=np.arange(SEQUENCES) < used), _names(2), bins=6)
+    figure = residual_figure(_residual(2, used=np.arange(SEQUENCES) < used), _names(2), bins=6)
     assert any(np.isfinite(line.get_ydata()).any() for line in figure.axes[0].get_lines()[:1])
 
 

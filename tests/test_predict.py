@@ -50,12 +50,12 @@ def _case(q: float, information: float) -> _Case:
     noise = 2 * jnp.log(jnp.asarray([DT * q, q]))
     blank = Dataset(*(jnp.zeros((1, 9, *s)) for s in ((), (1,), (1,))), jnp.ones((1, 9), bool))
     y = 0.3 * jnp.sin(jnp.arange(9.0))[None, :, None]
-    now = begin(_rig(), blank._replace(y=y, u=0 * y + 0.2), key=jax.random.key(0))
-    unknown = eqx.tree_at(lambda f: (f.speed, f.knee), now.model.unknown, (jnp.asarray([8.0]), jnp.asarray([0.1])))
+    problem = begin(_rig(), blank._replace(y=y, u=0 * y + 0.2), key=jax.random.key(0))
+    unknown = eqx.tree_at(lambda f: (f.speed, f.knee), problem.model.unknown, (jnp.asarray([8.0]), jnp.asarray([0.1])))
     model = StateSpaceModel(system, unknown, start, noise, 2 * jnp.log(jnp.asarray([1e-3])), (0,), DT)
     data, x = _logs(model)
-    hessian = information * jnp.eye(now.state.hessian.shape[0])
-    return _Case(now._replace(state=now.state._replace(model=model, best=model, hessian=hessian)), data, x)
+    hessian = information * jnp.eye(problem.state.hessian.shape[0])
+    return _Case(problem._replace(state=problem.state._replace(model=model, best=model, hessian=hessian)), data, x)
 
 
 def test_given_rows_are_those_up_to_the_time():
@@ -66,21 +66,21 @@ def test_given_rows_are_those_up_to_the_time():
 
 def test_without_noise_the_prediction_is_the_integral():
     case = _case(q=1e-7, information=1e20)
-    found = predict(case.fitted, case.data, GIVEN, key=jax.random.key(1), samples=SAMPLES)
+    prediction = predict(case.fitted, case.data, GIVEN, key=jax.random.key(1), samples=SAMPLES)
     model = case.fitted.model
     last = int(np.sum(given_samples(case.data, GIVEN)[0])) - 1
-    ahead = np.asarray(found.ahead)
+    ahead = np.asarray(prediction.ahead)
     np.testing.assert_array_equal(ahead, np.arange(ROWS)[None].repeat(3, 0) > last)
-    x, path = found.mean[:, last], []
+    x, path = prediction.mean[:, last], []
     step = jax.jit(jax.vmap(model.transition))
     for k in range(last, ROWS - 1):
         x = step(x, jax.vmap(Inputs.held)(case.data.u[:, k]))
         path.append(x)
     path = jnp.stack(path, axis=1)
-    std = np.asarray(found.std[:, last + 1 :])
+    std = np.asarray(prediction.std[:, last + 1 :])
     # the mean of 400 draws about the smoothed state: four standard errors of what that is known to (rad: 1e-3 / sqrt n)
-    assert np.all(np.abs(found.mean[:, last + 1 :] - path) < 4 * std / np.sqrt(SAMPLES) + 1e-5)
-    assert np.all(np.abs(found.mean - case.x)[ahead] < 5 * np.asarray(found.std)[ahead])
+    assert np.all(np.abs(prediction.mean[:, last + 1 :] - path) < 4 * std / np.sqrt(SAMPLES) + 1e-5)
+    assert np.all(np.abs(prediction.mean - case.x)[ahead] < 5 * np.asarray(prediction.std)[ahead])
     assert std.max() < 0.02
 
 
@@ -90,18 +90,18 @@ def test_groups_of_sequences_change_nothing(monkeypatch):
     program = parallel._program
 
     def counted(function):
-        return lambda mesh, group, *rest: groups.append(group) or program(function)(mesh, group, *rest)
+        return lambda mesh, group, *arguments: groups.append(group) or program(function)(mesh, group, *arguments)
 
     monkeypatch.setattr(parallel, "_program", counted)
 
-    def found():
+    def prediction():
         groups.clear()
         return predict(case.fitted, case.data, GIVEN, key=jax.random.key(1), samples=20)
 
-    together = found()
+    together = prediction()
     assert groups == 4 * [3]  # three tries to smooth, and the prediction
     monkeypatch.setattr(AbstractSmoother, "room", 1)
-    single = found()
+    single = prediction()
     assert groups == 4 * [1]
     for a, b in zip(together, single, strict=True):
         # rounding, in other programs, over 80 rows of a smooth motion
@@ -112,7 +112,7 @@ def test_std_grows_as_the_kicks_add_up():
     """Near rest the pendulum is linear: the covariance obeys P' = F P F' + Q, here against draws."""
     case = _case(q=1e-2, information=1e20)
     quiet = case.data._replace(y=0.001 * case.data.y, u=0.0 * case.data.u)
-    found = predict(case.fitted, quiet, GIVEN, key=jax.random.key(1), samples=SAMPLES)
+    prediction = predict(case.fitted, quiet, GIVEN, key=jax.random.key(1), samples=SAMPLES)
     model = case.fitted.model
     last = int(np.sum(given_samples(quiet, GIVEN)[0])) - 1
     f = np.asarray(jax.jacfwd(model.transition)(jnp.zeros(2), Inputs.held(jnp.zeros(1))))
@@ -126,8 +126,8 @@ def test_std_grows_as_the_kicks_add_up():
         p = f @ p @ f.T + q
         stds.append(np.sqrt(np.diag(p)))
     # a standard deviation of n draws errs by 1 / sqrt(2 n); 330 of them: 4.5 of these
-    np.testing.assert_allclose(found.std[0, last + 1 :], np.asarray(stds), rtol=4.5 / np.sqrt(2 * SAMPLES))
-    total = np.asarray(found.std[0, :, 0])
+    np.testing.assert_allclose(prediction.std[0, last + 1 :], np.asarray(stds), rtol=4.5 / np.sqrt(2 * SAMPLES))
+    total = np.asarray(prediction.std[0, :, 0])
     assert total[-1] > 3 * total[last + 1] > 3 * total[last]
 
 
@@ -136,11 +136,11 @@ def test_the_smoother_of_the_fit_is_the_one_that_smooths():
     case = _case(q=1e-2, information=1.0)
     kalman = smooth(case.fitted, case.data)
     drawn = case.fitted._replace(smoother=ParticleSmoother(CubatureSmoother(case.fitted.bank), num_paths=400))
-    found = smooth(drawn, case.data)
-    assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(found.ess) > 100)
+    posterior = smooth(drawn, case.data)
+    assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(posterior.ess) > 100)
     std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
     # means of 400 paths through 300 particles: a standard error of .08, 480 of them
-    assert np.max(np.abs(np.asarray(found.state.mean - kalman.state.mean)) / std) < 5 * 0.08
+    assert np.max(np.abs(np.asarray(posterior.state.mean - kalman.state.mean)) / std) < 5 * 0.08
     again = predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50)
     np.testing.assert_array_equal(again.mean, predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50).mean)
 
@@ -154,10 +154,10 @@ def test_uncertain_friction_widens_the_prediction():
 def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():
     sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
     blind = sure.data._replace(y=sure.data.y.at[:, 20:].set(jnp.nan))
-    own = smooth(sure.fitted, blind).state.cov
+    certain = smooth(sure.fitted, blind).state.cov
     known, wide = (smoothed_states(case.fitted, blind).cov for case in (sure, unsure))
-    np.testing.assert_allclose(known, own, rtol=1e-6)
-    last, first = (np.asarray(wide / own)[:, row, 0, 0] for row in (-1, 5))
+    np.testing.assert_allclose(known, certain, rtol=1e-6)
+    last, first = (np.asarray(wide / certain)[:, row, 0, 0] for row in (-1, 5))
     assert np.all(last > 100 * first)
 
 
@@ -193,9 +193,9 @@ def test_horizon_errors_are_plain_arithmetic():
     known = given_samples(data, GIVEN)
     prediction = Prediction(jnp.asarray(mean), jnp.ones(mean.shape), jnp.asarray(valid & ~known))
     horizons = (0.1, 0.4, 1.0, 4.0, 0.001)
-    found = horizon_errors(prediction, case.fitted, data, GIVEN, horizons)
-    assert list(found) == ["theta1"]
-    for horizon, rms in zip(horizons, found["theta1"], strict=True):
+    errors = horizon_errors(prediction, case.fitted, data, GIVEN, horizons)
+    assert list(errors) == ["theta1"]
+    for horizon, rms in zip(horizons, errors["theta1"], strict=True):
         squares = [
             ((mean[s, k, 0] - y[s, k, 0] + np.pi) % (2 * np.pi) - np.pi) ** 2
             for s in range(3)

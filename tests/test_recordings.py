@@ -64,12 +64,12 @@ LAYOUTS = {
 @pytest.mark.parametrize("options", LAYOUTS.values(), ids=LAYOUTS)
 def test_every_layout_of_a_file_gives_what_was_written(tmp_path, options):
     path = _log(tmp_path / "a.mcap", **options)
-    found = {topic.name: topic for topic in reader(path).topics(path)}
-    assert found["/js"].fields[2:] == (
+    topics = {topic.name: topic for topic in reader(path).topics(path)}
+    assert topics["/js"].fields[2:] == (
         "position[shoulder]", "position[elbow]", "velocity[shoulder]", "velocity[elbow]"
     )  # fmt: skip
-    assert found["/cmd"].fields == ("layout.data_offset", "data[0]")
-    assert found["/js"].messages in (300, None)
+    assert topics["/cmd"].fields == ("layout.data_offset", "data[0]")
+    assert topics["/js"].messages in (300, None)
     tracks = _read(path, js=("position[elbow]", "velocity[shoulder]"), cmd=("data[0]",))
     np.testing.assert_array_equal(tracks["/js"].values["position[elbow]"], Q[:, 1])
     np.testing.assert_array_equal(tracks["/js"].values["velocity[shoulder]"], 2 * Q[:, 0])
@@ -119,8 +119,8 @@ def test_a_layout_that_differs_from_the_generic_decoder_is_not_used(tmp_path, mo
     from nnap_em.recordings.ros2 import Layout
 
     monkeypatch.setattr(Layout, "read", lambda self, data, start, path: np.zeros(start.size))
-    found = _read(_log(tmp_path / "a.mcap"), js=("position[elbow]",))["/js"].values
-    np.testing.assert_array_equal(found["position[elbow]"], Q[:, 1])
+    values = _read(_log(tmp_path / "a.mcap"), js=("position[elbow]",))["/js"].values
+    np.testing.assert_array_equal(values["position[elbow]"], Q[:, 1])
 
 
 MESSAGE = {  # a definition, a message of it, and numbers in it
@@ -170,11 +170,11 @@ def test_protobuf_and_json(tmp_path):
     fields = {topic.name: topic.fields for topic in reader(path).topics(path)}
     assert fields["/state"] == ("timestamp.seconds", "timestamp.nanos", "q[0]", "q[1]", "u")
     assert fields["/json"] == ("joint.q[a]", "joint.q[b]", "on")
-    found = _read(path, state=("q[1]", "u"), json=("joint.q[a]", "on"))
-    np.testing.assert_array_equal(found["/state"].values["q[1]"], Q[:, 1])
-    np.testing.assert_array_equal(found["/state"].t, stamps)
-    np.testing.assert_array_equal(found["/json"].values["joint.q[a]"], Q[:, 0])
-    assert found["/state"].values["u"][0] == 0.5 and found["/json"].values["on"][0] == 1.0
+    tracks = _read(path, state=("q[1]", "u"), json=("joint.q[a]", "on"))
+    np.testing.assert_array_equal(tracks["/state"].values["q[1]"], Q[:, 1])
+    np.testing.assert_array_equal(tracks["/state"].t, stamps)
+    np.testing.assert_array_equal(tracks["/json"].values["joint.q[a]"], Q[:, 0])
+    assert tracks["/state"].values["u"][0] == 0.5 and tracks["/json"].values["on"][0] == 1.0
 
 
 AXES = {  # how a group says its times, and the unit
@@ -253,11 +253,11 @@ def _cut(path):
 def test_what_is_whole_of_a_cut_file_is_read_and_told(tmp_path):
     path = _cut(tmp_path / "a.mcap")
     assert {topic.name for topic in reader(path).topics(path)} == {"/js", "/cmd", "/rest"}
-    found = reader(path).read(path, {"/cmd": ("data[0]",)})
-    values = found.tracks["/cmd"].values["data[0]"]
+    content = reader(path).read(path, {"/cmd": ("data[0]",)})
+    values = content.tracks["/cmd"].values["data[0]"]
     assert 50 < values.size < 300
     np.testing.assert_array_equal(values, U[: values.size])
-    assert "the file is cut short" in found.notes[0] and "what is whole was read" in found.notes[0]
+    assert "the file is cut short" in content.notes[0] and "what is whole was read" in content.notes[0]
 
 
 def _flipped(path):

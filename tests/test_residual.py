@@ -29,7 +29,7 @@ def _noise(seed, shape=(10, 300)):
     return np.random.default_rng(seed).normal(size=shape)
 
 
-def _found(seed, **changes):
+def _residual(seed, **changes):
     """What a right model would leave, of states that move."""
     rng = np.random.default_rng(1000 + seed)
     shape = (10, 300)
@@ -96,7 +96,7 @@ def test_unrelated_cause_fails_at_most_as_often_as_stated():
 
 
 def test_all_tests_together_seldom_accuse_a_right_model():
-    accused = [any(t.p_value < LEVEL for t in run_tests(_found(seed), NAMES)) for seed in range(40)]
+    accused = [any(t.p_value < LEVEL for t in run_tests(_residual(seed), NAMES)) for seed in range(40)]
     assert np.mean(accused) < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 40)
 
 
@@ -130,11 +130,11 @@ def test_heavy_tails_and_wrong_spread_are_told_from_each_other():
 
 
 def test_a_dependence_is_found_and_placed():
-    found = _found(8)
-    e = found.innovation.copy()
-    e[..., 0] += 0.5 * np.cos(found.predicted[..., 0])
-    e[:, 1:, 1] += 0.5 * found.u[:, :-1, 0]
-    results = run_tests(found._replace(innovation=e), NAMES)
+    whole = _residual(8)
+    e = whole.innovation.copy()
+    e[..., 0] += 0.5 * np.cos(whole.predicted[..., 0])
+    e[:, 1:, 1] += 0.5 * whole.u[:, :-1, 0]
+    results = run_tests(whole._replace(innovation=e), NAMES)
     by = {(t.channel, t.name): t for t in results}
     assert by["theta1", "correlation with cos(theta1)"].p_value < LEVEL
     assert by["dx", "correlation with u"].p_value < LEVEL
@@ -145,21 +145,21 @@ def test_a_dependence_is_found_and_placed():
 
 
 def test_a_slight_but_certain_misfit_is_called_so():
-    found = _found(14)
-    e = found.innovation.copy()
+    whole = _residual(14)
+    e = whole.innovation.copy()
     e[..., 0] *= 1.07
-    test = next(t for t in run_tests(found._replace(innovation=e), NAMES) if t[:2] == ("spread", "theta1"))
+    test = next(t for t in run_tests(whole._replace(innovation=e), NAMES) if t[:2] == ("spread", "theta1"))
     assert test.p_value < LEVEL and test.slight and "small" in test.meaning
 
 
 def test_lost_sequences_take_no_part():
-    found = _found(9)
-    broken = found.innovation.copy()
+    whole = _residual(9)
+    broken = whole.innovation.copy()
     broken[0] = 1e3
     used = np.arange(10) > 0
-    results = run_tests(found._replace(innovation=broken, used=used), NAMES)
+    results = run_tests(whole._replace(innovation=broken, used=used), NAMES)
     assert all(t.p_value > LEVEL for t in results)
-    assert run_tests(found._replace(used=np.zeros(10, bool)), NAMES) == []
+    assert run_tests(whole._replace(used=np.zeros(10, bool)), NAMES) == []
 
 
 def _slide(force, noise=(1e-3, 1e-4), mass=2.0, seconds=3.0, sequences=6):
@@ -210,15 +210,15 @@ def _with_kick(fitted, std):
 def test_a_known_force_comes_back_within_its_standard_deviation():
     fitted, data, truth = _slide(lambda t, x, v: 1.5 * math.sin(2 * t) - 0.8 * x)
     fitted = _with_kick(fitted, float(np.std(truth)) * DT / 2.0)  # as large as the force
-    found = residual(fitted, data)
-    assert found.used.all()
-    error = (found.force[:, :-1, 0] - truth[:, :-1]) / found.force_std[:, :-1, 0]
+    left = residual(fitted, data)
+    assert left.used.all()
+    error = (left.force[:, :-1, 0] - truth[:, :-1]) / left.force_std[:, :-1, 0]
     assert np.sqrt(np.mean(error**2)) < 1.1
-    assert np.isnan(found.force[:, -1]).all()
-    smooth = np.mean((found.force[:, :-1, 0] - truth[:, :-1]).reshape(6, 15, 20), axis=-1)
+    assert np.isnan(left.force[:, -1]).all()
+    smooth = np.mean((left.force[:, :-1, 0] - truth[:, :-1]).reshape(6, 15, 20), axis=-1)
     assert np.sqrt(np.mean(smooth**2)) < 0.02 * np.std(truth)
-    np.testing.assert_allclose(found.state, data.y, atol=5e-3)
-    np.testing.assert_allclose(found.u, data.u)
+    np.testing.assert_allclose(left.state, data.y, atol=5e-3)
+    np.testing.assert_allclose(left.u, data.u)
 
 
 def test_a_force_comes_back_by_particles_too():
@@ -226,11 +226,11 @@ def test_a_force_comes_back_by_particles_too():
     fitted, data, truth = _slide(lambda t, x, v: 1.5 * math.sin(2 * t) - 0.8 * x)
     fitted = _with_kick(fitted, float(np.std(truth)) * DT / 2.0)
     kalman = residual(fitted, data)
-    found = residual(fitted._replace(smoother=ParticleSmoother(fitted.smoother)), data)
-    assert found.used.all()
-    error = (found.force[:, :-1, 0] - kalman.force[:, :-1, 0]) / kalman.force_std[:, :-1, 0]
+    particles = residual(fitted._replace(smoother=ParticleSmoother(fitted.smoother)), data)
+    assert particles.used.all()
+    error = (particles.force[:, :-1, 0] - kalman.force[:, :-1, 0]) / kalman.force_std[:, :-1, 0]
     assert np.sqrt(np.mean(error**2)) < 0.3  # of draws: 100 paths through 300 particles
-    np.testing.assert_allclose(found.innovation, kalman.innovation, atol=1e-6)  # a slide is linear: no path matters
+    np.testing.assert_allclose(particles.innovation, kalman.innovation, atol=1e-6)  # a slide is linear: no path matters
 
 
 def test_adding_an_effect_back_gives_its_force():
@@ -241,25 +241,25 @@ def test_adding_an_effect_back_gives_its_force():
     fitted = fitted._replace(state=fitted.state._replace(best=model))
     left = residual(fitted, data)
     assert np.sqrt(np.nanmean(left.force**2)) < 0.05 * np.std(truth)
-    found = left.without_effects()
-    np.testing.assert_allclose(np.nanmean(found.force[:, :-1, 0] - truth[:, :-1], axis=1), 0, atol=0.01)
-    np.testing.assert_allclose(found.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
+    whole = left.without_effects()
+    np.testing.assert_allclose(np.nanmean(whole.force[:, :-1, 0] - truth[:, :-1], axis=1), 0, atol=0.01)
+    np.testing.assert_allclose(whole.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
 
 
 def test_there_is_an_innovation_where_there_is_a_reading():
     fitted, data, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
     y = np.where(_noise(15, data.y.shape) > 1, np.nan, data.y)
-    found = residual(fitted, data._replace(y=y))
+    left = residual(fitted, data._replace(y=y))
     assert np.isnan(y).any()
-    np.testing.assert_array_equal(np.isfinite(found.innovation), np.isfinite(y))
+    np.testing.assert_array_equal(np.isfinite(left.innovation), np.isfinite(y))
 
 
 def test_joints_are_called_by_number_and_by_the_name_of_their_own():
     names = NAMES._replace(coordinates=("theta1", "elbow", "x3"), rates=("dtheta1", "delbow", "dx3"))
     assert [names.joint(j) for j in (1, 2, 3)] == ["joint 1", "joint 2 (elbow)", "joint 3"]
     text = "motor gain at joint 2: joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
-    told = "motor gain at joint 2 (elbow): joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
-    assert with_names(text, names.coordinates) == told
+    expected = "motor gain at joint 2 (elbow): joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
+    assert with_names(text, names.coordinates) == expected
 
 
 def test_names_carry_units():

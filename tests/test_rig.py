@@ -197,13 +197,13 @@ MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what 
 }
 
 
-@pytest.mark.parametrize(("good", "bad", "place", "found", "hint"), MISTAKES.values(), ids=MISTAKES.keys())
-def test_a_mistake_is_refused_with_file_place_finding_and_hint(tmp_path, good, bad, place, found, hint):
+@pytest.mark.parametrize(("good", "bad", "place", "finding", "hint"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_refused_with_file_place_finding_and_hint(tmp_path, good, bad, place, finding, hint):
     assert good in GOOD
     with pytest.raises(RigError) as refused:
         _read(tmp_path, GOOD.replace(good, bad, 1))
     message = str(refused.value)
-    for part in (str(tmp_path / "rig.toml"), place, found, hint):
+    for part in (str(tmp_path / "rig.toml"), place, finding, hint):
         assert part in message
 
 

@@ -47,10 +47,10 @@ def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
 
 def test_only_what_the_whole_length_cannot_tell_stays_equivalent(weak_drive):
     data, bare, full = weak_drive
-    (own,) = map(key_of, full.model.effects)
+    (law,) = map(key_of, full.model.effects)
     delay = next(key_of(effect) for effect in possible(bare, data) if effect.name == "input_delay")
-    told = compare_equivalents(_closed(bare, full, delay, own), data)
-    assert told.found[0].equivalent == (own,)  # the same law in its own place is as likely
+    compared = compare_equivalents(_closed(bare, full, delay, law), data)
+    assert compared.found[0].equivalent == (law,)  # the same law in its own place is as likely
     untouched = _closed(bare, full)
     assert compare_equivalents(untouched, data) is untouched
 
@@ -60,8 +60,8 @@ def test_a_rival_that_is_clearly_likelier_takes_the_place(weak_drive):
     data, bare, full = weak_drive
     delay = instead(bare, data, None, lambda effect: effect.name == "input_delay")
     (gain,) = map(key_of, full.model.effects)
-    told = compare_equivalents(_closed(bare, delay, gain), data)
-    (effect,) = told.after.model.effects
+    compared = compare_equivalents(_closed(bare, delay, gain), data)
+    (effect,) = compared.after.model.effects
     assert effect.name == "motor_gain" and abs(float(effect.values()["gain"]) - GAIN) < 0.05
-    assert told.found[0].gain > 1.0 + EQUIVALENT_NATS  # the lead over the law that it replaces is added
-    assert told.found[0].equivalent == ()
+    assert compared.found[0].gain > 1.0 + EQUIVALENT_NATS  # the lead over the law that it replaces is added
+    assert compared.found[0].equivalent == ()

@@ -34,7 +34,7 @@ def _motion(seed: int, level: float = 1.0) -> dict[str, np.ndarray]:
     return {n: y.sum(axis=0) + level * NOISE[n] * rng.standard_normal(ROWS) for n, y in clean.items()}
 
 
-def _found(readings: Columns) -> dict[tuple[str, str], set[int]]:
+def _faults(readings: Columns) -> dict[tuple[str, str], set[int]]:
     return {(entry.kind, entry.column): set(entry.rows.tolist()) for entry in rough(readings, DT)}
 
 
@@ -45,7 +45,7 @@ def test_smooth_motion_is_left_alone(seed, level, step):
     readings = _motion(seed, level)
     if step:
         readings["theta1"] = step * np.round(readings["theta1"] / step)
-    assert _found(readings) == {}
+    assert _faults(readings) == {}
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -56,7 +56,7 @@ def test_spikes_are_found_row_by_row(name, level):
         readings, rng = _motion(seed, level), np.random.default_rng(seed)
         rows = rng.choice(np.arange(5, ROWS - 5, 7), 5, replace=False)
         readings[name][rows] += 40 * NOISE[name] * rng.choice([-1, 1], 5)
-        assert _found(readings) == {("spike", name): set(rows.tolist())}
+        assert _faults(readings) == {("spike", name): set(rows.tolist())}
 
 
 def test_two_or_three_rows_are_a_spike_and_ten_are_none():
@@ -69,9 +69,9 @@ def test_two_or_three_rows_are_a_spike_and_ten_are_none():
 def test_a_missing_neighbour_hides_no_spike():
     readings = _motion(3)
     readings["theta1"][[148, 153]], readings["theta1"][150] = np.nan, 9.0
-    assert _found(readings) == {("spike", "theta1"): {150}}
+    assert _faults(readings) == {("spike", "theta1"): {150}}
     readings["theta1"][1::2] = np.nan
-    assert _found(readings) == {("spike", "theta1"): {150}}
+    assert _faults(readings) == {("spike", "theta1"): {150}}
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -82,9 +82,9 @@ def test_an_impact_is_no_spike(level):
         rate = 3.0 * np.sign(((np.arange(ROWS) // length) % 2) - 0.5) + 0.2 * np.sin(5 * t)
         angle = DT * np.cumsum(rate)
         noise = {n: level * s * rng.standard_normal(ROWS) for n, s in NOISE.items()}
-        assert _found({"theta1": angle + noise["theta1"], "dtheta1": rate + noise["dtheta1"]}) == {}
+        assert _faults({"theta1": angle + noise["theta1"], "dtheta1": rate + noise["dtheta1"]}) == {}
     held = np.clip(np.arange(ROWS) - 200.0, 0.0, 60.0)
-    assert _found({"x": held}) == {}
+    assert _faults({"x": held}) == {}
 
 
 def _resampled(way: np.ndarray, step: float, part: float = 0.37) -> np.ndarray:
@@ -97,10 +97,10 @@ def _resampled(way: np.ndarray, step: float, part: float = 0.37) -> np.ndarray:
 def test_the_turning_points_of_a_coarse_encoder_are_no_limit(step):
     """Half of these 24 were saturated when a straight line extrapolated them; cut off, all but some are."""
     angles = [_motion(seed, 0.0)["theta1"] for seed in range(24)]
-    assert [_found({"theta1": _resampled(y, step)}) for y in angles] == [{}] * 24
+    assert [_faults({"theta1": _resampled(y, step)}) for y in angles] == [{}] * 24
     cut = [_resampled(np.minimum(y, np.percentile(y, 90)), step) for y in angles]
-    found = [("saturated", "theta1") in _found({"theta1": y}) for y in cut]
-    assert sum(found) >= 22
+    hits = [("saturated", "theta1") in _faults({"theta1": y}) for y in cut]
+    assert sum(hits) >= 22
 
 
 def _ease(x: np.ndarray) -> np.ndarray:
@@ -115,9 +115,9 @@ def test_a_pause_at_the_end_of_the_way_is_no_limit():
     for seed in range(10):
         length, pause = np.random.default_rng(seed).uniform((0.5, 0.05), (1.5, 0.3))
         way = _ease((t - 0.5) / length) - _ease((t - 0.5 - length - pause) / length)
-        assert _found({"x": way}) == {}
+        assert _faults({"x": way}) == {}
         moving = way[50 : int(100 * (0.5 + 2 * length + pause))]
-        ((what, rows),) = _found({"x": np.minimum(moving, 0.9)}).items()
+        ((what, rows),) = _faults({"x": np.minimum(moving, 0.9)}).items()
         assert what == ("saturated", "x")
         assert rows == set(np.flatnonzero(moving >= 0.9).tolist())
 
@@ -130,7 +130,7 @@ def test_a_joint_that_stands_still_is_not_stuck():
         rng = np.random.default_rng(seed)
         way = [0.3, 0.3, -0.4] @ (starts**3 * (10 - 15 * starts + 6 * starts**2))
         way += 3.6e-6 * np.sin(2 * np.pi * rng.uniform(2, 6) * t + rng.uniform(0, 6))
-        assert _found({"q": _resampled(way, 4e-6, rng.uniform(0.05, 0.95))}) == {}
+        assert _faults({"q": _resampled(way, 4e-6, rng.uniform(0.05, 0.95))}) == {}
 
 
 def test_standing_still_tells_no_noise():
@@ -185,7 +185,7 @@ def test_wiggles_without_noise_to_hide_them_are_left_alone(case, tmp_path):
 def test_a_stuck_sensor_is_found_by_what_the_other_says(name, level):
     readings = _motion(4, level)
     readings[name][151:201] = readings[name][150]
-    ((kind, column), rows), *more = _found(readings).items()
+    ((kind, column), rows), *more = _faults(readings).items()
     assert (column, more) == (name, [])
     assert kind in ("stuck", "saturated")
     assert set(range(151, 201)) <= rows <= set(range(150, 201))
@@ -195,10 +195,10 @@ def test_a_stuck_sensor_is_found_alone():
     """By the jump where it wakes up; and where it wakes up at the same place, by the noise that it lacks."""
     theta = _motion(5)["theta1"]
     theta[151:201] = theta[150]
-    assert _found({"theta1": theta}) == {("stuck", "theta1"): set(range(151, 201))}
+    assert _faults({"theta1": theta}) == {("stuck", "theta1"): set(range(151, 201))}
     rest = np.random.default_rng(0).normal(0.0, 0.005, ROWS)
     rest[151:201] = rest[150]
-    assert _found({"theta1": rest}) == {("stuck", "theta1"): set(range(151, 201))}
+    assert _faults({"theta1": rest}) == {("stuck", "theta1"): set(range(151, 201))}
 
 
 def test_a_machine_at_rest_is_not_stuck():
@@ -207,16 +207,16 @@ def test_a_machine_at_rest_is_not_stuck():
     theta = np.where(t < 1, 0.0, np.where(t < 4, 1 - np.cos(np.pi * (t - 1)), 2.0))
     counts = 1e-3 * np.round(theta / 1e-3)
     rate = np.where((t > 1) & (t < 4), np.pi * np.sin(np.pi * (t - 1)), 0.0)
-    assert _found({"theta1": counts, "dtheta1": rate}) == {}
-    assert _found({"theta1": counts}) == {}
-    assert _found({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
+    assert _faults({"theta1": counts, "dtheta1": rate}) == {}
+    assert _faults({"theta1": counts}) == {}
+    assert _faults({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["with its rate", "alone"])
 def test_a_late_sensor_is_found(alone):
     readings = _motion(6)
     readings["theta1"][:30] = 0.0
-    assert _found({"theta1": readings["theta1"]} if alone else readings) == {("late start", "theta1"): set(range(30))}
+    assert _faults({"theta1": readings["theta1"]} if alone else readings) == {("late start", "theta1"): set(range(30))}
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["with its angle", "alone"])
@@ -225,7 +225,7 @@ def test_a_saturated_sensor_is_found(alone):
     limit = float(np.percentile(readings["dtheta1"], 90))
     beyond = set(np.flatnonzero(readings["dtheta1"] > limit).tolist())
     readings["dtheta1"] = np.minimum(readings["dtheta1"], limit)
-    ((what, rows),) = _found({"dtheta1": readings["dtheta1"]} if alone else readings).items()
+    ((what, rows),) = _faults({"dtheta1": readings["dtheta1"]} if alone else readings).items()
     assert what == ("saturated", "dtheta1")
     assert beyond <= rows
     assert len(rows - beyond) < 0.2 * len(beyond)  # rows between two that are full
@@ -365,8 +365,8 @@ def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
 
     def error(logs: Logs) -> float:
         fitted = identify(rig, logs.data, key=jax.random.key(0), epochs=6)
-        found = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-        return horizon_errors(found, fitted, test.data, 1.0)["x"][3]
+        prediction = predict(fitted, test.data, 1.0, key=jax.random.key(0))
+        return horizon_errors(prediction, fitted, test.data, 1.0)["x"][3]
 
     assert error(spoilt) < 1.3 * error(train)
     rows = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]

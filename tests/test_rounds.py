@@ -44,11 +44,11 @@ def _function(*names: str) -> AbstractEffect:
 
 
 def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None, left_out=None, band: int = 0):
-    own = Share(share, share if left_out is None else left_out, folds or (share,) * 3)
-    return Screened(Candidate(law, (law,), law), np.ones(1), 1, own, band, FLOOR, chance, 100.0)
+    explained = Share(share, share if left_out is None else left_out, folds or (share,) * 3)
+    return Screened(Candidate(law, (law,), law), np.ones(1), 1, explained, band, FLOOR, chance, 100.0)
 
 
-def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, members=None):
+def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MULTI, members=None):
     """A round over these candidates, and the names of those that were refitted in turn.
 
     A refit removes what the screen said, or leaves `errors` by name; its gain is 100 nat, or that of `gains`.
@@ -59,7 +59,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, me
         law = screened.candidate.start
         tried.append(law.name)
         removed = 1 - (errors or {}).get(law.name, 1 - screened.share.least)
-        after = now.plus(law, screened.candidate)
+        after = hypothesis.plus(law, screened.candidate)
         return Refit(screened, None, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
 
     size = sum(len(s.candidate.probes) for s in entries)
@@ -70,7 +70,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, me
     monkeypatch.setattr(rounds, "screen", lambda *_: seen)
     monkeypatch.setattr(rounds, "fitted", lambda *_: None)
     monkeypatch.setattr(rounds, "with_candidate", refit)
-    fit = SmoothedFit(BARE, now, None, DATA, np.ones(6, bool), 9)
+    fit = SmoothedFit(BARE, hypothesis, None, DATA, np.ones(6, bool), 9)
     before = SimpleNamespace(rig=RIG)
     context = SearchContext(before, {}, DATA, loss, EFFORT, lambda text: None)
     return screening_round(fit, context), tried
@@ -81,9 +81,9 @@ def _run(monkeypatch, entries, errors=None, gains=None, now=BARE, loss=MULTI, me
     [(0.151, 0.0, True), (0.149, 0.0, False), (0.3, 0.149, True), (0.3, 0.151, False)],
 )
 def test_a_law_is_accepted_from_the_floor_and_from_twice_the_chance_level_on(monkeypatch, share, chance, accepted):
-    found, tried = _run(monkeypatch, [_screened(_law("motor_gain"), share, chance)])
-    assert (found.accepted is not None) == bool(tried) == accepted
-    assert found.step.accepted == (key_of(_law("motor_gain")) if accepted else None)
+    outcome, tried = _run(monkeypatch, [_screened(_law("motor_gain"), share, chance)])
+    assert (outcome.accepted is not None) == bool(tried) == accepted
+    assert outcome.step.accepted == (key_of(_law("motor_gain")) if accepted else None)
 
 
 def test_the_smaller_of_both_shares_counts_where_the_parts_agree(monkeypatch):
@@ -94,8 +94,8 @@ def test_the_smaller_of_both_shares_counts_where_the_parts_agree(monkeypatch):
 
 @pytest.mark.parametrize(("free", "tried"), [(0.55, "air_drag"), (0.56, "unknown_function")])
 def test_a_law_with_a_name_is_preferred_where_it_is_even_with_six_tenths_of_another(monkeypatch, free, tried):
-    found, _ = _run(monkeypatch, [_screened(_function("x"), free), _screened(_law("air_drag"), 0.3)])
-    assert found.accepted.effect.name == tried
+    outcome, _ = _run(monkeypatch, [_screened(_function("x"), free), _screened(_law("air_drag"), 0.3)])
+    assert outcome.accepted.effect.name == tried
 
 
 @pytest.mark.parametrize(("named", "accepted"), [(0.46, "torsional_spring"), (0.44, "unknown_function")])
@@ -103,23 +103,23 @@ def test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reac
     monkeypatch, named, accepted
 ):
     """The parts left out of both are the same, so that they differ by what they explain: a bump is no ripple."""
-    found, _ = _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), named)])
-    assert found.accepted.effect.name == accepted
+    outcome, _ = _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), named)])
+    assert outcome.accepted.effect.name == accepted
 
 
 @pytest.mark.parametrize(("error", "accepted"), [(0.54, "torsional_spring"), (0.56, "unknown_function")])
 def test_a_refit_may_show_that_a_named_law_is_even_with_the_function_that_contains_it(monkeypatch, error, accepted):
     """The screen is linear: it gave the spring .4, and its refit removes more."""
     entries = [_screened(_function("x"), 0.5), _screened(_spring(), 0.4)]
-    found, tried = _run(monkeypatch, entries, {"torsional_spring": error})
-    assert set(tried) == {"torsional_spring", "unknown_function"} and found.accepted.effect.name == accepted
+    outcome, tried = _run(monkeypatch, entries, {"torsional_spring": error})
+    assert set(tried) == {"torsional_spring", "unknown_function"} and outcome.accepted.effect.name == accepted
     assert _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), 0.29)])[1] == ["unknown_function"]
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.251, True), (0.249, False)])
 def test_a_law_without_a_name_has_a_higher_bar(monkeypatch, share, accepted):
-    found, _ = _run(monkeypatch, [_screened(_function("x"), share)])
-    assert (found.accepted is not None) == accepted
+    outcome, _ = _run(monkeypatch, [_screened(_function("x"), share)])
+    assert (outcome.accepted is not None) == accepted
 
 
 def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(monkeypatch):
@@ -128,14 +128,14 @@ def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(m
     assert contains(one, _spring(), MODEL.system) and not contains(one, _law("motor_gain"), MODEL.system)
     assert not contains(two, _spring(), MODEL.system)  # another signal is another cause
     for share, names in ((0.46, ("x",)), (0.44, ("x", "dx"))):
-        found, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
-        assert found.accepted.effect.inputs_named() == names
+        outcome, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
+        assert outcome.accepted.effect.inputs_named() == names
 
 
 def test_a_simpler_law_is_refitted_where_the_function_that_beat_it_is_rejected(monkeypatch):
     entries = [_screened(_function("x"), 0.5), _screened(_spring(), 0.2)]
-    found, tried = _run(monkeypatch, entries, errors={"unknown_function": 0.95})
-    assert tried == ["unknown_function", "torsional_spring"] and found.accepted.effect.name == "torsional_spring"
+    outcome, tried = _run(monkeypatch, entries, errors={"unknown_function": 0.95})
+    assert tried == ["unknown_function", "torsional_spring"] and outcome.accepted.effect.name == "torsional_spring"
 
 
 def test_a_band_shows_a_free_function_at_its_own_bar():
@@ -149,15 +149,17 @@ def test_a_band_shows_a_free_function_at_its_own_bar():
 def test_of_a_chain_of_laws_that_contain_each_other_one_stands(monkeypatch):
     """Each is even with the next, and the first is not even with the last."""
     laws = [_screened(_function("x"), 0.42), _screened(_function("x", "dx"), 0.46), _screened(_spring(), 0.38)]
-    found, _ = _run(monkeypatch, laws)
-    assert found.accepted.effect.name == "torsional_spring"
+    outcome, _ = _run(monkeypatch, laws)
+    assert outcome.accepted.effect.name == "torsional_spring"
 
 
-@pytest.mark.parametrize(("rest", "accepted"), [(0.28, "unknown_function"), (0.26, "air_drag")])
-def test_the_remainder_of_a_law_comes_before_other_causes(monkeypatch, rest, accepted):
-    now = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
-    found, _ = _run(monkeypatch, [_screened(_law("air_drag"), 0.5), _screened(_function("x"), rest)], now=now)
-    assert found.accepted.effect.name == accepted
+@pytest.mark.parametrize(("remainder", "accepted"), [(0.28, "unknown_function"), (0.26, "air_drag")])
+def test_the_remainder_of_a_law_comes_before_other_causes(monkeypatch, remainder, accepted):
+    hypothesis = BARE.plus(_spring(), Candidate(_spring(), (_spring(),), _spring()))
+    outcome, _ = _run(
+        monkeypatch, [_screened(_law("air_drag"), 0.5), _screened(_function("x"), remainder)], hypothesis=hypothesis
+    )
+    assert outcome.accepted.effect.name == accepted
 
 
 def test_errors_soon_after_a_start_decide_where_later_ones_show_nothing(monkeypatch):
@@ -165,17 +167,17 @@ def test_errors_soon_after_a_start_decide_where_later_ones_show_nothing(monkeypa
     soon, late = _screened(_law("dead_zone"), 0.4, band=1), _screened(_law("motor_gain"), 0.2)
     assert _run(monkeypatch, [soon, late])[1] == ["motor_gain"]
     assert _run(monkeypatch, [soon])[1] == ["dead_zone"]
-    found, tried = _run(monkeypatch, [soon, late], errors={"motor_gain": 0.95})
-    assert tried == ["motor_gain", "dead_zone"] and found.accepted.effect.name == "dead_zone"
+    outcome, tried = _run(monkeypatch, [soon, late], errors={"motor_gain": 0.95})
+    assert tried == ["motor_gain", "dead_zone"] and outcome.accepted.effect.name == "dead_zone"
 
 
 def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.3)]
-    found, tried = _run(monkeypatch, entries, errors={"motor_gain": 0.92})
-    assert tried == ["motor_gain", "dead_zone"] and found.accepted.effect.name == "dead_zone"
-    found, _ = _run(monkeypatch, entries, errors={"motor_gain": 0.92, "dead_zone": 1.2})
-    assert found.accepted is None and not found.step.suspects  # what was refitted and rejected is no suspect
-    assert dict(found.step.refitted)[key_of(_law("motor_gain"))] == pytest.approx(0.08)
+    outcome, tried = _run(monkeypatch, entries, errors={"motor_gain": 0.92})
+    assert tried == ["motor_gain", "dead_zone"] and outcome.accepted.effect.name == "dead_zone"
+    outcome, _ = _run(monkeypatch, entries, errors={"motor_gain": 0.92, "dead_zone": 1.2})
+    assert outcome.accepted is None and not outcome.step.suspects  # what was refitted and rejected is no suspect
+    assert dict(outcome.step.refitted)[key_of(_law("motor_gain"))] == pytest.approx(0.08)
 
 
 @pytest.mark.parametrize(
@@ -189,8 +191,8 @@ def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):
 )
 def test_refits_decide_between_laws_that_the_screen_cannot_tell_apart(monkeypatch, share, errors, gains, accepted):
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), share)]
-    found, tried = _run(monkeypatch, entries, errors, gains)
-    assert found.accepted.effect.name == accepted
+    outcome, tried = _run(monkeypatch, entries, errors, gains)
+    assert outcome.accepted.effect.name == accepted
     assert len(tried) == (1 if share < 0.45 else 2)
 
 
@@ -201,28 +203,28 @@ def test_refits_decide_between_laws_that_the_screen_cannot_tell_apart(monkeypatc
 def test_laws_of_other_causes_that_explain_the_same_leave_the_question_open(monkeypatch, law, error, open_):
     """A gain and a spring; two laws of the input are told by their likelihood."""
     entries = [_screened(_law("motor_gain"), 0.5), _screened(law, 0.5)]
-    found, _ = _run(monkeypatch, entries, {law.name: error})
-    assert (found.accepted is None) == bool(found.step.rivals) == open_
+    outcome, _ = _run(monkeypatch, entries, {law.name: error})
+    assert (outcome.accepted is None) == bool(outcome.step.rivals) == open_
     if open_:
-        assert set(found.step.rivals) == {key_of(e.candidate.start) for e in entries}
-    found, _ = _run(monkeypatch, entries, {law.name: error}, loss=OneStep())
-    assert found.accepted is not None  # likelihood tells them
+        assert set(outcome.step.rivals) == {key_of(e.candidate.start) for e in entries}
+    outcome, _ = _run(monkeypatch, entries, {law.name: error}, loss=OneStep())
+    assert outcome.accepted is not None  # likelihood tells them
 
 
 def test_laws_whose_columns_are_the_same_are_equivalent(monkeypatch):
     """Two of three candidates have proportional columns."""
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.2), _screened(_spring(), 0.2)]
-    found, _ = _run(monkeypatch, entries)
+    outcome, _ = _run(monkeypatch, entries)
     alike = np.array([[4.0, 2.0, 0.1], [2.0, 1.0, 0.0], [0.1, 0.0, 1.0]], np.float32)
-    seen = found.screen._replace(information=(alike,))
+    seen = outcome.screen._replace(information=(alike,))
     assert rounds.overlaps(seen, seen.screened[0]) == pytest.approx([0.0, 0.0, 1 - 0.01 / 4], abs=1e-5)
 
 
 def test_the_best_of_every_kind_stands_for_it(monkeypatch):
     entries = [_screened(_law("air_drag", v), share) for v, share in ((1.0, 0.1), (2.0, 0.4), (3.0, 0.2))]
-    found, _ = _run(monkeypatch, entries)
-    assert found.step.screened == ((key_of(_law("air_drag")), 0.4),)
-    assert float(found.accepted.effect.c) == 2.0
+    outcome, _ = _run(monkeypatch, entries)
+    assert outcome.step.screened == ((key_of(_law("air_drag")), 0.4),)
+    assert float(outcome.accepted.effect.c) == 2.0
 
 
 SCREENED = (("unknown_function", 0.14), ("dead_zone", 0.12), ("motor_gain", 0.10), ("air_drag", 0.08))
@@ -240,19 +242,19 @@ def test_suspects_are_near_the_best_and_over_chance_with_named_laws_first(monkey
     laws = [_function("x") if name == "unknown_function" else _law(name) for name, _ in SCREENED]
     entries = [_screened(law, share, chance) for law, (_, share) in zip(laws, SCREENED, strict=True)]
     entries = [e._replace(share=Share(e.share.inside, e.share.left_out, (0.2, 0.2, 0.2))) for e in entries]
-    found, tried = _run(monkeypatch, entries)
+    outcome, tried = _run(monkeypatch, entries)
     assert not tried
-    assert [suspect.key[0] for suspect in found.step.suspects] == names
-    assert all(suspect.chance == chance for suspect in found.step.suspects)
+    assert [suspect.key[0] for suspect in outcome.step.suspects] == names
+    assert all(suspect.chance == chance for suspect in outcome.step.suspects)
 
 
 def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it(monkeypatch):
     members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
     law = _screened(_law("motor_gain"), 0.5, folds=(0.8, 0.8, -0.6))
-    found, tried = _run(monkeypatch, [law, _screened(_law("dead_zone"), 0.05)], members=members)
+    outcome, tried = _run(monkeypatch, [law, _screened(_law("dead_zone"), 0.05)], members=members)
     assert not tried
-    assert len(found.step.disputed) == 1
-    told = found.step.disputed[0]
-    assert (told.key, told.share, told.against, told.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
+    assert len(outcome.step.disputed) == 1
+    dispute = outcome.step.disputed[0]
+    assert (dispute.key, dispute.share, dispute.against, dispute.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
     weak = _screened(_law("motor_gain"), 0.14, folds=(0.8, 0.8, -0.6))
     assert not _run(monkeypatch, [weak], members=members)[0].step.disputed

@@ -34,8 +34,8 @@ def test_rows_in_blocks_are_the_rows_all_at_once(length, states):
 def test_only_few_states_are_cut_in_blocks(states, loops):
     """Programs of many states in blocks take gigabytes to compile."""
     x, scale = jnp.ones((70, states)), jnp.ones(70)
-    told = str(jax.make_jaxpr(lambda x, scale: rows(_one, _path(x), scale))(x, scale))
-    assert told.count("scan[") == loops
+    program = str(jax.make_jaxpr(lambda x, scale: rows(_one, _path(x), scale))(x, scale))
+    assert program.count("scan[") == loops
 
 
 def test_blocks_may_be_batched_and_differentiated():

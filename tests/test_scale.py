@@ -66,8 +66,8 @@ def test_an_arm_with_an_idle_motor_or_none(joints, columns):
     system = build_system(rig)
     names = not_identifiable(rig, system, still)
     assert names and names[0][0] in "mI"
-    told = [f for f in torques(rig, system, still, measure_scales(rig, system, still)) if f.subject == "scale"]
-    assert len(told) == 1 and names[0] in told[0].text and "cannot tell the scale" in told[0].text
+    remarks = [f for f in torques(rig, system, still, measure_scales(rig, system, still)) if f.subject == "scale"]
+    assert len(remarks) == 1 and names[0] in remarks[0].text and "cannot tell the scale" in remarks[0].text
 
 
 @pytest.mark.slow

@@ -52,8 +52,8 @@ def _log(path: Path, gain: float | str = GAIN, supply: float | str = SUPPLY, row
     """A folder with one log; `at` is the row in which the columns are as given, all others hold the defaults."""
     lines = ["time,goal,gain,supply,theta1"]
     for k in range(rows):
-        own = (gain, supply) if k == at or at == 0 else (GAIN, SUPPLY)
-        lines.append(f"{0.01 * k:.12g},{np.sin(0.3 * k):.9g},{own[0]},{own[1]},{0.4 * np.sin(0.3 * k - 0.5):.9g}")
+        row = (gain, supply) if k == at or at == 0 else (GAIN, SUPPLY)
+        lines.append(f"{0.01 * k:.12g},{np.sin(0.3 * k):.9g},{row[0]},{row[1]},{0.4 * np.sin(0.3 * k - 0.5):.9g}")
     (path / "train").mkdir(exist_ok=True)
     (path / "train" / "a.csv").write_text("\n".join(lines) + "\n")
     return path / "train"
@@ -75,19 +75,19 @@ def test_numbers_are_proportional_to_their_columns(tmp_path):
     kp, limit, clipped = 3.0 * GAIN / 200.0 * SUPPLY / 7.4, 0.6 * SUPPLY / 7.4, 0
     for k, (q, v) in enumerate(np.random.default_rng(0).uniform(-1.0, 1.0, (12, 2))):
         torque = kp * (data.u[0, k, 0] - q) - 0.25 * v
-        found = model.scene(jnp.asarray([q, v]), jax.tree.map(lambda a, k=k: a[k], u)).drive
-        np.testing.assert_allclose(found, [np.clip(torque, -limit, limit)], rtol=1e-12)
+        drive = model.scene(jnp.asarray([q, v]), jax.tree.map(lambda a, k=k: a[k], u)).drive
+        np.testing.assert_allclose(drive, [np.clip(torque, -limit, limit)], rtol=1e-12)
         clipped += abs(torque) > limit
     assert 0 < clipped < 12
 
 
 def test_declared_elsewhere_a_number_gives_the_same_motion(tmp_path):
     """Twice the number at twice the value is the same servo; so is a plain number where columns never change."""
-    here, data = _begun(tmp_path, f"{KP}\n{LIMIT}")
+    once, data = _begun(tmp_path, f"{KP}\n{LIMIT}")
     twice, _ = _begun(tmp_path, KP.replace("3.0", "6.0").replace("200.0", "400.0") + f"\n{LIMIT}")
     plain, bare = _begun(tmp_path, f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}\nlimit = {0.6 * SUPPLY / 7.4!r}")
     x, ends = jnp.asarray([0.2, -0.4]), []
-    for fit, logs in ((here, data), (twice, data), (plain, bare)):
+    for fit, logs in ((once, data), (twice, data), (plain, bare)):
         model = fit.state.model
         u = jax.tree.map(lambda a: a[5], model.inputs(_first(logs)))
         ends.append(model.transition(x, u))

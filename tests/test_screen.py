@@ -26,12 +26,12 @@ ROWS = 60
 
 def _innovations(model, full, rule, path: Gaussian, seq: Dataset):
     """Whitened innovations of `model` linearised about a path, moved by what `full` does otherwise on that path."""
-    here = local(model, rule.prior, path, seq, CUBATURE)
+    linear = local(model, rule.prior, path, seq, CUBATURE)
     both = [jax.vmap(m.transition)(path.mean, m.inputs(seq)) for m in (full, model)]
     read = [jax.vmap(m.emission)(path.mean, m.inputs(seq)) for m in (full, model)]
-    affine = here.affine._replace(offset=here.affine.offset + both[0] - both[1])
-    reading = here.reading._replace(offset=here.reading.offset + read[0] - read[1])
-    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, here.seq).innovation
+    affine = linear.affine._replace(offset=linear.affine.offset + both[0] - both[1])
+    reading = linear.reading._replace(offset=linear.reading.offset + read[0] - read[1])
+    return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, linear.seq).innovation
 
 
 def _fit(bench) -> SmoothedFit:
@@ -44,10 +44,10 @@ def test_a_lost_sequence_does_not_count_not_even_as_nan(bench):
     fit = _fit(bench)
     spring = catalogue["torsional_spring"].candidates(surroundings(bench[0], *_of(fit)))[:1]
     lost = fit._replace(path=fit.path._replace(mean=fit.path.mean.at[1].set(jnp.nan)))
-    (found,) = OneStep().linearise(lost, spring)
-    assert not found.weight[1].any() and found.weight[[0, 2, 3]].all()
+    (linearised,) = OneStep().linearise(lost, spring)
+    assert not linearised.weight[1].any() and linearised.weight[[0, 2, 3]].all()
     (unused,) = OneStep().linearise(fit._replace(used=np.array([True, False, True, True])), spring)
-    np.testing.assert_array_equal(unused.weight, found.weight)
+    np.testing.assert_array_equal(unused.weight, linearised.weight)
 
 
 def _of(fit: SmoothedFit):
@@ -70,9 +70,9 @@ def test_columns_are_difference_quotients(bench, name):
         before = run(model, at, seq)
         column = -(run(full, at, seq) - before) / small
         size = float(jnp.linalg.norm(column) * jnp.linalg.norm(before))
-        (found,) = OneStep().linearise(_fit(bench), [candidate])
-        np.testing.assert_allclose(found.error[i], before, atol=1e-5)
-        own = found.columns[i, ..., -1].astype(float)
+        (linearised,) = OneStep().linearise(_fit(bench), [candidate])
+        np.testing.assert_allclose(linearised.error[i], before, atol=1e-5)
+        own = linearised.columns[i, ..., -1].astype(float)
         assert float(jnp.sum(own * before)) == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
         assert float(jnp.sum(own**2)) == pytest.approx(float(jnp.sum(column**2)), rel=0.05)
 
@@ -84,11 +84,11 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
     maps = ("torque_offset", "motor_back_emf", "air_drag")
     held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
     free = catalogue["torsional_spring"].candidates(around)
-    (found,) = OneStep().linearise(_fit(bench), [*held, *free])
+    (linearised,) = OneStep().linearise(_fit(bench), [*held, *free])
     count = rule.weights(model).nodes.size + rule.weights(model).prior.size
-    none, weak = np.zeros(found.error.shape[:2], int), 1e-4 * np.eye(count)  # a prior that counts for nothing
-    rows = project(found, none, none, weak, np.zeros(count))
-    whole = np.sum(found.columns[..., count:].astype(float) ** 2 * found.weight[..., None], axis=(0, 1, 2))
+    none, weak = np.zeros(linearised.error.shape[:2], int), 1e-4 * np.eye(count)  # a prior that counts for nothing
+    rows = project(linearised, none, none, weak, np.zeros(count))
+    whole = np.sum(linearised.columns[..., count:].astype(float) ** 2 * linearised.weight[..., None], axis=(0, 1, 2))
     share = np.sum(rows.columns**2, axis=0) / whole
     # what the map has no nodes for, and what a spring keeps: 4e-4 at most and .025 at least with this key
     assert np.all(share[: len(held)] < 0.003)

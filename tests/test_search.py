@@ -73,26 +73,26 @@ def _spring():
 
 def _with(*names: str) -> Hypothesis:
     """The slide with these effects."""
-    now = BARE
+    hypothesis = BARE
     for i, name in enumerate(names):
-        now = now.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(0.5 + 0.1 * i))
-    return now
+        hypothesis = hypothesis.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(0.5 + 0.1 * i))
+    return hypothesis
 
 
-def _names(now) -> list[str]:
-    return [effect.name for effect in now.effects]
+def _names(hypothesis) -> list[str]:
+    return [effect.name for effect in hypothesis.effects]
 
 
 def test_certainty_is_the_marginal_of_the_posterior():
     """Value over standard deviation, whatever is correlated with it: network weights, a mass, another effect."""
-    now = _with("motor_gain", "dead_zone")
+    hypothesis = _with("motor_gain", "dead_zone")
     root = np.random.default_rng(0).normal(size=(5, 5))
     hessian = root @ root.T + np.eye(5)  # two network weights, the mass, the effects
     std = np.sqrt(np.diag(np.linalg.inv(hessian)))
     for place, name in enumerate(("motor_gain", "dead_zone")):
         value, spread = 1.0 + place, 2.0 + place
         expected = value / (spread * std[3 + place])
-        assert certainty(_candidate(name), now, hessian, place) == pytest.approx(expected, rel=1e-9)
+        assert certainty(_candidate(name), hypothesis, hessian, place) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_sixth_is_trimmed_at_either_end():
@@ -109,11 +109,11 @@ def test_one_fit_is_ahead_of_another_by_what_it_is_likelier():
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
     left, names = [i for i in range(3) if i != place], ("motor_gain", "dead_zone", "air_drag")
-    now = _with(*names).without(place)
-    assert _names(now.model) == [names[i] for i in left]
-    assert [f.removed for f in now.found if f] == [0.5 + 0.1 * i for i in left]
-    np.testing.assert_allclose(now.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
-    assert [name.partition(".")[0] for name in now.m_step.prior.names] == ["m", "0", "1"]
+    hypothesis = _with(*names).without(place)
+    assert _names(hypothesis.model) == [names[i] for i in left]
+    assert [f.removed for f in hypothesis.found if f] == [0.5 + 0.1 * i for i in left]
+    np.testing.assert_allclose(hypothesis.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
+    assert [name.partition(".")[0] for name in hypothesis.m_step.prior.names] == ["m", "0", "1"]
 
 
 def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
@@ -137,8 +137,8 @@ def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_ano
 
 def _functions(joint: int, *names: str):
     """Functions of these signals at a joint: the one that repeats each turn, and the one that does not."""
-    found = [c.start for c in catalogue["unknown_function"].candidates(AROUND) if c.start.joint == joint]
-    turning, still = (e for e in found if e.inputs_named() == names and len(e.axes) == 1)
+    functions = [c.start for c in catalogue["unknown_function"].candidates(AROUND) if c.start.joint == joint]
+    turning, still = (e for e in functions if e.inputs_named() == names and len(e.axes) == 1)
     return turning, still
 
 
@@ -158,9 +158,9 @@ def test_one_repeats_each_turn_and_the_other_does_not():
     turning, still = _functions(2, "theta2")
     for effect, again in ((turning, 1.0), (still, 0.0)):
         basis = jax.vmap(effect.axes[0].basis)(np.array([1.0, 1.0 + 2 * np.pi]))
-        here, there = basis[:, int(np.argmax(basis[0]))]
-        assert here > 0.8
-        np.testing.assert_allclose(there, again * here, atol=1e-6)
+        first, second = basis[:, int(np.argmax(basis[0]))]
+        assert first > 0.8
+        np.testing.assert_allclose(second, again * first, atol=1e-6)
 
 
 def test_a_stop_that_yields_is_none():
@@ -209,11 +209,13 @@ def _pretend(monkeypatch, worth: dict[str, float]):
     left = lambda model: 1 - sum(worth[name] for name in _names(model))  # noqa: E731
     smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
     monkeypatch.setattr(
-        search, "smooth", lambda context, now, length: (smoothed._replace(hypothesis=now), np.ones(6, bool))
+        search,
+        "smooth",
+        lambda context, hypothesis, length: (smoothed._replace(hypothesis=hypothesis), np.ones(6, bool)),
     )
-    monkeypatch.setattr(search, "fitted", lambda now, *_: Trial(now.model, RULE, None, np.zeros(6), None))
+    monkeypatch.setattr(search, "fitted", lambda hypothesis, *_: Trial(hypothesis.model, RULE, None, np.zeros(6), None))
     monkeypatch.setattr(MultiStep, "ratio", lambda self, null, full, *_: left(full.model) / left(null.model))
-    monkeypatch.setattr(search, "extend", lambda context, now, length: _emstate(now.model, 1.0))
+    monkeypatch.setattr(search, "extend", lambda context, hypothesis, length: _emstate(hypothesis.model, 1.0))
 
 
 @pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])
@@ -232,8 +234,8 @@ def test_both_of_two_laws_go_that_are_worth_nothing(monkeypatch):
 
 def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
     _pretend(monkeypatch, {"dead_zone": 0.5})
-    now = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
-    assert search._backward(_context(), now).found == ()
+    hypothesis = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
+    assert search._backward(_context(), hypothesis).found == ()
 
 
 def _case(law, removed: float = 0.5) -> Refit:
@@ -263,19 +265,19 @@ def _rounds(monkeypatch, *laws):
 def test_laws_are_added_until_none_is_accepted(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.4, "air_drag": 0.3})
     _rounds(monkeypatch, _law("motor_gain", 0.5), _law("air_drag", 0.5))
-    now, state, steps, complete = search._search(_context(), BARE, None, [9])
-    assert _names(now.model) == ["motor_gain", "air_drag"] and state is not None and complete
+    hypothesis, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert _names(hypothesis.model) == ["motor_gain", "air_drag"] and state is not None and complete
     assert [step.accepted is not None for step in steps] == [True, True, False]
-    found = now.found[0]
-    assert (found.gain, found.removed, found.share) == (80.0, 0.5, 0.4) and np.isnan(found.held_out)
+    record = hypothesis.found[0]
+    assert (record.gain, record.removed, record.share) == (80.0, 0.5, 0.4) and np.isnan(record.held_out)
 
 
 def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
     """Accepted in every round, and needless in every backward pass."""
     _pretend(monkeypatch, {"motor_gain": 0.01})
     _rounds(monkeypatch, _law("motor_gain", 0.5), None, _law("motor_gain", 0.5), None)
-    now, state, steps, complete = search._search(_context(), BARE, None, [9])
-    assert now.found == () and state is None and len(steps) == 2 and complete
+    hypothesis, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert hypothesis.found == () and state is None and len(steps) == 2 and complete
 
 
 @pytest.mark.parametrize("left", [0, 3])
@@ -293,8 +295,8 @@ def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, l
         return Round(Step(9, (), (), None, 400, untried=left), None, None)
 
     monkeypatch.setattr(search, "screening_round", late)
-    now, state, steps, complete = search._search(_context(), BARE, None, [9])
-    assert _names(now.model) == ["motor_gain"] and state is not None and not complete
+    hypothesis, state, steps, complete = search._search(_context(), BARE, None, [9])
+    assert _names(hypothesis.model) == ["motor_gain"] and state is not None and not complete
     assert [step.untried for step in steps] == ([0, left] if left else [0])
 
 
@@ -310,15 +312,15 @@ def test_no_step_begins_after_the_deadline():
 
 
 @pytest.mark.parametrize(
-    ("own", "names"), [(0.9, ["torsional_spring", "unknown_function"]), (0.1, ["unknown_function"])]
+    ("removed", "names"), [(0.9, ["torsional_spring", "unknown_function"]), (0.1, ["unknown_function"])]
 )
-def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(own, names):
+def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(removed, names):
     """The remainder removes half of what is left by a law that removed nine tenths, or one."""
     spring = Candidate(_spring(), (_spring(),), _spring())
-    now = BARE.plus(_spring(), spring, Found(1.0, 1.0, 0.0, removed=own))
+    hypothesis = BARE.plus(_spring(), spring, Found(1.0, 1.0, 0.0, removed=removed))
     law = _function()
-    case = _case(law)._replace(after=now.plus(law, _case(law).screened.candidate))
-    following = search._with(now, case, _found(0.5), _context())
+    case = _case(law)._replace(after=hypothesis.plus(law, _case(law).screened.candidate))
+    following = search._with(hypothesis, case, _found(0.5), _context())
     assert _names(following.model) == names
     # the remainder that took the place removed what both did; beside the law only its own
     assert following.found[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
@@ -352,10 +354,10 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     """Equivalent laws are compared where they decided, and there was time to end the search."""
     ran, cut, compared = [], [], []
 
-    def run(context, now, state, lengths):
+    def run(context, hypothesis, state, lengths):
         ran.append(type(context.loss))
         one_step = isinstance(context.loss, OneStep)
-        laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (now, state)
+        laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (hypothesis, state)
         return search._Searched(*laws, [], complete)
 
     def white_innovations(fitted, data):
@@ -373,16 +375,16 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
 
     monkeypatch.setattr(search, "identify", identify)
     monkeypatch.setattr(search, "_search", run)
-    monkeypatch.setattr(search, "quantised", lambda context, now: (now, None))
+    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     monkeypatch.setattr(search, "compare_equivalents", lambda closed, data: compared.append(data) or closed)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
-    found = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
-    assert ran == losses and len(found.found) == (white and innovations)
-    assert found.before.smoother.second() is not None and found.after.smoother.second() is not None
-    assert bool(compared) == (white and innovations and complete) and found.complete == complete
+    outcome = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
+    assert ran == losses and len(outcome.found) == (white and innovations)
+    assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
+    assert bool(compared) == (white and innovations and complete) and outcome.complete == complete
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
 

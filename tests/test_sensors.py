@@ -112,16 +112,16 @@ def test_readings_are_those_of_mujoco_under_torque_and_friction(name, tmp_path):
     text, sites = MACHINES[name]
     columns = _columns(sites)
     system = build_system(read_rig(_rig(tmp_path, text, columns), specs))
-    given = _model(system, columns)
+    ours = _model(system, columns)
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     address = {model.sensor(i).name: int(model.sensor_adr[i]) for i in range(model.nsensor)}
-    rng, read = np.random.default_rng(0), jax.jit(lambda x, u: given.emission(x, u))
+    rng, read = np.random.default_rng(0), jax.jit(lambda x, u: ours.emission(x, u))
     for _ in range(6):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = rng.uniform(-3.0, 3.0, (2, model.nv))
         data.ctrl[:] = u = rng.uniform(-2.0, 2.0, model.nu)
-        data.qfrc_applied[:] = np.asarray(given.unknown(jnp.asarray(data.qvel)))
+        data.qfrc_applied[:] = np.asarray(ours.unknown(jnp.asarray(data.qvel)))
         mujoco.mj_forward(model, data)
         x = jnp.asarray(np.concatenate([data.qpos, data.qvel]))
         truth = [data.sensordata[address[c[:-2]] + "xyz".index(c[-1])] for c in columns]
@@ -132,18 +132,18 @@ def test_readings_are_those_of_mujoco_under_torque_and_friction(name, tmp_path):
 def test_derivatives_of_readings_are_finite_differences(name, tmp_path):
     text, sites = MACHINES[name]
     columns = _columns(sites)
-    given = _model(build_system(read_rig(_rig(tmp_path, text, columns), specs)), columns)
-    dof, rng, step = len(given.system.coordinates), np.random.default_rng(1), 1e-6
+    model = _model(build_system(read_rig(_rig(tmp_path, text, columns), specs)), columns)
+    dof, rng, step = len(model.system.coordinates), np.random.default_rng(1), 1e-6
     x, u = (
         jnp.asarray(rng.uniform(-1.0, 1.0, 2 * dof)),
-        Inputs.held(jnp.asarray(rng.uniform(-1, 1, len(given.system.joints)))),
+        Inputs.held(jnp.asarray(rng.uniform(-1, 1, len(model.system.joints)))),
     )
-    both = jax.jit(lambda x, force: given.emission(x, u, force))
-    found = jnp.concatenate(jax.jacfwd(both, (0, 1))(x, jnp.zeros(dof)), axis=1)
+    both = jax.jit(lambda x, force: model.emission(x, u, force))
+    derivative = jnp.concatenate(jax.jacfwd(both, (0, 1))(x, jnp.zeros(dof)), axis=1)
     for i in range(3 * dof):
         dx, force = jnp.split(step * jnp.eye(3 * dof)[i], [2 * dof])
         truth = (both(x + dx, force) - both(x - dx, -force)) / (2 * step)
-        np.testing.assert_allclose(found[:, i], truth, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(derivative[:, i], truth, rtol=1e-6, atol=1e-6)
 
 
 # --- what a fit makes of them
@@ -172,23 +172,23 @@ class _Pushed(NamedTuple):
 def _expanded(model, prior, data: Dataset):
     """Score and information of one sequence; what the likelihood itself says of a constant force and of the mass."""
     seq = jax.tree.map(lambda a: a[0], data)
-    given = prepare(model, seq)
-    posterior = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)(model, given)
-    here, read = local(model, prior, posterior.state, seq), readings_at(model, posterior, given)
-    found = quadratic(model.log_q, model.log_r, model.start, here, NODES, posterior, read)
+    prepared = prepare(model, seq)
+    posterior = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)(model, prepared)
+    linear, read = local(model, prior, posterior.state, seq), readings_at(model, posterior, prepared)
+    expansion = quadratic(model.log_q, model.log_r, model.start, linear, NODES, posterior, read)
 
     def filtered(knobs):
         pushed = _Pushed(prior.write(model, knobs[1:]), knobs[:1])
         about = lambda x, u: Tangent()(pushed, Gaussian(x, jnp.eye(2)), u)  # noqa: E731
-        affine = jax.vmap(about)(posterior.state.mean, given.inputs)
-        reading = jax.vmap(lambda x, u: linear_reading(pushed, x, u))(posterior.state.mean, given.inputs)
-        out = kalman_filter(model.log_q, model.log_r, model.start, affine, reading, given)
+        affine = jax.vmap(about)(posterior.state.mean, prepared.inputs)
+        reading = jax.vmap(lambda x, u: linear_reading(pushed, x, u))(posterior.state.mean, prepared.inputs)
+        out = kalman_filter(model.log_q, model.log_r, model.start, affine, reading, prepared)
         return out.loglik, out.innovation.ravel()
 
     step = 1e-4
     ahead, behind = (jax.vmap(filtered)(sign * step * jnp.eye(2)) for sign in (1, -1))
     slope, jac = ((a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True))
-    return found, slope, jac, _shaken(jax.tree.map(lambda a: a[None], here), model.log_q, model.log_r)
+    return expansion, slope, jac, _shaken(jax.tree.map(lambda a: a[None], linear), model.log_q, model.log_r)
 
 
 def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information(tmp_path):
@@ -207,13 +207,13 @@ def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_infor
     data = simulate(model, start.mean[None], u, key=jax.random.key(0)).data
     data = data._replace(y=data.y.at[0, 7:9, 1].set(jnp.nan))
     prior = ParameterPrior(("cart.mass",), jnp.asarray([1.3]), jnp.asarray([0.1]))
-    found, slope, jac, floor = _expanded(model, prior, data)
+    expansion, slope, jac, floor = _expanded(model, prior, data)
     kick = model.log_q[1] - 2 * jnp.log(model.dt)  # a kick of the rate over one step is an acceleration
     np.testing.assert_allclose(floor, [model.log_r[0], kick], rtol=1e-6)
     both = np.zeros((2, 6))
     both[0, :5], both[1, 5] = 1.0, 1.0  # the weights of the nodes sum to 1: a constant force is one at all of them
-    np.testing.assert_allclose(both @ found.score, slope, rtol=1e-6)  # differences of step 1e-4
-    np.testing.assert_allclose(both @ found.information @ both.T, jac @ jac.T, rtol=1e-6)
+    np.testing.assert_allclose(both @ expansion.score, slope, rtol=1e-6)  # differences of step 1e-4
+    np.testing.assert_allclose(both @ expansion.information @ both.T, jac @ jac.T, rtol=1e-6)
 
 
 def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
@@ -315,9 +315,9 @@ def swung(tmp_path_factory):
 
 def test_a_joint_that_only_its_sensors_tell_is_followed_and_predicted(swung):
     fitted, data = swung
-    found = predict(fitted, data, 0.5, key=jax.random.key(0), samples=20)
-    assert found.mean.shape == (1, 90, 6)  # angle, rate, and four components
-    errors = horizon_errors(found, fitted, data, 0.5, horizons=(0.1,))
+    prediction = predict(fitted, data, 0.5, key=jax.random.key(0), samples=20)
+    assert prediction.mean.shape == (1, 90, 6)  # angle, rate, and four components
+    errors = horizon_errors(prediction, fitted, data, 0.5, horizons=(0.1,))
     assert list(errors) == list(SEEN)
     assert [errors[name][0] < bound for name, bound in zip(SEEN, (0.1, 0.3, 0.5, 0.01), strict=True)] == [True] * 4
 
@@ -333,9 +333,9 @@ def test_the_exported_predictor_agrees_with_predict(swung):
     exec(predictor(fitted), space)
     one = (np.asarray(part[0]) for part in data[:3])
     noise = np.asarray(jax.random.normal(key_noise, (90, 20, 2)))
-    found = space["predict"](space["MODEL"], *one, 0.5, draws=(*map(np.asarray, draws), noise))
-    np.testing.assert_allclose(found.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found.std, wanted.std[0], rtol=1e-6, atol=1e-6)
+    prediction = space["predict"](space["MODEL"], *one, 0.5, draws=(*map(np.asarray, draws), noise))
+    np.testing.assert_allclose(prediction.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(prediction.std, wanted.std[0], rtol=1e-6, atol=1e-6)
     assert space["MODEL"].sensors == SEEN
     assert parameters(fitted)["sensors"][1] == {"name": "shake.y", "unit": "m/s^2"}
 
@@ -375,8 +375,8 @@ def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp
     assert read_rig(tmp_path / "rig.toml", specs).measured == ("pivot", "imu.x", "shake.z")
     assert re.search(r"imu\.x = .*# rad/s$", made.text, re.M) and re.search(r"shake\.z = .*# m/s\^2$", made.text, re.M)
     fields = tuple(f"{kind}.{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz")
-    found = _sensors(read_machine(tmp_path / "swing.xml"), [Topic("/imu", "sensor_msgs/msg/Imu", 10, fields)])
-    assert {name: str(at) for name, at in found.items() if name[-1] == "y"} == {
+    columns = _sensors(read_machine(tmp_path / "swing.xml"), [Topic("/imu", "sensor_msgs/msg/Imu", 10, fields)])
+    assert {name: str(at) for name, at in columns.items() if name[-1] == "y"} == {
         "imu.y": "/imu:angular_velocity.y", "shake.y": "/imu:linear_acceleration.y",
     }  # fmt: skip
 

@@ -99,12 +99,12 @@ def _row(model, u: float):
 def test_a_servo_of_a_file_gives_the_force_of_mujoco(tmp_path, name):
     more = 'actuatorfrcrange="-15 15"' if name == "limited at its joint" else ""
     rig = _of_file(tmp_path, ACTUATORS[name], more=more)
-    model, own = _model(rig), mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml"))
-    data, rng, seen = mujoco.MjData(own), np.random.default_rng(0), []
+    model, compiled = _model(rig), mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml"))
+    data, rng, seen = mujoco.MjData(compiled), np.random.default_rng(0), []
     for _ in range(12):
         data.qpos[:], data.qvel[:] = rng.uniform(-2.0, 2.0, (2, 2))
         data.ctrl[0] = rng.uniform(0.0, 3.0)
-        mujoco.mj_forward(own, data)
+        mujoco.mj_forward(compiled, data)
         x = jnp.concatenate([jnp.asarray(data.qpos), jnp.asarray(data.qvel)])
         drive = model.scene(x, _row(model, float(data.ctrl[0]))).drive
         np.testing.assert_allclose(drive, data.qfrc_actuator, atol=1e-10)
@@ -126,12 +126,12 @@ def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
     model = _model(dataclasses.replace(rig, friction=False))
     w, rows = 400.0, 12
     row = _row(model, 0.5)
-    x, found = jnp.zeros(2), []
+    x, positions = jnp.zeros(2), []
     for _ in range(rows):
-        found.append(x[0])
+        positions.append(x[0])
         x = model.transition(x, row)
     assert model.steps == 9
-    np.testing.assert_allclose(found, 0.5 * (1 - np.cos(w * 0.01 * np.arange(rows))), atol=0.02)
+    np.testing.assert_allclose(positions, 0.5 * (1 - np.cos(w * 0.01 * np.arange(rows))), atol=0.02)
 
 
 def test_a_late_command_is_that_of_earlier_rows_and_stood_before_the_first(tmp_path):
@@ -164,8 +164,8 @@ def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
     servo = _model(_servo(tmp_path, f'kind = "velocity"\nkv = {k * k / r}\nlimit = 0.4\nbias = 0.01'))
     for u, v in ((3.0, 1.0), (-0.2, 2.0), (9.0, -4.0)):
         x = jnp.asarray([0.1, v])
-        there = [m.scene(x, _row(m, w)).drive for m, w in ((driven, u), (servo, u / k))]
-        np.testing.assert_allclose(*there, rtol=1e-12)
+        drives = [m.scene(x, _row(m, w)).drive for m, w in ((driven, u), (servo, u / k))]
+        np.testing.assert_allclose(*drives, rtol=1e-12)
 
 
 def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
@@ -191,11 +191,11 @@ def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
     rng = np.random.default_rng(1)
     seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2))))
     x = jnp.asarray(rng.normal(size=4))
-    there = _model(both, laws)
+    beside = _model(both, laws)
     alone = _model(_rig(tmp_path, text, model=model, kind="acrobot"), laws)
     for k in (0, 1, 7):
-        rows = [jax.tree.map(lambda a, k=k: a[k], m.inputs(seq)) for m in (there, alone)]
-        one, two = (m.scene(x, row).drive[0] for m, row in zip((there, alone), rows, strict=True))
+        rows = [jax.tree.map(lambda a, k=k: a[k], m.inputs(seq)) for m in (beside, alone)]
+        one, two = (m.scene(x, row).drive[0] for m, row in zip((beside, alone), rows, strict=True))
         np.testing.assert_allclose(one, two, rtol=1e-12)
 
 
@@ -323,10 +323,10 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     free = free.replace("I = 0.002", "I = { mean = 0.002, std = 0.001 }")
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 3.0 }\nkd = { mean = 0.2, std = 0.1 }\n'
     rig = _servo(tmp_path, lines + "delay = { mean = 0.01, std = 0.01 }\nlimit = { mean = 3.0, std = 1.0 }", model=free)
-    found = identifiability(rig, build_system(rig), build_servos(rig))
-    assert found.rubbed == ("goal.kd",)
-    assert [set(group) for group in found.together] == [{"m", "I", "goal.kp"}]
-    assert "cannot tell goal.kd from the learned friction of the joint" in " ".join(sentences(found))
+    result = identifiability(rig, build_system(rig), build_servos(rig))
+    assert result.rubbed == ("goal.kd",)
+    assert [set(group) for group in result.together] == [{"m", "I", "goal.kp"}]
+    assert "cannot tell goal.kd from the learned friction of the joint" in " ".join(sentences(result))
     known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
     assert identifiability(known, build_system(known), build_servos(known)) == ((), (), ("goal.kd",))
     bare = dataclasses.replace(known, friction=False)
@@ -346,9 +346,9 @@ def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, mark, said):
     t = 0.01 * np.arange(200)
     y = 1.2 * np.sin(6.0 * t)[None, :, None]
     train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
-    found = [each for each in check(rig, train, None, key=jax.random.key(0)) if each.subject == "servo"]
-    assert [each.mark for each in found] == [mark]
-    assert said in found[0].text
+    remarks = [each for each in check(rig, train, None, key=jax.random.key(0)) if each.subject == "servo"]
+    assert [each.mark for each in remarks] == [mark]
+    assert said in remarks[0].text
 
 
 def test_check_says_that_a_gain_is_too_stiff_for_the_samples(tmp_path):
@@ -356,8 +356,8 @@ def test_check_says_that_a_gain_is_too_stiff_for_the_samples(tmp_path):
     t = 0.01 * np.arange(200)
     y = 1.2 * np.sin(6.0 * t)[None, :, None]
     train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
-    found = [each.text for each in check(rig, train, None, key=jax.random.key(0)) if each.mark == BAD]
-    assert any(re.search("stiffest servo would need .* integration steps of a sample, and gets 64", x) for x in found)
+    remarks = [each.text for each in check(rig, train, None, key=jax.random.key(0)) if each.mark == BAD]
+    assert any(re.search("stiffest servo would need .* integration steps of a sample, and gets 64", x) for x in remarks)
 
 
 # --- the fit
@@ -401,9 +401,9 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
     rig = _servo(tmp_path, lines)
     data = _simulated(tmp_path, 0)
     fit = identify(rig, data, key=jax.random.key(0), epochs=12)
-    found = parameter_table(fit)
-    assert abs(found["goal.kp"][0] / KP - 1) < 0.05
-    assert abs(found["goal.delay"][0] - DELAY) < 1e-3
+    table = parameter_table(fit)
+    assert abs(table["goal.kp"][0] / KP - 1) < 0.05
+    assert abs(table["goal.delay"][0] - DELAY) < 1e-3
     v = np.linspace(-3.0, 3.0, 61)
     curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
     assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
@@ -412,7 +412,7 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
     assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is .001
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
-    assert parameter_table(again) == found and again.rig == rig
+    assert parameter_table(again) == table and again.rig == rig
     with pytest.raises(ExportError, match="its inputs are commands of servos"):
         export(again, tmp_path / "out")
 
@@ -425,9 +425,9 @@ def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
     rig = _of_file(tmp_path, ACTUATORS["behind a gear"])
     system = build_system(rig)
     bare = dataclasses.replace(rig, input_columns=(), input_joints=(), input_kinds=())
-    found = measure_scales(rig, system, data).torque - measure_scales(bare, system, data).torque
+    size = measure_scales(rig, system, data).torque - measure_scales(bare, system, data).torque
     wanted = 3.0 * np.sqrt(0.5) * np.hypot(12.0 * (1.5 - 3.0), 0.3 * 3.0 * w)
-    np.testing.assert_allclose(found, [wanted, 0.0], rtol=5e-3)
+    np.testing.assert_allclose(size, [wanted, 0.0], rtol=5e-3)
 
 
 def test_a_servo_with_other_numbers_keeps_its_own():
@@ -445,10 +445,10 @@ def test_columns_of_candidates_are_changes_of_the_torque_of_the_servo(tmp_path):
     inputs, first = jax.vmap(model.inputs)(data), jax.tree.map(lambda a: a[0], data)
     track = tracks(model, Gaussian(mean, jnp.zeros((1, 24, 2, 2))), inputs)
     for law in (Saturation.of(0.5, joint=1), MotorGain.of(-0.2, joint=1), InputDelay.of(0.013, joint=1)):
-        found = candidate_columns(model, [Candidate(law, (law,), law)])(track).force[0, 0]
+        force = candidate_columns(model, [Candidate(law, (law,), law)])(track).force[0, 0]
         drive = [
             jax.vmap(lambda x, u, m=m: m.scene(x, u).drive)(track.middle[0], m.inputs(first))
             for m in (with_effects(model, (law,)), model)
         ]
-        assert np.abs(found).max() > 0.1
-        np.testing.assert_allclose(found, drive[0] - drive[1], atol=1e-6)
+        assert np.abs(force).max() > 0.1
+        np.testing.assert_allclose(force, drive[0] - drive[1], atol=1e-6)

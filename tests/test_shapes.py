@@ -32,9 +32,9 @@ def _learned(f, axis, rng, *, noise=0.08, inside=(0.0, 1.0), system=PENDULUM) ->
     basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
     cov = np.linalg.inv(basis.T @ basis / std**2 + np.eye(axis.count) / (3 * np.std(y)) ** 2)
     weights = cov @ basis.T @ (y + std * rng.standard_normal(x.size)) / std**2
-    found = catalogue["unknown_function"](jnp.asarray(weights), (axis,), joint=1).curve(cov, system)
-    assert found is not None
-    return found
+    curve = catalogue["unknown_function"](jnp.asarray(weights), (axis,), joint=1).curve(cov, system)
+    assert curve is not None
+    return curve
 
 
 def _hinge(rng):
@@ -129,11 +129,11 @@ FORMS = {f.__name__[1:]: f for f in _FORMS} | {"two": _two(TURN, 9), "two on two
 def test_a_known_shape_is_named_with_its_numbers(form, seed):
     rng = np.random.default_rng(seed)
     kind, axis, f, truth = form(rng)
-    told = shape(_learned(f, axis, rng))
-    assert told.kind == kind, told.words
+    named = shape(_learned(f, axis, rng))
+    assert named.kind == kind, named.words
     for name, (value, tolerance) in truth.items():
-        assert told.numbers[name][0] == pytest.approx(value, abs=tolerance, rel=0), (name, told.words)
-    assert told.explains > 0.95
+        assert named.numbers[name][0] == pytest.approx(value, abs=tolerance, rel=0), (name, named.words)
+    assert named.explains > 0.95
 
 
 @pytest.mark.parametrize(
@@ -144,14 +144,14 @@ def test_what_was_not_visited_has_no_say(low, high):
     rng = np.random.default_rng(0)
     centre = np.pi * (low + high) - np.pi
     away = lambda x: (x - centre + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
-    found = _learned(lambda x: 0.4 * (away(x) > 0.2), TURN, rng, inside=(low, high))
-    told = shape(found)
-    assert told.kind == "step" and "of the range of theta1" in told.words
-    assert told.numbers["place"][0] == pytest.approx((centre + 0.2 + np.pi) % (2 * np.pi) - np.pi, abs=0.1)
-    assert told.numbers["height"][0] == pytest.approx(0.4, rel=0.1)
-    far = found.std > 0.8 * found.std.max()
-    wild = found._replace(mean=found.mean + far * rng.standard_normal(far.size))
-    assert far.any() and shape(wild).words == told.words
+    curve = _learned(lambda x: 0.4 * (away(x) > 0.2), TURN, rng, inside=(low, high))
+    form = shape(curve)
+    assert form.kind == "step" and "of the range of theta1" in form.words
+    assert form.numbers["place"][0] == pytest.approx((centre + 0.2 + np.pi) % (2 * np.pi) - np.pi, abs=0.1)
+    assert form.numbers["height"][0] == pytest.approx(0.4, rel=0.1)
+    far = curve.std > 0.8 * curve.std.max()
+    wild = curve._replace(mean=curve.mean + far * rng.standard_normal(far.size))
+    assert far.any() and shape(wild).words == form.words
 
 
 def test_noise_is_no_shape():
@@ -160,9 +160,9 @@ def test_noise_is_no_shape():
         rng = np.random.default_rng(seed)
         cov = np.diag(rng.uniform(0.5, 2.0, 20))
         weights = jnp.asarray(np.sqrt(np.diag(cov)) * rng.standard_normal(20))
-        found = catalogue["unknown_function"](weights, (PART,), joint=1).curve(cov, PENDULUM)
-        told = shape(found)
-        assert told.kind == "smooth" and told.explains == 0.0, told.words
+        curve = catalogue["unknown_function"](weights, (PART,), joint=1).curve(cov, PENDULUM)
+        form = shape(curve)
+        assert form.kind == "smooth" and form.explains == 0.0, form.words
 
 
 def test_a_curve_without_a_form_is_seldom_given_one():
@@ -171,34 +171,34 @@ def test_a_curve_without_a_form_is_seldom_given_one():
     for seed in range(60):
         weights = jnp.asarray(np.random.default_rng(seed).standard_normal(20))
         effect = catalogue["unknown_function"](weights, ((PART, TURN)[seed % 2],), joint=1)
-        told = shape(effect.curve(1e-3 * np.eye(20), PENDULUM))
-        named += [told.explains] if told.kind != "smooth" else []
+        form = shape(effect.curve(1e-3 * np.eye(20), PENDULUM))
+        named += [form.explains] if form.kind != "smooth" else []
     assert len(named) <= 12
     assert all(explains > 0.85 for explains in named)
 
 
 def test_all_at_rest_is_told_as_nothing_known():
-    told = shape(_learned(lambda x: x, PART, np.random.default_rng(0))._replace(mean=np.zeros(121)))
-    assert told.kind == "smooth" and told.numbers["height"][0] == 0.0
+    form = shape(_learned(lambda x: x, PART, np.random.default_rng(0))._replace(mean=np.zeros(121)))
+    assert form.kind == "smooth" and form.numbers["height"][0] == 0.0
 
 
 @pytest.mark.parametrize("form", (_hinge, _step, _two(TURN, 9), _bump), ids=["hinge", "step", "two", "bump"])
 def test_sign_and_units_change_nothing_but_the_numbers(form):
     rng = np.random.default_rng(1)
     _, axis, f, _ = form(rng)
-    found = _learned(f, axis, rng)
-    told = shape(found)
-    other = shape(found._replace(mean=-1e3 * found.mean, std=1e3 * found.std))
-    assert {told.kind, other.kind} in ({told.kind}, {"bump", "dip"})
-    assert other.explains == pytest.approx(told.explains, abs=1e-6)
-    for name, (value, unit) in told.numbers.items():
+    curve = _learned(f, axis, rng)
+    named = shape(curve)
+    other = shape(curve._replace(mean=-1e3 * curve.mean, std=1e3 * curve.std))
+    assert {named.kind, other.kind} in ({named.kind}, {"bump", "dip"})
+    assert other.explains == pytest.approx(named.explains, abs=1e-6)
+    for name, (value, unit) in named.numbers.items():
         if not name.startswith("phase"):
             size = -1e3 if name in ("height", "slope_above", "slope_below") else 1e3 if "amplitude" in name else 1.0
             assert other.numbers[name] == (pytest.approx(size * value, rel=1e-4), unit)
-    if not found.turns:  # along any other signal, in metres and millimetres
-        metres = found._replace(signal_unit="m")
-        told, other = shape(metres), shape(metres._replace(signal_unit="mm", x=1e3 * found.x))
-        assert other.numbers["place"] == (pytest.approx(1e3 * told.numbers["place"][0], rel=1e-4), "mm")
+    if not curve.turns:  # along any other signal, in metres and millimetres
+        metres = curve._replace(signal_unit="m")
+        named, other = shape(metres), shape(metres._replace(signal_unit="mm", x=1e3 * curve.x))
+        assert other.numbers["place"] == (pytest.approx(1e3 * named.numbers["place"][0], rel=1e-4), "mm")
 
 
 def test_words_own_up_to_what_the_basis_cannot_show():
@@ -218,18 +218,18 @@ def test_words_have_the_units_of_the_signal():
     rng = np.random.default_rng(3)
     position = _learned(lambda x: np.sin(2 * np.pi * x / 0.25), Axis(("x",), 0.0, 1.0, False, 20), rng, system=SLIDE)
     assert "a ripple in x of period 0.25 m, amplitude " in shape(position).words
-    own = InputAxis(("tau2",), -0.3, 0.3, False, 20, index=0)
-    loss = shape(_learned(lambda u: 0.2 * np.maximum(0, u - 0.05), own, rng))
+    axis = InputAxis(("tau2",), -0.3, 0.3, False, 20, index=0)
+    loss = shape(_learned(lambda u: 0.2 * np.maximum(0, u - 0.05), axis, rng))
     assert loss.numbers["slope_above"][1] == "" and loss.words.endswith("above")
     once = shape(_learned(lambda x: 1.0 * ((x > -1) & (x < 1.5)), TURN, rng))
     assert once.words.startswith("a step up at theta1 = -1") and "and down again at 1.5" in once.words
 
 
 def test_the_entry_is_what_json_holds():
-    told = shape(_learned(lambda x: np.maximum(0, x - 0.4), PART, np.random.default_rng(4)))
-    entry = json.loads(json.dumps(told.entry()))
+    form = shape(_learned(lambda x: np.maximum(0, x - 0.4), PART, np.random.default_rng(4)))
+    entry = json.loads(json.dumps(form.entry()))
     assert entry["kind"] == "hinge" and entry["numbers"]["place"] == {
-        "value": told.numbers["place"][0], "unit": "rad"}  # fmt: skip
+        "value": form.numbers["place"][0], "unit": "rad"}  # fmt: skip
     assert set(entry) == {"kind", "numbers", "explains", "resolution", "known", "rivals"}
     assert entry["resolution"] == pytest.approx(NODE)
     assert entry["known"] == pytest.approx([-1.5, 1.5], abs=0.1)

@@ -31,8 +31,8 @@ def _rows(error, columns, fold, block=None, overlap=1.0) -> Rows:
 
 def _share(rows: Rows, size: int, timed: bool = False):
     """Shares of one candidate."""
-    found = shares(rows, [_candidate(size)], [timed])
-    return found.inside[0], found.left_out[0], found.folds[0], found.directions[0], found.coefficients
+    result = shares(rows, [_candidate(size)], [timed])
+    return result.inside[0], result.left_out[0], result.folds[0], result.directions[0], result.coefficients
 
 
 def test_shares_are_those_of_least_squares():
@@ -40,21 +40,21 @@ def test_shares_are_those_of_least_squares():
     rng = np.random.default_rng(0)
     x, fold = rng.normal(size=(400, 3)), rng.permutation(np.repeat(np.arange(4), 100))
     e = x @ np.array([1.0, -0.5, 0.0]) + rng.normal(size=400)
-    found = shares(_rows(e, x, fold), [_candidate(2), _candidate(1)], [True, True])
-    fitted, rest, *_ = np.linalg.lstsq(x[:, :2], e, rcond=None)
-    np.testing.assert_allclose(found.coefficients[:2], fitted, rtol=1e-6)
-    raw = 1 - rest[0] / np.sum(e**2)
-    assert found.directions[0] == pytest.approx(2.0, rel=1e-6)
-    assert found.inside[0] == pytest.approx(1 - (1 - raw) * 399 / 397, rel=1e-6)
+    result = shares(_rows(e, x, fold), [_candidate(2), _candidate(1)], [True, True])
+    fitted, squares, *_ = np.linalg.lstsq(x[:, :2], e, rcond=None)
+    np.testing.assert_allclose(result.coefficients[:2], fitted, rtol=1e-6)
+    raw = 1 - squares[0] / np.sum(e**2)
+    assert result.directions[0] == pytest.approx(2.0, rel=1e-6)
+    assert result.inside[0] == pytest.approx(1 - (1 - raw) * 399 / 397, rel=1e-6)
     gone = 0.0
     for f in range(4):
         mask = fold == f
-        own = np.linalg.lstsq(x[~mask, :2], e[~mask], rcond=None)[0]
-        before, after = np.sum(e[mask] ** 2), np.sum((e[mask] - x[mask, :2] @ own) ** 2)
-        assert found.folds[0, f] == pytest.approx(1 - after / before, rel=1e-6)
+        coefficients = np.linalg.lstsq(x[~mask, :2], e[~mask], rcond=None)[0]
+        before, after = np.sum(e[mask] ** 2), np.sum((e[mask] - x[mask, :2] @ coefficients) ** 2)
+        assert result.folds[0, f] == pytest.approx(1 - after / before, rel=1e-6)
         gone += before - after
-    assert found.left_out[0] == pytest.approx(gone / np.sum(e**2), rel=1e-6)
-    assert found.left_out[1] < 0.02  # what is not there removes nothing of what is left out
+    assert result.left_out[0] == pytest.approx(gone / np.sum(e**2), rel=1e-6)
+    assert result.left_out[1] < 0.02  # what is not there removes nothing of what is left out
 
 
 def test_errors_that_overlap_count_for_less():
@@ -75,17 +75,17 @@ def test_the_nuisance_is_projected_out_by_ridge_regression():
     weight[1] = 0.0
     precision = np.diag(rng.uniform(1, 9, size))
     fold, none = np.repeat(np.arange(3)[:, None], 20, axis=1), np.zeros((3, 20), int)
-    found = Linearised(error, columns, weight, 1.0, np.arange(20))
-    rows = project(found, fold, none, precision, precision @ value)
+    linearised = Linearised(error, columns, weight, 1.0, np.arange(20))
+    rows = project(linearised, fold, none, precision, precision @ value)
     keep, root = weight > 0, np.sqrt(weight[weight > 0])
     e, wide = root * error[keep], root[:, None] * columns[keep]
-    nuisance, own = wide[:, :size], wide[:, size:]
+    nuisance, candidate = wide[:, :size], wide[:, size:]
     prior = np.sqrt(precision)
     stacked = np.concatenate([nuisance, prior])
     taken = np.linalg.lstsq(stacked, np.concatenate([e, -prior @ value]), rcond=None)[0]
     np.testing.assert_allclose(rows.error, e - nuisance @ taken, atol=1e-9)
-    explained = np.linalg.lstsq(stacked, np.concatenate([own, np.zeros((size, 2))]), rcond=None)[0]
-    np.testing.assert_allclose(rows.columns, own - nuisance @ explained, atol=1e-9)
+    explained = np.linalg.lstsq(stacked, np.concatenate([candidate, np.zeros((size, 2))]), rcond=None)[0]
+    np.testing.assert_allclose(rows.columns, candidate - nuisance @ explained, atol=1e-9)
     assert np.unique(rows.cell).tolist() == [0, 2]
 
 
@@ -94,8 +94,8 @@ def test_a_part_with_hardly_any_error_is_harmed_by_what_that_is_of_an_average_on
     error, fold = np.array([1.0, 1.0, 1.0, 1.0, -0.1, -0.1]), np.repeat(np.arange(3), 2)
     folds = _share(_rows(error, np.ones((6, 1)), fold), 1)[2]
     assert folds[2] == pytest.approx(-2.4 / (4.02 / 3))
-    own = 2 * 0.45 - 0.45**2  # of one of the full parts, from the mean 0.45 of the others
-    assert folds[0] == pytest.approx(own)
+    expected = 2 * 0.45 - 0.45**2  # of one of the full parts, from the mean 0.45 of the others
+    assert folds[0] == pytest.approx(expected)
 
 
 def test_folds_are_neighbours_and_pieces_where_there_are_few():
@@ -163,10 +163,10 @@ def test_what_happens_at_one_moment_of_every_recording_is_no_law():
 
 def _placebo(error, columns, rng) -> tuple[float, float]:
     """Share left out that one column removes, and that its placebo removes; a sequence is a fold."""
-    found = Linearised(error[..., None], columns, np.ones((*error.shape, 1)), 1.0, np.arange(error.shape[1]))
+    linearised = Linearised(error[..., None], columns, np.ones((*error.shape, 1)), 1.0, np.arange(error.shape[1]))
     fold = np.repeat(np.arange(len(error)), error.shape[1])
     out = []
-    for one in (found, shifted(found, 1, rng)):
+    for one in (linearised, shifted(linearised, 1, rng)):
         rows = _rows(one.error.ravel(), one.columns.reshape(-1, 2)[:, 1:], fold)
         out.append(_share(rows, 1, timed=True)[1])
     return out[0], out[1]
@@ -181,8 +181,8 @@ def test_a_placebo_keeps_a_column_s_numbers_and_loses_what_it_explains():
     columns = np.stack([np.ones_like(signal), signal], axis=-1)[:, :, None]
     weight = np.ones((12, 60, 1))
     weight[:, 50:] = 0.0  # ends that nobody reads take no part
-    found = Linearised(error[..., None], columns, weight, 1.0, np.arange(60))
-    moved = shifted(found, 1, rng)
+    linearised = Linearised(error[..., None], columns, weight, 1.0, np.arange(60))
+    moved = shifted(linearised, 1, rng)
     np.testing.assert_array_equal(moved.columns[..., 0], columns[..., 0])
     np.testing.assert_array_equal(moved.columns[:, 50:], columns[:, 50:])
     for a, b in zip(moved.columns[:, :50, 0, 1], columns[:, :50, 0, 1], strict=True):
@@ -204,8 +204,8 @@ def test_the_placebo_of_a_constant_explains_nothing():
 
 def test_a_sequence_of_few_moments_takes_no_part_in_a_placebo():
     columns = np.arange(1.0, 13.0).reshape(1, 3, 1, 4)
-    found = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
-    moved = shifted(found, 1, np.random.default_rng(0)).columns
+    linearised = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
+    moved = shifted(linearised, 1, np.random.default_rng(0)).columns
     np.testing.assert_array_equal(moved[..., :1], columns[..., :1])
     assert not moved[..., 1:].any()
 
@@ -217,9 +217,9 @@ def test_a_placebo_moves_the_moments_that_count():
     moved = shifted(
         Linearised(np.zeros((1, 100, 1)), columns, weight, 1.0, np.arange(100)), 1, np.random.default_rng(1)
     )
-    own, other = columns[0, ::5, 0, 1], moved.columns[0, ::5, 0, 1]
-    np.testing.assert_allclose(np.sort(np.abs(own)), np.sort(np.abs(other)))
-    assert not np.any(np.isclose(own, other))
+    before, after = columns[0, ::5, 0, 1], moved.columns[0, ::5, 0, 1]
+    np.testing.assert_allclose(np.sort(np.abs(before)), np.sort(np.abs(after)))
+    assert not np.any(np.isclose(before, after))
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

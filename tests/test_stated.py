@@ -36,8 +36,8 @@ def test_a_draw_of_a_parameter_moves_states_as_smoothing_with_it_does(case):
     heavier = rule.prior.write(model, rule.prior.read(model) + small)
     moved = _path(heavier, data).mean - path.mean
     draw = jnp.zeros((1, rule.weights(model).nodes.size + 1)).at[0, -1].set(small)
-    found = stated.of_states(model, rule, path, data, draw, 0.0, key=KEY)
-    np.testing.assert_allclose(found, moved[..., :, None] * moved[..., None, :], atol=2e-3 * float(jnp.max(moved**2)))
+    cov = stated.of_states(model, rule, path, data, draw, 0.0, key=KEY)
+    np.testing.assert_allclose(cov, moved[..., :, None] * moved[..., None, :], atol=2e-3 * float(jnp.max(moved**2)))
 
 
 def test_forces_unsaid_move_states_as_the_same_input_does(case):
@@ -48,5 +48,5 @@ def test_forces_unsaid_move_states_as_the_same_input_does(case):
     pushed = data._replace(u=data.u + jnp.einsum("c,sctd->std", draw, every))
     moved = _path(model, pushed).mean - path.mean
     still = jnp.zeros((1, rule.weights(model).nodes.size + 1))
-    found = stated.of_states(model, rule, path, data, still, size, key=KEY)
-    np.testing.assert_allclose(found, moved[..., :, None] * moved[..., None, :], atol=1e-6 * float(jnp.max(moved**2)))
+    cov = stated.of_states(model, rule, path, data, still, size, key=KEY)
+    np.testing.assert_allclose(cov, moved[..., :, None] * moved[..., None, :], atol=1e-6 * float(jnp.max(moved**2)))

@@ -184,9 +184,9 @@ def test_a_model_from_before_smoothers_branched_is_read(tmp_path, name):
 def test_a_stored_model_keeps_its_smoother(tmp_path, make):
     fitted = begin(RIGS["arm"], _data(RIGS["arm"]), key=jax.random.key(5), smoother=make)
     save(tmp_path / "model.npz", fitted)
-    found = load(tmp_path / "model.npz")
-    assert _bits(found) == _bits(fitted)
-    assert jax.tree.structure(found.smoother) == jax.tree.structure(fitted.smoother)  # statics, too
+    loaded = load(tmp_path / "model.npz")
+    assert _bits(loaded) == _bits(fitted)
+    assert jax.tree.structure(loaded.smoother) == jax.tree.structure(fitted.smoother)  # statics, too
 
 
 class _Own(AbstractSmoother):

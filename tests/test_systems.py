@@ -100,8 +100,8 @@ def test_mass_and_bias_are_lagranges_equations(name):
     q, v = _states(name)
     a = 3 * q - v
     expected = jax.jit(jax.vmap(force))(q, v, a)
-    found = jax.vmap(lambda q, v, a: system.mass(q) @ a + system.bias(q, v))(q, v, a)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    torque = jax.vmap(lambda q, v, a: system.mass(q) @ a + system.bias(q, v))(q, v, a)
+    np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
 
 
 @names

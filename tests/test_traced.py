@@ -22,10 +22,10 @@ from nnap_em.storage.cache import Cache
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A cache in use, in a process that has no program yet."""
-    found = Cache(tmp_path / "cache")
-    monkeypatch.setattr(traced._Programs, "cache", found)
+    programs = Cache(tmp_path / "cache")
+    monkeypatch.setattr(traced._Programs, "cache", programs)
     monkeypatch.setattr(traced._Programs, "ready", {})
-    return found
+    return programs
 
 
 def _kept(cache: Cache) -> set[str]:
@@ -74,10 +74,10 @@ def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
     else:
         data = data._replace(u=data.u.astype(jnp.float32))
     with jax.numpy_dtype_promotion("standard"):
-        found = _smoothed((model, data), smoother, monkeypatch)
+        posterior = _smoothed((model, data), smoother, monkeypatch)
         assert len(_kept(cache)) == 2
         monkeypatch.setattr(traced._Programs, "cache", None)
-        np.testing.assert_array_equal(found.state.mean, _smoothed((model, data), smoother, monkeypatch).state.mean)
+        np.testing.assert_array_equal(posterior.state.mean, _smoothed((model, data), smoother, monkeypatch).state.mean)
 
 
 def test_other_numbers_are_no_other_program(cache, work, monkeypatch):

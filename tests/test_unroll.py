@@ -16,7 +16,7 @@ from nnap_em.portable.unroll import UnrollError, unroll
 
 MODEL = declared_model(plant.Case(steps=20, hidden=False))
 AROUND = around(MODEL)
-CANDIDATES = {name: found[0].probes[0] for name, kind in catalogue.items() if (found := kind.candidates(AROUND))}
+CANDIDATES = {name: laws[0].probes[0] for name, kind in catalogue.items() if (laws := kind.candidates(AROUND))}
 
 
 def _agrees(function, **arguments: Float[Array, "..."]) -> str:
@@ -27,8 +27,8 @@ def _agrees(function, **arguments: Float[Array, "..."]) -> str:
     wanted = function(*arguments.values())
     for batch in ((), (3, 2)):
         flat = [tuple(np.broadcast_to(a, batch) for a in np.ravel(value)) for value in arguments.values()]
-        found = space["function"](*flat)
-        for mine, his in zip((found,) if len(wanted) == 1 else found, wanted, strict=True):
+        outputs = space["function"](*flat)
+        for mine, his in zip((outputs,) if len(wanted) == 1 else outputs, wanted, strict=True):
             parts = np.array([np.broadcast_to(np.asarray(a, float), batch) for a in mine])
             np.testing.assert_allclose(np.moveaxis(parts, 0, -1), np.broadcast_to(np.ravel(his), (*batch, len(mine))))
     return str(source)

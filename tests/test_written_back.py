@@ -126,8 +126,8 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     np.testing.assert_allclose(written.dof_damping, [joint.damping for joint in machine.joints])
     np.testing.assert_allclose(written.dof_frictionloss, [joint.dry for joint in machine.joints])
     again = read_machine(tmp_path / "out.xml")
-    there = [motor[:2] for motor in machine.motors]
-    assert [motor[:2] for motor in again.motors] == [*there, ("u", 0)]  # the rig drives a joint without a motor
+    motors = [motor[:2] for motor in machine.motors]
+    assert [motor[:2] for motor in again.motors] == [*motors, ("u", 0)]  # the rig drives a joint without a motor
     assert again.joint_sensors == machine.joint_sensors
 
 

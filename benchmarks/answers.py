@@ -62,7 +62,7 @@ def main() -> None:
     arguments.add_argument("folders", nargs="*", type=Path, help="data sets to be diagnosed beside the simulated ones")
     arguments.add_argument("--table", type=Path, required=True)
     args = arguments.parse_args()
-    told = [
+    lines = [
         "# Time to an answer\n",
         f"{date.today()}, {platform.machine()}, {cores()} cores, Python {platform.python_version()}; "
         "written by `benchmarks/answers.py`. The first run finds no program compiled; the second finds those of the "
@@ -84,9 +84,9 @@ def main() -> None:
             print(command, name, flush=True)
             first, later = (run(command, folder, work / f"{number}_{i}", work / f"cache_{number}") for i in range(2))
             row = f"{first.seconds:.0f} | {first.compiling:.0f} | {first.programs} | {later.seconds:.0f}"
-            told.append(f"| {command} | {name} | {row} | {later.answer} |")
+            lines.append(f"| {command} | {name} | {row} | {later.answer} |")
             profiles += [f"\n## What the first `{command}` of {name} compiles\n", "```text", *first.profile, "```"]
-    replace_text(args.table, "\n".join([*told, *profiles]) + "\n")
+    replace_text(args.table, "\n".join([*lines, *profiles]) + "\n")
 
 
 if __name__ == "__main__":

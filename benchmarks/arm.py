@@ -205,18 +205,18 @@ def written(rig: Rig, data: Dataset, folder: Path) -> None:
 
 def diagnosed(kind: str, seed: int, out: Path, count: int, *, imu: bool) -> str:
     """What `nnap-em diagnose` names in a machine that lacks something, and how long it took; a row of the table."""
-    folder, found = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
-    if not (found / "report.json").exists():
+    folder, result = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
+    if not (result / "report.json").exists():
         (folder / "train").mkdir(parents=True, exist_ok=True)
         data, _ = recorded(machine(count, imu=imu), JOINTS[:count], seed, LACKS[kind])
         written(declared(folder, count, imu=imu), data, folder)
-        command = ["diagnose", str(folder), "--out", str(found), "--seed", str(seed), "--quiet"]
+        command = ["diagnose", str(folder), "--out", str(result), "--seed", str(seed), "--quiet"]
         began, before = time.perf_counter(), os.times().children_user
         subprocess.run([sys.executable, "-m", "nnap_em.commands.cli", *command], check=True)
         took, spent = time.perf_counter() - began, os.times().children_user - before
-        (found / "seconds.json").write_text(json.dumps([took, spent]))
-    report = json.loads((found / "report.json").read_text())
-    took, spent = json.loads((found / "seconds.json").read_text())
+        (result / "seconds.json").write_text(json.dumps([took, spent]))
+    report = json.loads((result / "report.json").read_text())
+    took, spent = json.loads((result / "seconds.json").read_text())
     named = "; ".join(f"{e['name']} {e['joint']}: {_numbers(e)}" for e in report["effects"])
     return f"| {kind} | {seed} | {named or 'nothing'} | {took:.0f} | {spent:.0f} |"
 
@@ -255,8 +255,8 @@ def main() -> None:
             began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))
             took, spent = time.perf_counter() - began, time.process_time() - spent
-            found = " | ".join(f"{e:.3f}" for e in errors(fitted.model.unknown, friction(joints), x))
-            print(f"| {seed} | {found} | {fitted.state.epoch} | {took:.0f} | {spent:.0f} |", flush=True)
+            cells = " | ".join(f"{e:.3f}" for e in errors(fitted.model.unknown, friction(joints), x))
+            print(f"| {seed} | {cells} | {fitted.state.epoch} | {took:.0f} | {spent:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -78,21 +78,21 @@ def prior_draw(start: Identified, key, moves: int = 200):
     log_pull = partial(_log_pull, weights, unknown, middle, symmetry)
     std = 1 / np.sqrt(np.asarray(weights.precision(middle)))
     draw = lambda: rng.normal(size=middle.shape) * std  # noqa: E731
-    now = draw()
-    level = float(log_pull(now))
+    state = draw()
+    level = float(log_pull(state))
     for _ in range(moves):
         other, bar = draw(), level + np.log(rng.uniform())
         angle = rng.uniform(0, 2 * np.pi)
         low, high = angle - 2 * np.pi, angle
         while True:
-            trial = now * np.cos(angle) + other * np.sin(angle)
+            trial = state * np.cos(angle) + other * np.sin(angle)
             level = float(log_pull(trial))
             if level > bar:
                 break
             low, high = (angle, high) if angle < 0 else (low, angle)
             angle = rng.uniform(low, high)
-        now = trial
-    return unknown.with_weights(middle + now)
+        state = trial
+    return unknown.with_weights(middle + state)
 
 
 def stribeck_draw(start: Identified, key) -> StribeckLaw:

@@ -51,8 +51,8 @@ def main() -> None:
     for share in SHARES:
         rows[share] = [(base[i], fit(grown(truth, share), 900 + i)) for i in range(pairs // 2)]
     for share, fits in rows.items():
-        found = [compare(*pair, names=("before", "after")).changed for pair in fits]
-        friction, mass = (sum(name in changed for changed in found) for name in ("friction of joint 1", "m"))
+        changes = [compare(*pair, names=("before", "after")).changed for pair in fits]
+        friction, mass = (sum(name in changed for changed in changes) for name in ("friction of joint 1", "m"))
         print(f"| {share:.0%} | {len(fits)} | {friction} | {mass} |")
 
 

@@ -87,8 +87,8 @@ def expected(design: Design, information, grid: np.ndarray) -> list[float]:
     out = []
     for j, v in enumerate(grid):
         weights = np.stack([np.interp(v, nodes[j], row) for row in np.eye(nodes.shape[1])], axis=1)
-        own = cov[j * nodes.shape[1] : (j + 1) * nodes.shape[1], j * nodes.shape[1] : (j + 1) * nodes.shape[1]]
-        out.append(float(np.sqrt(np.mean(np.einsum("vi,ij,vj->v", weights, own, weights)))))
+        block = cov[j * nodes.shape[1] : (j + 1) * nodes.shape[1], j * nodes.shape[1] : (j + 1) * nodes.shape[1]]
+        out.append(float(np.sqrt(np.mean(np.einsum("vi,ij,vj->v", weights, block, weights)))))
     return out
 
 

@@ -114,23 +114,23 @@ def run(name: str, out: Path) -> None:
         train, test = (read_logs(folder / part, rig).data for part in ("train", "test"))
         began = time.perf_counter()
         closed = close_the_loop(rig, train, key=jax.random.key(0), log=record["log"].append)
-        found = findings(closed)
+        reported = findings(closed)
         error = {}
         for side, fitted in (("before", closed.before), ("after", closed.after)):
             prediction = predict(fitted, test, 1.0, key=jax.random.key(0))
             error[side] = horizon_errors(prediction, fitted, test, 1.0)
         record["seconds"] = time.perf_counter() - began
-        record |= {"effects": [entry(f) for f in found], "error": error, "oracle": plant.oracle_errors(case, folder)}
+        record |= {"effects": [entry(f) for f in reported], "error": error, "oracle": plant.oracle_errors(case, folder)}
     out.mkdir(parents=True, exist_ok=True)
     replace_text(out / f"{name.replace(':', '_')}.json", json.dumps(record))
 
 
 def _commit() -> str:
     """The commit that is run; empty outside a clone."""
-    told = subprocess.run(
+    process = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
     )
-    return told.stdout.strip()
+    return process.stdout.strip()
 
 
 def judged(record: dict[str, Any]) -> dict[str, Any]:
@@ -141,16 +141,16 @@ def judged(record: dict[str, Any]) -> dict[str, Any]:
     left, hits, near, inside = list(named), 0, [], []
     for true in truth:
         place = (true["name"], true.get("joint"), true.get("channel"))
-        for told in left:
-            here = (told["name"], told["joint"], told["channel"])
-            same = here == place or here in SAME.get(place, ())
+        for reported in left:
+            where = (reported["name"], reported["joint"], reported["channel"])
+            same = where == place or where in SAME.get(place, ())
             if true["name"] == "unknown_function":
-                same = told["name"] == "unknown_function" and set(told["inputs"]) == INPUTS[effect]
+                same = reported["name"] == "unknown_function" and set(reported["inputs"]) == INPUTS[effect]
             if same:
                 hits += 1
-                left.remove(told)
-                for key, estimate in told["parameters"].items():
-                    if key in true and here == place and group != "variant":
+                left.remove(reported)
+                for key, estimate in reported["parameters"].items():
+                    if key in true and where == place and group != "variant":
                         error = abs(estimate["value"] - true[key])
                         if key in ("phase", "center"):
                             turn = 2 * math.pi if key == "phase" else math.pi
@@ -204,14 +204,14 @@ def table(out: Path) -> str:
         if group == "clean" and not score["false"]:
             continue
         entries = record.get("effects", [])
-        found = "; ".join(_name(e) for e in entries) or "nothing"
+        effects = "; ".join(_name(e) for e in entries) or "nothing"
         values = "; ".join(
             f"{k} {v['value']:.3g} ± {v['std']:.1g}" for e in entries for k, v in e["parameters"].items()
         )
         true = ", ".join(f"{k} {v}" for t in record["truth"] for k, v in t.items() if isinstance(v, float))
         mark = "yes" if score["right"] and not score["extras"] else "with extras" if score["right"] else "**no**"
         lines.append(
-            f"| {group} {effect} {view} | {found} | {values} ({true}) | {mark} | "
+            f"| {group} {effect} {view} | {effects} | {values} ({true}) | {mark} | "
             f"{score['before']:.3g} / {score['after']:.3g} / {score['oracle']:.3g} | {record['seconds']:.0f} "
             f"| {record.get('code', '')} |"
         )

@@ -106,23 +106,23 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     args = parser.parse_args()
     set_up()
-    here = Path(__file__).parent
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
+    folder = Path(__file__).parent
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True)
     print(
         f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}, "
         f"jax {jax.__version__}, commit {commit.stdout.strip()}; `{' '.join(['python', *sys.argv])}`\n"
     )
     model, sweep = examples["slide"]()
-    found = []
+    rows = []
     for seed in range(args.seeds):
         logs = sweep_experiment(model, sweep, SEQUENCES, STEPS, key=jax.random.key(seed))
         test = sweep_experiment(model, sweep, TESTS, STEPS, key=jax.random.key(100 + seed))
         fitted = identify(declared("slide", model), logs.data, key=jax.random.key(seed))
-        found.append(shares(fitted, model, test, args.draws, seed))
+        rows.append(shares(fitted, model, test, args.draws, seed))
     print("| in the band | readings of the position, each seed | mean | true position | true velocity [%] |")
     print("| --- | --- | --- | --- | --- |")
-    for name in found[0]:
-        each = np.array([one[name] for one in found])
+    for name in rows[0]:
+        each = np.array([one[name] for one in rows])
         seeds = ", ".join(f"{share:.0f}" for share in each[:, 0])
         print(f"| {name} | {seeds} | {' | '.join(f'{share:.0f}' for share in each.mean(axis=0))} |")
 

@@ -78,12 +78,12 @@ def _congruent(a: jax.Array, p: jax.Array) -> jax.Array:
     return product(product(a, p), a.T)
 
 
-def seconds(function: Callable, given: tuple[jax.Array, ...], calls: int) -> float:
+def seconds(function: Callable, arguments: tuple[jax.Array, ...], calls: int) -> float:
     """Time of one call, mean over several."""
     start = time.perf_counter()
     for _ in range(calls):
-        found = function(*given)
-    jax.block_until_ready(found)
+        result = function(*arguments)
+    jax.block_until_ready(result)
     return (time.perf_counter() - start) / calls
 
 
@@ -99,10 +99,10 @@ def main() -> None:
     print("| by hand | type | own [us] | usual [us] | gains |\n| --- | --- | --- | --- | --- |")
     for row in rows():
         for dtype in row.types:
-            given = tuple(x.astype(dtype) for x in row.given)
+            arguments = tuple(x.astype(dtype) for x in row.given)
             own, usual = jax.jit(row.own), jax.jit(row.usual)
-            calls = max(1, int(2e-3 / max(seconds(f, given, 3) for f in (own, usual, own, usual)[2:])))
-            pairs = [(seconds(own, given, calls), seconds(usual, given, calls)) for _ in range(rounds)]
+            calls = max(1, int(2e-3 / max(seconds(f, arguments, 3) for f in (own, usual, own, usual)[2:])))
+            pairs = [(seconds(own, arguments, calls), seconds(usual, arguments, calls)) for _ in range(rounds)]
             mine, theirs = (1e6 * statistics.median(each) for each in zip(*pairs, strict=True))
             gain = statistics.median(b / a for a, b in pairs)
             print(f"| {row.name} | {dtype} | {mine:.3g} | {theirs:.3g} | {gain:.2g} |", flush=True)

@@ -35,20 +35,20 @@ SLIDE = plant.Case(system="slide", sequences=6, tests=1, steps=120, seed=2, nois
 
 def numbers(out: Path) -> dict:
     """Everything that a run leaves behind but the seconds that it took."""
-    found: dict = {}
+    contents: dict = {}
     for path in sorted(out.glob("*.npz")):
         with np.load(path) as stored:
             arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
             header = json.loads(stored["header"].tobytes())
             header.pop("notes")
-            found[path.name] = arrays, header
+            contents[path.name] = arrays, header
     for path in sorted(out.glob("*.csv")):
-        found[path.name] = path.read_bytes()
+        contents[path.name] = path.read_bytes()
     report = json.loads((out / "report.json").read_text())
     report.pop("seconds")
     for epoch in report.get("epochs", []):
         epoch.pop("seconds")
-    return found | {"report": report}
+    return contents | {"report": report}
 
 
 def start(command: str, rig: Path, out: Path, *more: str) -> subprocess.Popen:
@@ -59,24 +59,24 @@ def start(command: str, rig: Path, out: Path, *more: str) -> subprocess.Popen:
 
 def broken(command: str, rig: Path, out: Path, length: float, rng: random.Random) -> tuple[dict[str, int], bool]:
     """A run with faults until it ends: how many of each kind, and whether it was told well what was kept."""
-    tried, told, more = {"SIGKILL": 0, "SIGINT": 0}, True, ()
+    tried, stated, more = {"SIGKILL": 0, "SIGINT": 0}, True, ()
     while True:
         run, kind = start(command, rig, out, *more), rng.choice(list(tried))
         try:
             _, said = run.communicate(timeout=rng.uniform(0.0, length))
             if run.returncode:
                 raise SystemExit(said)
-            return tried, told
+            return tried, stated
         except subprocess.TimeoutExpired:
             run.send_signal(signal.Signals[kind])
         _, said = run.communicate()
         last = "".join(said.splitlines()[-1:])
         if run.returncode == 0 or "nnap-em: wrote" in last:  # its work was done when the fault came
-            return tried, told
+            return tried, stated
         tried[kind] += 1
         if kind == "SIGINT":
             well = run.returncode == 130 and last.startswith("nnap-em: stopped")
-            told = told and well
+            stated = stated and well
             if not well:
                 print(f"status {run.returncode}: {said}", file=sys.stderr)
         more = ("--resume",)
@@ -102,11 +102,11 @@ def main() -> None:
             length, whole = time.perf_counter() - began, numbers(Path(spare) / command)
             total, survived, runs = {"SIGKILL": 0, "SIGINT": 0}, 0, 0
             while sum(total.values()) < args.faults:
-                tried, told = broken(command, rig, out, length, rng)
+                tried, stated = broken(command, rig, out, length, rng)
                 same = numbers(out) == whole
                 total = {kind: total[kind] + tried[kind] for kind in total}
-                survived, runs = survived + sum(tried.values()) * (same and told), runs + 1
-                print(f"{command}: {tried}, same numbers: {same}, told: {told}", file=sys.stderr, flush=True)
+                survived, runs = survived + sum(tried.values()) * (same and stated), runs + 1
+                print(f"{command}: {tried}, same numbers: {same}, told: {stated}", file=sys.stderr, flush=True)
                 shutil.rmtree(out)
             kinds = " | ".join(str(count) for count in total.values())
             rows.append(f"| `{command}` | {length:.0f} s | {runs} | {kinds} | {survived} of {sum(total.values())} |")

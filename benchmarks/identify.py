@@ -94,9 +94,9 @@ def cramer_rao(truth_fit: Identified, fitted: Identified, truth, smoother, data,
     @jax.jit
     @jax.vmap
     def information_of(posterior, seq):
-        here = local(model, fitted.m_step.prior, posterior.state, seq)
-        read = readings_at(model, posterior, here.seq)
-        return quadratic(model.log_q, model.log_r, model.start, here, nodes, posterior, read).information
+        linear = local(model, fitted.m_step.prior, posterior.state, seq)
+        read = readings_at(model, posterior, linear.seq)
+        return quadratic(model.log_q, model.log_r, model.start, linear, nodes, posterior, read).information
 
     information = jnp.sum(information_of(posterior, data), axis=0)
     flat, law = ravel_pytree(truth.unknown)

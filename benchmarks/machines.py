@@ -76,13 +76,13 @@ def measured(system: AbstractSystem, rounds: int) -> tuple[float, float]:
 
 def rows(folder: Path) -> dict[str, AbstractSystem]:
     """What is timed."""
-    found = {"acrobot, built in": examples["acrobot"]().model.system}
+    cases = {"acrobot, built in": examples["acrobot"]().model.system}
     for name in ("acrobot", "cartpole", "furuta"):
-        found[f"{name}.xml, 2 joints"] = tree(ROOT / "examples" / "machines" / f"{name}.xml")
+        cases[f"{name}.xml, 2 joints"] = tree(ROOT / "examples" / "machines" / f"{name}.xml")
     for count in range(1, 8):
         (folder / "arm.xml").write_text(arm(count))
-        found[f"arm, {count} joint{'s' * (count > 1)}"] = tree(folder / "arm.xml")
-    return found
+        cases[f"arm, {count} joint{'s' * (count > 1)}"] = tree(folder / "arm.xml")
+    return cases
 
 
 def main() -> None:

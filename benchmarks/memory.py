@@ -145,14 +145,14 @@ def roll(laws: Sequence[Any], x, u, rng: np.random.Generator | None = None):
         return np.concatenate([x[2:4], accelerations(x[:2], x[2:4], tau), np.stack(slip)])
 
     states, torques, h = [], [], DT / SUBSTEPS
-    for now in u:
+    for torque in u:
         states.append(x)
         torques.append(np.stack([law(x[4 + j], x[2 + j])[0] for j, law in enumerate(laws)]))
         for _ in range(SUBSTEPS):
-            a = rate(x, now)
-            b = rate(x + h / 2 * a, now)
-            c = rate(x + h / 2 * b, now)
-            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, now))
+            a = rate(x, torque)
+            b = rate(x + h / 2 * a, torque)
+            c = rate(x + h / 2 * b, torque)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, torque))
         if rng is not None:
             x = np.concatenate([x[:2], x[2:4] + KICK * rng.standard_normal(x[2:4].shape), x[4:]])
     return np.stack(states).transpose(2, 0, 1), np.stack(torques).transpose(2, 0, 1)

@@ -36,14 +36,14 @@ def main() -> None:
     killed = 0
     for mutant in share:
         with tempfile.TemporaryDirectory() as folder:
-            found = run(copy(Path(folder), mutant), mutant.test)
-        dead = found.failed == 1 and found.asserted
+            outcome = run(copy(Path(folder), mutant), mutant.test)
+        dead = outcome.failed == 1 and outcome.asserted
         killed += dead
-        state = "red" if dead else "green" if found.passed else "does not run"
+        state = "red" if dead else "green" if outcome.passed else "does not run"
         test = mutant.test.removeprefix("test_").replace(".py::test_", ": ").replace("_", " ")
         print(f"| {mutant.what} | `{mutant.file}` | {test} | {state} |", flush=True)
         if not dead:
-            print(found.said[-3000:], file=sys.stderr, flush=True)
+            print(outcome.said[-3000:], file=sys.stderr, flush=True)
     print(f"\n{killed} of {len(share)} turn their test red.")
 
 

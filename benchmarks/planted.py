@@ -33,14 +33,14 @@ from nnap_em.storage.files import replace_text
 def run(name: str, out: Path, limit: float) -> dict[str, Any]:
     """`nnap-em diagnose` on a case in a process of its own, ended after `limit` [s]; writes and returns the record."""
     with tempfile.TemporaryDirectory() as folder:
-        case, found = Path(folder, "case"), Path(folder, "found")
+        case, result = Path(folder, "case"), Path(folder, "found")
         record: dict[str, Any] = {"case": name, "truth": make(name, case), "code": _commit()}
         record["log_seconds"] = sum(
             sum(1 for _ in path.open()) * tomllib.loads((case / "rig.toml").read_text())["sampling"]["dt"]
             for path in case.glob("train/*.csv")
         )
         environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose", str(case), "--out", str(found), "--quiet"]
+        command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose", str(case), "--out", str(result), "--quiet"]
         began, spent = time.perf_counter(), _processor()
         with Path(folder, "said").open("w+") as said:
             process = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
@@ -56,7 +56,7 @@ def run(name: str, out: Path, limit: float) -> dict[str, Any]:
         record["seconds"] = time.perf_counter() - began
         record["processor_seconds"] = _processor() - spent
         if status == 0:
-            record["report"] = json.loads((found / "report.json").read_text())
+            record["report"] = json.loads((result / "report.json").read_text())
         else:
             record["failed"] = status if isinstance(status, str) else f"status {status}: {last}"
     out.mkdir(parents=True, exist_ok=True)

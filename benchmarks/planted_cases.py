@@ -303,22 +303,22 @@ class Case(NamedTuple):
 
 
 def _plant(word: str) -> Plant:
-    found = re.fullmatch(r"([a-z]+)(?:([12])|_(d?theta[12]|all))?", word)
-    if not found or found[1] not in LAWS:
+    match = re.fullmatch(r"([a-z]+)(?:([12])|_(d?theta[12]|all))?", word)
+    if not match or match[1] not in LAWS:
         raise ValueError(f"{word!r} is no law; known: {', '.join(LAWS)}, with its joint or _channel behind")
-    law, joint, channel = LAWS[found[1]], found[2], found[3]
+    law, joint, channel = LAWS[match[1]], match[2], match[3]
     sensor = bool(law.reading or law.delay)
     if (bool(joint), bool(channel)) != (not (sensor or law.whole), sensor):
         raise ValueError(f"{word!r}: a force or drive stands with its joint, a sensor with its channel, {WHOLE} alone")
-    return Plant(found[1], int(joint) if joint else None, channel)
+    return Plant(match[1], int(joint) if joint else None, channel)
 
 
 def case_of(name: str) -> Case:
     """The case of a name."""
-    rig, _, rest = name.partition("-")
-    if rest == "recorded":
+    rig, _, planted = name.partition("-")
+    if planted == "recorded":
         return Case(name, rig, (), "none")
-    laws, _, strength = rest.rpartition("-")
+    laws, _, strength = planted.rpartition("-")
     if strength not in STRENGTHS:
         raise ValueError(f"{name!r}: a case is RIG-LAWS-STRENGTH or RIG-recorded, strengths are {', '.join(STRENGTHS)}")
     return Case(name, rig, tuple(map(_plant, laws.split("+"))), strength)

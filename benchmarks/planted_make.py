@@ -73,8 +73,8 @@ def read(rig: str, data: Path = DATA) -> Rig:
             continue
         names, rows = texts[part] = csv_fields(full / part)
         logs[part] = dict(zip(names, np.asarray(rows, float).T, strict=True))
-        shown, own = csv_fields(path)
-        for name, column in zip(shown, np.asarray(own, float).T, strict=True):
+        shown, table = csv_fields(path)
+        for name, column in zip(shown, np.asarray(table, float).T, strict=True):
             if not np.array_equal(column, logs[part][name]):
                 raise ValueError(f"{path}: column {name!r} is not that of {full / part}")
     return Rig(folder, declared, body, logs, texts, shown)

@@ -123,52 +123,52 @@ def _near(a: float, b: float, share: float = 0.15) -> bool:
     return abs(a - b) <= share * abs(b)
 
 
-def _value(told: Entry, name: str) -> float:
-    return told["parameters"].get(name, {}).get("value", math.nan)
+def _value(entry: Entry, name: str) -> float:
+    return entry["parameters"].get(name, {}).get("value", math.nan)
 
 
-def _free(truth: Entry, told: Entry) -> bool:
+def _free(truth: Entry, entry: Entry) -> bool:
     """Whether an unknown function is the free form of a law."""
-    if told["name"] != "unknown_function" or told["joint"] != truth.get("joint"):
+    if entry["name"] != "unknown_function" or entry["joint"] != truth.get("joint"):
         return False
     signals = truth["inputs"] or [f"{s}{truth.get('joint')}" for s in FREE.get(truth["name"], ())]
-    return bool(signals) and set(told["inputs"]) == set(signals)
+    return bool(signals) and set(entry["inputs"]) == set(signals)
 
 
-def _other_gain(truth: Entry, told: Entry) -> bool:
+def _other_gain(truth: Entry, entry: Entry) -> bool:
     """A gain of one input is the inverse gain of the other, with all masses and friction scaled."""
-    names = {truth["name"], told["name"]} == {"motor_gain"}
-    return names and told["joint"] != truth["joint"] and _near(_value(told, "gain"), 1 / truth["parameters"]["gain"])
+    names = {truth["name"], entry["name"]} == {"motor_gain"}
+    return names and entry["joint"] != truth["joint"] and _near(_value(entry, "gain"), 1 / truth["parameters"]["gain"])
 
 
-def _part(truth: Entry, told: Entry) -> bool:
+def _part(truth: Entry, entry: Entry) -> bool:
     """Whether an effect is a part of a law: an overtone, or a harmonic of a square wave."""
-    own = truth["parameters"]
-    if truth["law"] == "ripple" and place(told) == place(truth):
-        return any(_near(_value(told, "k"), n * own["k"], 0.05) for n in (1, 2))
-    if truth["law"] == "square" and told["name"] == "base_vibration":
-        return any(_near(_value(told, "frequency"), n * own["frequency"], 0.02) for n in (1, 3, 5, 7))
+    numbers = truth["parameters"]
+    if truth["law"] == "ripple" and place(entry) == place(truth):
+        return any(_near(_value(entry, "k"), n * numbers["k"], 0.05) for n in (1, 2))
+    if truth["law"] == "square" and entry["name"] == "base_vibration":
+        return any(_near(_value(entry, "frequency"), n * numbers["frequency"], 0.02) for n in (1, 3, 5, 7))
     return False
 
 
 def matched(truth: Entry, left: Sequence[Entry]) -> list[Entry]:
     """Which of the effects told so far unmatched name a truth; the one with its own name, if there is one, first."""
-    own = [t for t in left if place(t) == place(truth) and truth["name"] != "unknown_function"]
-    parts = [t for t in left if _part(truth, t) and t not in own[:1]]
-    if own or parts:
-        return [*own[:1], *parts]
+    named = [t for t in left if place(t) == place(truth) and truth["name"] != "unknown_function"]
+    parts = [t for t in left if _part(truth, t) and t not in named[:1]]
+    if named or parts:
+        return [*named[:1], *parts]
     for same in SAME.get(place(truth), ()):
-        told = [t for t in left if place(t) in same]
-        if len(told) == len(same):
-            return told
+        entries = [t for t in left if place(t) in same]
+        if len(entries) == len(same):
+            return entries
     return [t for t in left if _free(truth, t) or _other_gain(truth, t)][:1]
 
 
-def parameters(truth: Entry, told: Entry, law: Law) -> tuple[list[bool], list[bool]]:
+def parameters(truth: Entry, entry: Entry, law: Law) -> tuple[list[bool], list[bool]]:
     """Parameter by parameter: right within 15 %, and inside two stated standard deviations."""
     near, inside = [], []
-    for name in law.scored if place(told) == place(truth) and told["parameters"] else ():
-        true, value = truth["parameters"][name], told["parameters"][name]
+    for name in law.scored if place(entry) == place(truth) and entry["parameters"] else ():
+        true, value = truth["parameters"][name], entry["parameters"][name]
         error = abs(value["value"] - true)
         if (period := ANGLES.get(name)) is not None:
             error = min(error % period, period - error % period) if math.isfinite(period) else error
@@ -184,15 +184,15 @@ def errors(report: Entry, side: str) -> tuple[float, ...]:
     return tuple(math.hypot(*(e[i] for e in angles)) for i in at)
 
 
-def _touches(true: Sequence[Entry], told: Sequence[Entry]) -> tuple[int, int, int]:
+def _touches(true: Sequence[Entry], reported: Sequence[Entry]) -> tuple[int, int, int]:
     """True touches, those found (middle within .1 s, sign right), and what was told beside."""
 
     def same(a: Entry, b: Entry) -> bool:
         apart = abs(a["from"] + a["to"] - b["from"] - b["to"]) / 2
         return a["file"] == b["file"] and a["joint"] == b["joint"] and apart <= 0.1 and a["size"] * b["size"] > 0
 
-    found = sum(any(same(t, s) for s in told) for t in true)
-    return len(true), found, sum(not any(same(t, s) for t in true) for s in told)
+    hits = sum(any(same(t, s) for s in reported) for t in true)
+    return len(true), hits, sum(not any(same(t, s) for t in true) for s in reported)
 
 
 def score(record: Entry, controls: Mapping[str, Entry]) -> Score:
@@ -200,12 +200,12 @@ def score(record: Entry, controls: Mapping[str, Entry]) -> Score:
     report, truths = record.get("report"), record["truth"]["effects"]
     left: list[Entry] = list(report["effects"]) if report else []
     named, near, inside = 0, [], []
-    found = "; ".join(map(words, left)) or "nothing"
+    effects = "; ".join(map(words, left)) or "nothing"
     for truth in truths:
-        told = matched(truth, left)
-        left = [t for t in left if t not in told]
-        named += bool(told)
-        for one in told[:1]:
+        entries = matched(truth, left)
+        left = [t for t in left if t not in entries]
+        named += bool(entries)
+        for one in entries[:1]:
             flags = parameters(truth, one, LAWS[truth["law"]])
             near, inside = near + flags[0], inside + flags[1]
     known = bool(report and report["error"])
@@ -225,7 +225,7 @@ def score(record: Entry, controls: Mapping[str, Entry]) -> Score:
         _touches(record["truth"].get("touches", []), report.get("interventions", []) if report else []),
         record["processor_seconds"],
         record.get("failed", ""),
-        record.get("failed", "") or found,
+        record.get("failed", "") or effects,
     )
 
 
@@ -244,14 +244,14 @@ def _numbers(values: Mapping[str, Any]) -> str:
 def _group(scores: Sequence[Score], title: str) -> str:
     ratios = [s.ratio for s in scores if s.right and math.isfinite(s.ratio)]
     near, inside = [f for s in scores for f in s.near], [f for s in scores for f in s.inside]
-    told = [s for s in scores if s.before]
+    scored = [s for s in scores if s.before]
     cells = [
         title,
         str(len(scores)),
         _of([s.right for s in scores]),
         _of([s.right and not s.extras for s in scores]),
         _of([s.extras > 0 for s in scores]),
-        _of([not s.worse for s in told]),
+        _of([not s.worse for s in scored]),
         f"{statistics.median(ratios):.2f} ({len(ratios)})" if ratios else "-",
         _of(near),
         _of(inside),
@@ -299,15 +299,15 @@ def table(records: Sequence[Entry]) -> str:
     lines += [_group(group, title) for title, group in groups.items() if group]
     as_recorded = [s for s in scores.values() if s.strength == "none"]
     if as_recorded:
-        told = sum(s.extras > 0 for s in as_recorded)
+        reported = sum(s.extras > 0 for s in as_recorded)
         raised = sum(s.raised and s.extras > 0 for s in as_recorded)
         lines.append(
-            f"\nAs recorded: {len(as_recorded)} rigs, something reported on {told}, the .5 s test error raised"
+            f"\nAs recorded: {len(as_recorded)} rigs, something reported on {reported}, the .5 s test error raised"
         )
         lines.append(f"by more than 2 % on {raised}.")
-    true, found, false = (sum(s.touches[i] for s in scores.values()) for i in range(3))
+    true, hits, false = (sum(s.touches[i] for s in scores.values()) for i in range(3))
     span = sum(r["log_seconds"] for r in records)
-    lines += ["", f"Touches: {found} of {true} found, {false} false ones in {span:.0f} s of training recordings.", ""]
+    lines += ["", f"Touches: {hits} of {true} found, {false} false ones in {span:.0f} s of training recordings.", ""]
     lines += _head(CASE_COLUMNS)
     for record in sorted(records, key=lambda r: (r["truth"]["strength"] == "none", r["case"])):
         lines.append(_line(record, scores[record["case"]]))
@@ -319,7 +319,7 @@ def _line(record: Entry, s: Score) -> str:
         f"{words(t)} ({_numbers(t['parameters'])}; {100 * t['share']:.0f} %)" for t in record["truth"]["effects"]
     )
     effects = record["report"]["effects"] if "report" in record else []
-    found = "; ".join(f"{words(e)} ({_numbers(e['parameters'])})" if e["parameters"] else words(e) for e in effects)
+    reported = "; ".join(f"{words(e)} ({_numbers(e['parameters'])})" if e["parameters"] else words(e) for e in effects)
     mark = "yes" if s.right and not s.extras else "with extras" if s.right else f"**{s.named} of {s.truths}**"
     if not s.truths:
         mark = "**false**" if s.extras else "yes"
@@ -332,7 +332,7 @@ def _line(record: Entry, s: Score) -> str:
         s.split,
         record["code"],
         truth or "-",
-        s.failed or found or "nothing",
+        s.failed or reported or "nothing",
         mark,
         error,
         ratio,

@@ -154,17 +154,17 @@ def spoil(folder: Path, case: plant.Case, change: Change) -> dict[str, Spoilt]:
 
 def detection(logs: Logs, done: dict[str, Spoilt]) -> tuple[int, int, int, int]:
     """Wrong readings that are masked, all wrong ones, right ones that are masked, rows that are not used."""
-    found = there = false = cut = 0
+    hits = total = false = cut = 0
     for file, y in zip(logs.files, np.asarray(logs.data.y), strict=True):
         log = done[file]
         cut += sum(entry.amount for entry in logs.masked if entry.file == file and entry.kind == "cut")
         for column, wrong in zip(np.moveaxis(y, -1, 0), log.wrong.values(), strict=True):
             last = int(np.asarray(logs.data.valid)[logs.files.index(file)].sum())
             masked, kept = np.isnan(column[:last]), log.kept[:last]
-            found += np.sum(masked & wrong[:last] & kept)
-            there += np.sum(wrong[:last] & kept)
+            hits += np.sum(masked & wrong[:last] & kept)
+            total += np.sum(wrong[:last] & kept)
             false += np.sum(masked & ~wrong[:last] & kept)
-    return int(found), int(there), int(false), cut
+    return int(hits), int(total), int(false), cut
 
 
 def friction_error(fitted, case: plant.Case) -> list[float]:
@@ -194,8 +194,8 @@ def study(case: plant.Case, kind: str, trust: bool) -> dict[str, float | list[fl
         rig, train.data, key=jax.random.key(0), watch=lambda state, seen, used: out.append(int((~used).sum()))
     )
     seconds = time.perf_counter() - began
-    found = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-    error = horizon_errors(found, fitted, test.data, 1.0)[rig.measured[0]][HORIZONS.index(1.0)]
+    prediction = predict(fitted, test.data, 1.0, key=jax.random.key(0))
+    error = horizon_errors(prediction, fitted, test.data, 1.0)[rig.measured[0]][HORIZONS.index(1.0)]
     return {
         "error": error,
         "friction": friction_error(fitted, case),
@@ -225,11 +225,11 @@ def main() -> None:
         for kind in args.only or kinds(case, Logs((), _nothing(), ())):
             row = study(case, kind, args.trust)
             first = first or row
-            found, there, false, cut = row["detection"]
+            hits, total, false, cut = row["detection"]
             ratio = [a / b for a, b in zip(row["friction"], first["friction"], strict=True)]
             cells = [system, kind, f"{row['error']:.4f}", f"{row['error'] / first['error']:.2f}"]
             cells += [", ".join(f"{v:.4f}" for v in row["friction"]), ", ".join(f"{v:.2f}" for v in ratio)]
-            cells += [f"{found} of {there}", str(false), str(cut), str(row["left_out"]), f"{row['seconds']:.0f}"]
+            cells += [f"{hits} of {total}", str(false), str(cut), str(row["left_out"]), f"{row['seconds']:.0f}"]
             print(f"| {' | '.join(cells)} |", flush=True)
 
 

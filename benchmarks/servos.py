@@ -74,8 +74,8 @@ def write(folder: Path, joints: int, undeclared: str | None = None) -> Rig:
     (folder / "servos.xml").write_text(text)
     names = ", ".join(f'"joint{i + 1}"' for i in range(joints))
     tables = [f"[input.goal{i + 1}]\nkp = {{ mean = {SHARE * KP[i]}, std = {0.4 * KP[i]} }}\n" for i in range(joints)]
-    plain, delay, rest = RIG.format(dt=DT, joints=names).partition("delay = { mean = 0.01, std = 0.01 }\n")
-    (folder / "rig.toml").write_text(plain + rest if undeclared else plain + delay + rest + "".join(tables))
+    plain, delay, end = RIG.format(dt=DT, joints=names).partition("delay = { mean = 0.01, std = 0.01 }\n")
+    (folder / "rig.toml").write_text(plain + end if undeclared else plain + delay + end + "".join(tables))
     return read_rig(folder / "rig.toml", specs)
 
 
@@ -119,13 +119,13 @@ def simulated(
 
 def judged(fit: Identified, joints: int, data: Dataset) -> list[str]:
     """A row of the table for every joint."""
-    found, out = parameter_table(fit), []
+    table, out = parameter_table(fit), []
     speed = np.percentile(np.abs(np.diff(np.asarray(data.y), axis=1)) / DT, 99, axis=(0, 1))
     v = speed[:, None] * np.linspace(-1.0, 1.0, 101)
     curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v.T))).T
     for i in range(joints):
-        gain = 100 * (found[f"goal{i + 1}.kp"][0] / KP[i] - 1)
-        delay = 1e3 * (found[f"goal{i + 1}.delay"][0] - DELAY[i])
+        gain = 100 * (table[f"goal{i + 1}.kp"][0] / KP[i] - 1)
+        delay = 1e3 * (table[f"goal{i + 1}.delay"][0] - DELAY[i])
         truth = friction(v[i], np.asarray(COULOMB[i]))
         missed = np.linalg.norm(curve[i] - truth) / np.linalg.norm(truth)
         out.append(f"| joint{i + 1} | {gain:+.1f} | {delay:+.2f} | {missed:.3f} |")
@@ -142,11 +142,11 @@ def searched(folder: Path, joints: int, shape: tuple[int, int], seed: int, undec
         limit = LIMIT * float(np.abs(KP[0] * (free.u - free.y) - KD[0] * rate)[..., 0].max())
     data = simulated(path, joints, *shape, seed, undeclared, limit)
     began = time.perf_counter()
-    found = findings(close_the_loop(rig, data, key=jax.random.key(seed)))
+    reported = findings(close_the_loop(rig, data, key=jax.random.key(seed)))
     laws = "; ".join(
         f"{one.effect.name} of joint {one.effect.joint} "
         + ", ".join(f"{name} {number.value:.4g} ± {number.std:.1g}" for name, number in one.parameters.items())
-        for one in found
+        for one in reported
     )
     true = {"delay": f"{1e3 * DELAY[0]:g} ms", "limit": f"{limit:.3g} N m", "load": f"{LOAD:g}"}[undeclared]
     return f"| {undeclared}, {true} | {seed} | {laws or 'nothing'} | {time.perf_counter() - began:.0f} |"

@@ -143,8 +143,8 @@ def check(rig: Rig) -> None:
         data.qpos, data.qvel, data.ctrl = rng.normal(size=(3, 2))
         mujoco.mj_forward(model, data)
         q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
-        own = jnp.linalg.solve(arm.mass(q), jnp.asarray(data.ctrl) - arm.bias(q, v))
-        np.testing.assert_allclose(data.qacc, own, rtol=1e-6, atol=1e-6)
+        acceleration = jnp.linalg.solve(arm.mass(q), jnp.asarray(data.ctrl) - arm.bias(q, v))
+        np.testing.assert_allclose(data.qacc, acceleration, rtol=1e-6, atol=1e-6)
 
 
 def fit_peer(rig: Rig, train: Dataset) -> mujoco.MjModel:
@@ -177,8 +177,8 @@ def fit_peer(rig: Rig, train: Dataset) -> mujoco.MjModel:
 
     def compare(params, predicted, measured, model, return_pred_all, *, state, **_):
         """Angles in rad; of the states, as sensors of a rollout are one step old."""
-        told = sysid.TimeSeries(measured.times, state[SUBSTEPS - 1 :: SUBSTEPS, 1:3])
-        return told.data - measured.data, told, measured
+        series = sysid.TimeSeries(measured.times, state[SUBSTEPS - 1 :: SUBSTEPS, 1:3])
+        return series.data - measured.data, series, measured
 
     def residual(x, params):
         """The toolbox's residual of all chunks, one column per point of a finite difference."""
@@ -190,8 +190,8 @@ def fit_peer(rig: Rig, train: Dataset) -> mujoco.MjModel:
         return [errors], None, None
 
     with contextlib.redirect_stdout(sys.stderr):  # a line for every iteration
-        found, _ = sysid.optimize(params, residual, verbose=False, max_iters=50)
-    return build(found, spec)
+        optimum, _ = sysid.optimize(params, residual, verbose=False, max_iters=50)
+    return build(optimum, spec)
 
 
 def peer_paths(model: mujoco.MjModel, data: Dataset, start: Start, dt: float) -> np.ndarray:
@@ -219,8 +219,8 @@ def predicted_paths(fitted: Identified, data: Dataset, start: Start, dt: float) 
     out = np.empty((len(start.row), len(HORIZONS), 2))
     for row in np.unique(start.row):
         mean = np.asarray(predict(fitted, data, row * dt, key=jax.random.key(0)).mean)
-        here = start.row == row
-        out[here] = mean[start.seq[here]][:, [row + k for k in ends(dt)], :2]
+        mask = start.row == row
+        out[mask] = mean[start.seq[mask]][:, [row + k for k in ends(dt)], :2]
     return out
 
 
@@ -243,18 +243,18 @@ def study(folder: Path, *, alone: bool) -> list[list[str]]:
     train, test = (jax.tree.map(jnp.asarray, read_logs(folder / part, rig).data) for part in ("train", "test"))
     check(rig)
     start = starts(test, rig.dt, EVERY, max(HORIZONS), EVERY)
-    told, began = {}, time.process_time()
+    paths, began = {}, time.process_time()
     if not alone:
         peer = fit_peer(rig, train)
-        told["mujoco.sysid"] = peer_paths(peer, test, start, rig.dt), f"{time.process_time() - began:.0f}"
+        paths["mujoco.sysid"] = peer_paths(peer, test, start, rig.dt), f"{time.process_time() - began:.0f}"
     began = time.process_time()
     fitted = identify(rig, train, key=jax.random.key(0))
     spent = time.process_time() - began
-    told["nnap-em"] = predicted_paths(fitted, test, start, rig.dt), f"{spent:.0f}"
-    told["nnap-em, same start"] = same_start_paths(fitted, test, start, rig.dt), "-"
+    paths["nnap-em"] = predicted_paths(fitted, test, start, rig.dt), f"{spent:.0f}"
+    paths["nnap-em, same start"] = same_start_paths(fitted, test, start, rig.dt), "-"
     return [
         [folder.name, str(len(start.row)), who, *cells(path, test, start, rig.dt), spent]
-        for who, (path, spent) in told.items()
+        for who, (path, spent) in paths.items()
     ]
 
 

@@ -113,14 +113,14 @@ def limit_lines(rows: list[dict]) -> list[str]:
     """How far the filter is from the transition, and the transition from C."""
     rate = {row["what"]: pace(row) * row["size"][2] for row in rows if row["who"] in ("nnap_em", "limit")}
     most = max(row["size"][2] for row in rows if row["who"] == "nnap_em")
-    own = rate["our transition alone"]
+    ours = rate["our transition alone"]
     pairs = {
-        "our transition / C transition": own / rate["C transition"],
-        "our transition / C transition, 512-bit vectors": own / rate["C transition, 512-bit vectors"],
-        "our transition / natural transition": own / rate["natural transition alone"],
-        "bootstrap filter / our transition": rate[f"bootstrap filter, {most}"] / own,
+        "our transition / C transition": ours / rate["C transition"],
+        "our transition / C transition, 512-bit vectors": ours / rate["C transition, 512-bit vectors"],
+        "our transition / natural transition": ours / rate["natural transition alone"],
+        "bootstrap filter / our transition": rate[f"bootstrap filter, {most}"] / ours,
         "bootstrap filter / C transition": rate[f"bootstrap filter, {most}"] / rate["C transition"],
-        "guided filter / our transition": rate[f"guided filter, {most}"] / own,
+        "guided filter / our transition": rate[f"guided filter, {most}"] / ours,
     }
     return ["", *table(["particle-steps/s of", "ratio"], [[k, f"{v:.2f}"] for k, v in pairs.items()])]
 
@@ -252,8 +252,8 @@ def main() -> None:
             lines += large((10, 50, 100) if args.quick else (1000, 500, 1000), cpus, cache)
         if "epoch" in args.only:
             two = cpus[:2]
-            found = child({"task": "epoch", "size": size, "repeats": 3}, two, cache)
-            rows = [[name, f"{v['time']:.2f}", f"{v['compile']:.1f}"] for name, v in found.items()]
+            timings = child({"task": "epoch", "size": size, "repeats": 3}, two, cache)
+            rows = [[name, f"{v['time']:.2f}", f"{v['compile']:.1f}"] for name, v in timings.items()]
             head = ["smoother", "time [s]", "compile [s]"]
             title = f"## One EM epoch of `nnap-em identify` on {len(two)} cores, 64 bits"
             lines += ["", title, "", *table(head, rows)]
@@ -282,9 +282,9 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
         curves[axis] = {}
         for smoother in ("particle",) if axis == "particles" else ("extended", "particle"):
             order = {"task": "growth", "smoother": smoother, "axis": axis, "points": at, "base": base}
-            found = curves[axis][smoother] = child(order, cpus, cache, measure_memory=True)
+            runs = curves[axis][smoother] = child(order, cpus, cache, measure_memory=True)
             rows += [
-                [smoother, f"{r['point']} {axes[axis]}", f"{r['time']:.3g}", f"{r['memory'] / 1e6:.0f}"] for r in found
+                [smoother, f"{r['point']} {axes[axis]}", f"{r['time']:.3g}", f"{r['memory'] / 1e6:.0f}"] for r in runs
             ]
     lines = ["", "## How time and memory grow", ""]
     lines.append(f"`e_step` as the library sets it, {base[0]} sequences x {base[1]} steps, {base[2]} particles and")
@@ -299,21 +299,19 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
 def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
     """Section of the speed-up by cores."""
     counts = [n for n in (1, 2, 4) if n <= len(cpus)]
-    found = {n: child({"task": "cores", "size": size, "repeats": 5}, cpus[:n], cache) for n in counts}
-    rows = [
-        [name, *(f"{found[n][name]:.3g} ({found[1][name] / found[n][name]:.2f})" for n in counts)] for name in found[1]
-    ]
+    runs = {n: child({"task": "cores", "size": size, "repeats": 5}, cpus[:n], cache) for n in counts}
+    rows = [[name, *(f"{runs[n][name]:.3g} ({runs[1][name] / runs[n][name]:.2f})" for n in counts)] for name in runs[1]]
     head = ["smoother", *(f"{n} core{'s' * (n > 1)} [s] (speed-up)" for n in counts)]
     return ["", f"## Cores: `e_step` on {size[0]} x {size[1]}, as the library sets it", "", *table(head, rows)]
 
 
 def large(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
     """Sentence on work whose whole history would not fit into memory."""
-    found = child({"task": "large", "size": size}, cpus, cache, measure_memory=True)
+    timing = child({"task": "large", "size": size}, cpus, cache, measure_memory=True)
     return [
         "",
         f"{size[0]} sequences x {size[1]} steps x {size[2]} particles with exact backward sampling of 25 trajectories, "
-        f"on {len(cpus)} cores: {found['time']:.0f} s with compilation, peak memory {found['memory'] / 1e9:.1f} GB.",
+        f"on {len(cpus)} cores: {timing['time']:.0f} s with compilation, peak memory {timing['memory'] / 1e9:.1f} GB.",
     ]
 
 

@@ -46,7 +46,7 @@ def groups(whole: Size, quick: bool) -> dict[str, list[Case]]:
     pair = half._replace(sequences=2)
     sizes = (whole,) if quick else (whole._replace(particles=most // 10), half, whole)
     limit = whole._replace(steps=whole.steps // 5, particles=64 * -(-most // 64))
-    own = lambda x, u: common_model().transition(x, Inputs.held(u))  # noqa: E731
+    transition = lambda x, u: common_model().transition(x, Inputs.held(u))  # noqa: E731
     return {
         "extended": [
             smoother_case("one start, one pass", ExtendedKalmanSmoother(one_start, iterations=0), plain),
@@ -61,7 +61,7 @@ def groups(whole: Size, quick: bool) -> dict[str, list[Case]]:
             dynamax_case("unscented", True, plain),
         ],
         "filter": [
-            transition_case("our transition alone", own, 1, limit),
+            transition_case("our transition alone", transition, 1, limit),
             transition_case("natural transition alone", natural_transition(common_model()), 0, limit),
             c_case("C transition", (), limit),
             c_case("C transition, 512-bit vectors", ("-mprefer-vector-width=512",), limit),

@@ -73,13 +73,13 @@ def main() -> None:
             logs, x = recorded(text, law, case.push, noise, sequences=8, rows=400, seed=seed)
             began = time.perf_counter()
             fitted = identify(rig, logs._replace(y=logs.y[..., read]), key=jax.random.key(seed))
-            took, found = time.perf_counter() - began, errors(fitted.model.unknown, law, x)
+            took, missed = time.perf_counter() - began, errors(fitted.model.unknown, law, x)
             logs, x = recorded(text, law, case.push, noise, sequences=4, rows=400, seed=100 + seed)
             with TemporaryDirectory() as folder:
                 write_mjcf(fitted, Path(folder) / "identified.xml")
                 files = text, (Path(folder) / "identified.xml").read_text()
             said = [", ".join(" / ".join(f"{e:.2g}" for e in row) for row in ahead(one, x, logs.u)) for one in files]
-            cells = machine, seed, " / ".join(f"{e:.3f}" for e in found), *said, f"{took:.0f}"
+            cells = machine, seed, " / ".join(f"{e:.3f}" for e in missed), *said, f"{took:.0f}"
             print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 

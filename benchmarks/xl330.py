@@ -132,17 +132,17 @@ def write(folder: Path, supply: str, more: str) -> Rig:
 
 def published(python: str, logs: list[dict]) -> dict[str, list[np.ndarray]]:
     """Angles of the published models every `DT` [rad]."""
-    keys, given = ("position", "speed", "goal_position"), []
+    keys, recordings = ("position", "speed", "goal_position"), []
     for log in logs:
         columns = {key: column(log, key, FINE).tolist() for key in keys}
         rows = [
             dict(zip(keys, row, strict=True)) | {"torque_enable": True} for row in zip(*columns.values(), strict=True)
         ]
         head = {key: log[key] for key in ("mass", "length", "kp", "vin")}
-        given.append(head | {"arm_mass": 0.0, "dt": FINE, "entries": rows})
+        recordings.append(head | {"arm_mass": 0.0, "dt": FINE, "entries": rows})
     models = sorted(map(str, RAW.glob("published_*.json")))
     done = subprocess.run(
-        [python, "-c", PUBLISHED], input=json.dumps([given, models]), capture_output=True, text=True, check=True
+        [python, "-c", PUBLISHED], input=json.dumps([recordings, models]), capture_output=True, text=True, check=True
     )
     angles = json.loads(done.stdout).items()
     return {Path(name).stem: [np.asarray(x)[:: round(DT / FINE)] for x in paths] for name, paths in angles}
@@ -163,20 +163,20 @@ def fitted(rig: Rig, folder: Path, laws: tuple[AbstractEffect, ...], search: flo
     data, key = read_logs(folder / "train", rig).data, jax.random.key(seed)
     if search:
         outcome = close_the_loop(rig, data, key=key, seconds=search, log=print)
-        for found in findings(outcome):
-            numbers = ", ".join(f"{name} {x.value:.4g} ± {x.std:.1g}" for name, x in found.parameters.items())
-            print(f"found: {found.effect.name} {numbers}", flush=True)
+        for finding in findings(outcome):
+            numbers = ", ".join(f"{name} {x.value:.4g} ± {x.std:.1g}" for name, x in finding.parameters.items())
+            print(f"found: {finding.effect.name} {numbers}", flush=True)
         return outcome.after
     return identify(rig, data, key=key, start=started(rig, data, laws, key) if laws else None)
 
 
 def started(rig: Rig, data: Dataset, laws: tuple[AbstractEffect, ...], key: PRNGKeyArray) -> Identified:
     """The problem with laws in it: the tilt, which is the first, is estimated, load friction stays as it is."""
-    now = begin(rig, data, key=key, effects=laws)
-    old = now.m_step.prior
+    problem = begin(rig, data, key=key, effects=laws)
+    old = problem.m_step.prior
     mean, std = jnp.append(old.mean, 0.0), jnp.append(old.std, TILT)
-    rule = eqx.tree_at(lambda m: m.prior, now.m_step, ParameterPrior((*old.names, "0.angle"), mean, std))
-    return now._replace(m_step=rule, state=start_state(now.state.model, rule, key=now.state.key))
+    rule = eqx.tree_at(lambda m: m.prior, problem.m_step, ParameterPrior((*old.names, "0.angle"), mean, std))
+    return problem._replace(m_step=rule, state=start_state(problem.state.model, rule, key=problem.state.key))
 
 
 def main() -> None:

@@ -200,8 +200,8 @@ def arrays(name: str, out: Path) -> Arrays:
         result = PICTURES[name].run(out / name)
         out.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(file, **result)
-    with np.load(file) as there:
-        return dict(there)
+    with np.load(file) as stored:
+        return dict(stored)
 
 
 def main() -> int:
@@ -217,13 +217,13 @@ def main() -> int:
     args.pictures.mkdir(parents=True, exist_ok=True)
     for name in args.names or PICTURES:
         try:
-            found = arrays(name, args.out)
+            results = arrays(name, args.out)
         except FileNotFoundError as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue
         for end, ink in (("", LIGHT), ("-dark", DARK)):
             path = args.pictures / f"{name}{end}.png"
-            drawn(PICTURES[name], found, ink).savefig(path, dpi=DOTS, transparent=True)
+            drawn(PICTURES[name], results, ink).savefig(path, dpi=DOTS, transparent=True)
         print(f"{name}: {args.pictures / name}.png, {name}-dark.png")
     return 0
 

@@ -55,10 +55,10 @@ def friction(out: Path) -> Arrays:
     """Friction of both joints of a simulated acrobot of which joint 1 is read, and the true friction."""
     _command("simulate", out / "rig", "--seed", 1)
     _command("identify", out / "rig", "--out", out / "fit", "--quiet")
-    found, true = (_read(path / "friction.csv") for path in (out / "fit", out / "rig" / "truth"))
+    learned, true = (_read(path / "friction.csv") for path in (out / "fit", out / "rig" / "truth"))
     return {
         f"{side}_{name}": table[name]
-        for side, table in (("found", found), ("true", true))
+        for side, table in (("found", learned), ("true", true))
         for name in table.dtype.names
     }
 
@@ -76,8 +76,8 @@ def _loop() -> tuple[measured_loop.Diagnosis, measured_loop.Diagnosis]:
     """The two diagnoses of `measured_loop.py`, which is run where it has not been."""
     out = Path("out/measured_loop")
     if not (out / "planted" / "found" / "report.json").exists():
-        given = ROOT.parent / "shared" / "data" / "raw" / "dfki_c1_pert"
-        places = ["--from", str(given)] if given.is_dir() else []
+        source = ROOT.parent / "shared" / "data" / "raw" / "dfki_c1_pert"
+        places = ["--from", str(source)] if source.is_dir() else []
         command = [sys.executable, str(ROOT / "examples" / "measured_loop.py"), "--out", str(out), *places]
         subprocess.run(command, check=True)
     return tuple(measured_loop.read(out / name) for name in ("recorded", "planted"))  # type: ignore[return-value]
@@ -107,14 +107,14 @@ def touch(out: Path) -> Arrays:
     rig = read_rig(folder / "rig.toml", specs)
     logs = read_logs(folder / "train", rig)
     fit = lambda data: identify(rig, data, key=jax.random.key(0))  # noqa: E731
-    fitted, _, found, _ = disturbance_free(fit, fit(logs.data), logs.data)
+    fitted, _, disturbances, _ = disturbance_free(fit, fit(logs.data), logs.data)
     force = residual(fitted, logs.data).force
-    count = [sum(each.sequence == i for each in found) for i in range(len(logs.files))]
+    count = [sum(each.sequence == i for each in disturbances) for i in range(len(logs.files))]
     number = int(np.argmax(count))
     true = _read(folder / "truth" / "train" / logs.files[number])
-    here = [each for each in found if each.sequence == number]
-    joint = max((1, 2), key=lambda j: sum(each.joint == j for each in here))
-    spans = [(each.from_s, each.to_s) for each in here if each.joint == joint]
+    pulses = [each for each in disturbances if each.sequence == number]
+    joint = max((1, 2), key=lambda j: sum(each.joint == j for each in pulses))
+    spans = [(each.from_s, each.to_s) for each in pulses if each.joint == joint]
     mean = averaged(force, round(WIDTHS[0] / rig.dt))[number]
     torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
     return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques

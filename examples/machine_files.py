@@ -115,8 +115,8 @@ def errors(learned: Callable, law: Law, x: np.ndarray) -> list[float]:
     dof = x.shape[-1] // 2
     ends = np.percentile(np.abs(x[..., dof:].reshape(-1, dof)), 95, axis=0)
     grid = np.linspace(-1.0, 1.0, 81)[:, None] * ends[None]
-    found, truth = np.asarray(jax.vmap(learned)(jnp.asarray(grid))), law(grid)
-    return list(np.sqrt(np.mean((found - truth) ** 2, axis=0) / np.mean(truth**2, axis=0)))
+    curves, truth = np.asarray(jax.vmap(learned)(jnp.asarray(grid))), law(grid)
+    return list(np.sqrt(np.mean((curves - truth) ** 2, axis=0) / np.mean(truth**2, axis=0)))
 
 
 if __name__ == "__main__":

@@ -140,9 +140,9 @@ def missing_torque(title: str, done: Diagnosis, law: str, *, planted: bool) -> M
     left = residual(done.after, read_logs(done.folder / "train", done.after.rig).data).followed()
     seen = np.isfinite(left.force[..., joint])
     q, v = (left.state[..., column][seen] for column in (joint, joint + 2))
-    lacked, rest = left.partial_force[..., joint][seen], left.force[..., joint][seen]
+    lacked, remainder = left.partial_force[..., joint][seen], left.force[..., joint][seen]
     true = torque(law, q, v) if planted else None
-    return MissingTorque(title, q, lacked, lacked - rest if done.report["effects"] else None, true)
+    return MissingTorque(title, q, lacked, lacked - remainder if done.report["effects"] else None, true)
 
 
 def lines(recorded: Diagnosis, planted: Diagnosis, law: str, off: dict[str, float]) -> list[tuple[str, str]]:
@@ -168,8 +168,8 @@ def summary(done: Diagnosis) -> str:
     """Effects that a report lists as missing."""
     report = done.report
     suspects = "".join(f"; a suspect: {s['law']}" for s in report.get("suspects", [])[:1])
-    found = "; ".join(f"{e['description'].partition(':')[0]}{share_removed(e['evidence'])}" for e in report["effects"])
-    return found or ("it cannot tell what" if report.get("cannot_tell") else f"nothing{suspects}")
+    laws = "; ".join(f"{e['description'].partition(':')[0]}{share_removed(e['evidence'])}" for e in report["effects"])
+    return laws or ("it cannot tell what" if report.get("cannot_tell") else f"nothing{suspects}")
 
 
 def share_removed(evidence: dict[str, float | None]) -> str:

@@ -46,24 +46,24 @@ def design(first: Path, plan: Path, effect: str) -> tuple[object, ...]:
 def play(case: plant.Case, folder: Path, out: Path) -> None:
     """The machine plays the inputs of a design: logs of it, from starts that are set by hand."""
     machine, rng = plant.build(case), np.random.default_rng([case.seed, 99])
-    told = json.loads((folder / "design.json").read_text())
+    proposal = json.loads((folder / "design.json").read_text())
     t, u = (
-        np.stack([np.genfromtxt(folder / file, delimiter=",", names=True)[name] for file in told["inputs"]])
+        np.stack([np.genfromtxt(folder / file, delimiter=",", names=True)[name] for file in proposal["inputs"]])
         for name in ("time", "u")
     )
-    start = np.asarray([[s[name] for name in plant.SYSTEMS[case.system].states] for s in told["starts"]])
+    start = np.asarray([[s[name] for name in plant.SYSTEMS[case.system].states] for s in proposal["starts"]])
     start[:, :2] += 0.03 * rng.standard_normal((len(u), 2))
     kicks = case.process * rng.standard_normal((*u.shape, machine.dof))
     x = plant.simulate(machine, start, u, t[:, 0], kicks)
     y = plant.readings(machine._replace(case=case._replace(seed=1000 + case.seed)), x)
-    for i, file in enumerate(told["inputs"]):
+    for i, file in enumerate(proposal["inputs"]):
         rows = np.column_stack([t[i], u[i], y[i]])
         (out / Path(file).name).parent.mkdir(parents=True, exist_ok=True)
         header = ",".join(("time", "u", *plant.measured(case)))
         np.savetxt(out / Path(file).name, rows, fmt="%.6f", delimiter=",", header=header, comments="")
 
 
-def told(report: Path) -> list[str]:
+def findings(report: Path) -> list[str]:
     """What a report found, and what it could not tell from it."""
     lines = []
     for effect in json.loads((report / "report.json").read_text())["effects"]:
@@ -94,7 +94,7 @@ def main() -> int:
             return status
     print("truth:", *(f"{k} {v}" for k, v in EFFECTS[args.effect].items()))
     for name, report in (("six sequences of sines", first), ("and six that were designed", again)):
-        print(f"{name}:", *told(report), sep="\n  ")
+        print(f"{name}:", *findings(report), sep="\n  ")
     return 0
 
 

@@ -501,14 +501,14 @@ def step(plant: Plant, x: Array, u: Array, k: int, t: Array) -> Array:
     """The states one sample later, without noise; u [batch, time] from the first row, of which k is now, at time t."""
     cuts = {0.0, 1.0, plant.late - math.floor(plant.late), *(queue.fraction for queue in plant.queues)}
     cuts = sorted(cuts)
-    now, past = x[:, : plant.dynamic], {0.0: x}
+    state, past = x[:, : plant.dynamic], {0.0: x}
     for begin, end in itertools.pairwise(cuts):
         row = k + math.floor((begin + end) / 2 - plant.late)
         command = u[:, row] if row >= 0 else np.zeros(len(u))
-        now = _runge_kutta(plant, now, command, t + begin * DT, (end - begin) * DT)
-        past[end] = now
+        state = _runge_kutta(plant, state, command, t + begin * DT, (end - begin) * DT)
+        past[end] = state
     shifted = x.copy()
-    shifted[:, : plant.dynamic] = now
+    shifted[:, : plant.dynamic] = state
     for queue in plant.queues:
         shifted[:, queue.first + 1 : queue.first + queue.length] = x[:, queue.first : queue.first + queue.length - 1]
         shifted[:, queue.first] = past[queue.fraction][:, queue.state]

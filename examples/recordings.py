@@ -85,11 +85,11 @@ def downloaded(address: str = ADDRESS, cache: Path | None = None, retries: int =
             part = Path(store.path) / f"{name}.part"
             out.append(Path(store.fetch(name, downloader=functools.partial(_download, part))))
         except ValueError:
-            found = f"what {host} sends is not the published file (its SHA-256 differs), and is not used"
-            raise RecordingError(f"{name}: {found}; get the file elsewhere, then --from FOLDER") from None
+            problem = f"what {host} sends is not the published file (its SHA-256 differs), and is not used"
+            raise RecordingError(f"{name}: {problem}; get the file elsewhere, then --from FOLDER") from None
         except requests.HTTPError as error:
-            found = f"{host} answers {error.response.status_code} for {urls[name]}"
-            raise RecordingError(f"{name}: {found}; get the file elsewhere, then --from FOLDER") from None
+            problem = f"{host} answers {error.response.status_code} for {urls[name]}"
+            raise RecordingError(f"{name}: {problem}; get the file elsewhere, then --from FOLDER") from None
         except requests.RequestException:
             hint = f"download {urls[name]} and the seven others where there is one, then --from FOLDER"
             raise RecordingError(f"{name}: no connection to {host}; {hint}") from None

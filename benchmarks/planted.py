@@ -123,7 +123,7 @@ def _do(args: argparse.Namespace) -> None:
         for name in _chosen(args.cases or ["*"], args.split, args.share):
             if not (args.out / f"{name}.json").exists():
                 done = score(run(name, args.out, args.limit), {})
-                print(f"{name}: {done.named} of {done.truths}, {done.extras} extra; {done.found}", flush=True)
+                print(f"{name}: {done.named} of {done.truths}, {done.extras} extra; {done.effects}", flush=True)
     if args.command == "table":
         text = table(records(args.folder))
         print(text) if args.out is None else replace_text(args.out, text)

@@ -88,7 +88,7 @@ class Score(NamedTuple):
     """True ones, those found, and false ones."""
     seconds: float
     failed: str
-    found: str
+    effects: str
 
     @property
     def right(self) -> bool:

@@ -19,7 +19,7 @@ class MissingTorque(NamedTuple):
     """[rad]"""
     torque: Float[Any, " sample"]
     """[N m]"""
-    found: Float[Any, " sample"] | None = None
+    laws: Float[Any, " sample"] | None = None
     """Torque of the laws that the search found [N m]; None: it found none."""
     true: Float[Any, " sample"] | None = None
     """Torque of the law that was taken out of the log [N m]."""
@@ -52,8 +52,8 @@ def _draw(ax: Axes, panel: MissingTorque) -> None:
     ax.plot(panel.angle, torque, ".", color=READING, ms=1.6, mew=0, alpha=0.5, label="each sample", rasterized=True)
     ax.plot(*_means(panel.angle, torque), "o", color=BEFORE, ms=4, zorder=3)
     ax.plot([], [], "o", color=BEFORE, ms=1.2, mew=0, label="their mean")  # marks of a legend are four times as large
-    if panel.found is not None:
-        ax.plot(*_means(panel.angle, panel.found), color=AFTER, lw=2.2, label="law that was found", zorder=4)
+    if panel.laws is not None:
+        ax.plot(*_means(panel.angle, panel.laws), color=AFTER, lw=2.2, label="law that was found", zorder=4)
     if panel.true is not None:
         dashes = (0, (4, 2))
         ax.plot(*_means(panel.angle, panel.true), color=TRUTH, ls=dashes, lw=1.4, label="law taken out", zorder=5)

@@ -234,7 +234,7 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _last_line(said))
     if command is DIAGNOSE:
         _answered_in_time(rig, out, capsys)
-    code, said = _here(_order(command, rig, out, "--resume"), capsys)
+    code, said = _called(_order(command, rig, out, "--resume"), capsys)
     assert code == 0 and "resumed" in said, said
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
@@ -243,7 +243,7 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     assert [effect["name"] for effect in left["report"].get("effects", [])] == FOUND[command[0]]
 
 
-def _here(order: list[str], capsys) -> tuple[int, str]:
+def _called(order: list[str], capsys) -> tuple[int, str]:
     """A command in this process."""
     capsys.readouterr()
     return cli.main(order), capsys.readouterr().err
@@ -252,7 +252,7 @@ def _here(order: list[str], capsys) -> tuple[int, str]:
 def _answered_in_time(rig: Path, out: Path, capsys) -> None:
     """An answer after the first fit, since no more time is left, and what goes on from there."""
     steps = len(_steps(out))
-    code, said = _here(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"), capsys)
+    code, said = _called(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"), capsys)
     assert code == 0 and re.search(r"\[\d+:\d\d over\] ", said), said
     assert re.search(r"finished steps kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
     report = json.loads((out / "report.json").read_text())

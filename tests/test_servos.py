@@ -63,8 +63,8 @@ columns = [{read}]
 PENDULUM = "m = 0.5\nlc = 0.2\nI = 0.002\ng = 9.81"
 
 
-def _rig(path: Path, given: str, *, model: str = PENDULUM, kind: str = "pendulum", read: str = '"theta1"') -> Rig:
-    (path / "rig.toml").write_text(RIG.format(type=kind, model=model, input=given, read=read))
+def _rig(path: Path, text: str, *, model: str = PENDULUM, kind: str = "pendulum", read: str = '"theta1"') -> Rig:
+    (path / "rig.toml").write_text(RIG.format(type=kind, model=model, input=text, read=read))
     return read_rig(path / "rig.toml", specs)
 
 
@@ -72,9 +72,9 @@ def _servo(path: Path, lines: str, **model) -> Rig:
     return _rig(path, f'[input]\ncolumns = ["goal"]\njoints = [1]\n{lines}', **model)
 
 
-def _of_file(path: Path, actuators: str, given: str = "", more: str = "") -> Rig:
+def _of_file(path: Path, actuators: str, text: str = "", more: str = "") -> Rig:
     (path / "machine.xml").write_text((TWO % actuators).replace('axis="0 1 0"', f'axis="0 1 0" {more}'))
-    return _rig(path, given, model='file = "machine.xml"', kind="mjcf", read='"a", "rail"')
+    return _rig(path, text, model='file = "machine.xml"', kind="mjcf", read='"a", "rail"')
 
 
 def _logs(u: np.ndarray, y: np.ndarray | None = None, dt: float = 0.01) -> Dataset:

@@ -1,4 +1,3 @@
-import gc
 import os
 import signal
 from pathlib import Path
@@ -15,8 +14,6 @@ import pytest
 from costs import Costs
 
 ROOT = Path(__file__).resolve().parents[1]
-
-gc.set_threshold(200_000, 20, 100)  # tracing makes millions of objects that stay: to look for cycles took a sixteenth
 
 # a shell that runs the tests in the background ignores Ctrl-C, and so would the processes that tests send it to
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -10,6 +10,7 @@ import rod
 from nnap_em.diagnose.context import EFFORT, SearchContext, extend
 from nnap_em.diagnose.hypothesis import Hypothesis
 from nnap_em.diagnose.losses import OneStep
+from nnap_em.em.loop import Schedule
 from nnap_em.fit.identify import friction_table, identify
 
 
@@ -28,7 +29,10 @@ def _extended(fitted, model):
 
 
 def test_friction_too_steep_for_the_integration_is_left(fitted):
-    """Of 200 N m from .02 rad/s on, no step of the fit leads back to .1 N m and .05 N m s/rad."""
+    """No step leads from 200 N m at .02 rad/s to a friction of .1 N m and .05 N m s/rad; a fit from the start does.
+
+    It is that of `identify`: the same network, noise and schedule.
+    """
     before, _ = fitted
     weights = before.m_step.weights(before.model)
     w = weights.read(before.model)
@@ -39,6 +43,7 @@ def test_friction_too_steep_for_the_integration_is_left(fitted):
     assert abs(float(model.unknown(jnp.ones(1))[0])) > 100
     state, lines = _extended(fitted, eqx.tree_at(lambda m: m.log_q, model, model.log_q + 8))
     assert any("friction from its start" in line for line in lines)
+    np.testing.assert_allclose(state.top, before.state.top, rtol=1e-9)
     v = np.array([[-4.0, -1.0, -0.3, 0.3, 1.0, 4.0]])
     table = friction_table(before._replace(state=state), jnp.asarray(v))
     np.testing.assert_allclose(table.torque, -0.05 * v - 0.1 * np.tanh(v / 0.1), atol=0.01)
@@ -49,3 +54,10 @@ def test_friction_that_is_right_is_gone_on_from(fitted):
     state, lines = _extended(fitted, before.model)
     assert len(lines) == 1
     assert np.nanmean(state.top) == pytest.approx(np.nanmean(before.state.top), abs=0.5)
+
+
+@pytest.mark.parametrize("hold", [1, 2, 3])
+def test_the_first_horizon_lasts_as_many_epochs_as_are_compared(hold):
+    schedule = Schedule(first=60, growth=1.6, hold=hold)
+    rows = [schedule.horizon(epoch, 1000) for epoch in range(schedule.at_first + 1)]
+    assert rows == [60] * schedule.at_first + [96]

@@ -147,11 +147,10 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> EMState | None:
     step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within .07 rad/s.
     """
     before = context.before
-    declared, first = begin(before.rig, context.data, key=before.state.key), hypothesis.m_step.centre
-    rule = eqx.tree_at(lambda rule: rule.centre, declared.m_step, first)  # the network of the first fit, not another
-    friction = hypothesis.model.unknown.with_weights(first)
-    model = eqx.tree_at(lambda m: m.unknown, cast(StateSpaceModel, declared.model), friction)
-    fresh = Hypothesis(model, rule).having(hypothesis.additions)
+    declared = begin(before.rig, context.data, key=before.state.key)
+    rule = eqx.tree_at(lambda rule: rule.centre, declared.m_step, hypothesis.m_step.centre)  # that of the first fit
+    weights = rule.weights(declared.model)
+    fresh = Hypothesis(weights.write(declared.model, weights.middle()), rule).having(hypothesis.additions)
     brief = horizon(context.data, SCHEDULE.first)
     state = start_state(fresh.model, fresh.m_step, key=before.state.key)
     try:

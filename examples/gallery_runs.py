@@ -121,7 +121,7 @@ def touch(out: Path) -> Arrays:
 
 
 def apart(out: Path) -> Arrays:
-    """Inputs that hardly tell a late input from a lag, and one that does; how often each would name the wrong law."""
+    """Inputs that hardly discriminate a delay and a lag, and one that does; how often each would name the wrong law."""
     rig, first, plan, effect = out / "rig", out / "first", out / "plan", "input_delay"
     plant.write(next_experiment.rig_of(effect, 1), rig)
     _command(*next_experiment.diagnosis(rig, first))

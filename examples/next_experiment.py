@@ -1,9 +1,9 @@
-"""The next experiment, end to end from a seed: logs that hardly tell two laws apart, and inputs that do.
+"""The next experiment, end to end from a seed: logs that hardly discriminate two laws, and inputs that do.
 
 The rig is simulated by `plant.py`, which shares no code with the library: an acrobot whose second joint nobody
-measures and whose drive acts a little late.  Six sequences of sines hardly tell a delay of .4 samples from a lag: by
-some 5 nats.  `nnap-em design` proposes six more, the plant plays them, and old and new logs are diagnosed together.
-Written into `out/next_experiment/`: the logs, both reports and the design.
+measures and whose drive acts a little late.  Six sequences of sines hardly discriminate a delay of .4 samples and
+a lag: by some 5 nats.  `nnap-em design` proposes six more, the plant plays them, and old and new logs are diagnosed
+together.  Written into `out/next_experiment/`: the logs, both reports and the design.
 
     python examples/next_experiment.py                             # some six minutes on two cores
     python examples/next_experiment.py --effect actuator_lag       # the other law as the true one
@@ -38,7 +38,7 @@ def diagnosis(rig: Path, first: Path) -> tuple[object, ...]:
 
 
 def design(first: Path, plan: Path, effect: str) -> tuple[object, ...]:
-    """The command that proposes inputs by which the law is told from the other one."""
+    """The command that proposes inputs by which the law is discriminated from the other one."""
     rival = next(name for name in EFFECTS if name != effect)
     return "design", first, "--out", plan, "--for", "apart", "--rival", rival, "--seconds", "30"
 
@@ -64,7 +64,7 @@ def play(case: plant.Case, folder: Path, out: Path) -> None:
 
 
 def findings(report: Path) -> list[str]:
-    """What a report found, and what it could not tell from it."""
+    """Effects of a report, and their equivalents."""
     lines = []
     for effect in json.loads((report / "report.json").read_text())["effects"]:
         same = " or ".join(other["name"] for other in effect["equivalent"])

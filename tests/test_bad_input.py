@@ -418,7 +418,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
         "gravity and inertia of joint 1",
         "look at its unit (N m)",
     ),
-    "mass in g": (_rig("m = 0.5", "m = 500e3"), "train: column u", "ask for", "masses (kg)"),
+    "mass in g": (_rig("m = 0.5", "m = 500e3"), "train: column u", " need ", "masses (kg)"),
     "gravity in mm/s^2": (_rig("g = 9.81", "g = 9810"), "rig.toml", "[model] g", "9810", "write it in m/s^2"),
     "length in mm": (_rig("lc = 0.4", "lc = 400"), "rig.toml", "[model] lc", "400", "write it in m"),
 }

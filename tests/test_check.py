@@ -100,7 +100,7 @@ def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
         return next(f for f in torques(rig, system, data, measure_scales(rig, system, data)) if f.subject == "torque")
 
     assert torque(1.0).mark == "ok"
-    assert re.search(r"up to 7.8\d N m, gravity and inertia of joint 3 ask for 7.[89]", torque(1.0).text)
+    assert re.search(r"up to 7.8\d N m, gravity and inertia of joint 3 need 7.[89]", torque(1.0).text)
     assert [torque(1e3).mark, torque(1e-4).mark] == ["bad", "bad"]
 
 
@@ -136,7 +136,7 @@ def test_a_place_that_nothing_tells_is_named(slide):
     ((mark, text),) = report["states"]
     assert mark == "look"
     assert "1 of 2 directions" in text
-    assert "do not tell x" in text
+    assert "not determined: x" in text
 
 
 def test_readings_that_tell_no_velocity_are_bad(slide):
@@ -215,7 +215,7 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     capsys.readouterr()
     assert cli.main(["check", str(folder)]) == 0
     good = capsys.readouterr()
-    assert "nothing speaks against a fit" in good.err
+    assert "the logs allow a fit" in good.err
     assert all(re.match(r"(ok|look)   *[a-z]+ +\S", line) for line in good.out.splitlines())
     _heavier(folder)
     assert cli.main(["check", str(folder)]) == 1

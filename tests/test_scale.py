@@ -67,7 +67,7 @@ def test_an_arm_with_an_idle_motor_or_none(joints, columns):
     names = not_identifiable(rig, system, still)
     assert names and names[0][0] in "mI"
     remarks = [f for f in torques(rig, system, still, measure_scales(rig, system, still)) if f.subject == "scale"]
-    assert len(remarks) == 1 and names[0] in remarks[0].text and "cannot tell the scale" in remarks[0].text
+    assert len(remarks) == 1 and names[0] in remarks[0].text and "does not determine the scale" in remarks[0].text
 
 
 @pytest.mark.slow

@@ -326,7 +326,7 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     result = identifiability(rig, build_system(rig), build_servos(rig))
     assert result.rubbed == ("goal.kd",)
     assert [set(group) for group in result.together] == [{"m", "I", "goal.kp"}]
-    assert "cannot tell goal.kd from the learned friction of the joint" in " ".join(sentences(result))
+    assert "do not separate goal.kd from the learned friction of the joint" in " ".join(sentences(result))
     known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
     assert identifiability(known, build_system(known), build_servos(known)) == ((), (), ("goal.kd",))
     bare = dataclasses.replace(known, friction=False)

@@ -69,7 +69,7 @@ example:
   nnap-em check bench
 
 One line per question: ok, look (it may do, but look at it) or bad (a fit would be in vain).  Length, missing samples,
-sampling rate, noise, torques, the velocities that each joint visits, and whether the readings tell the whole state.
+sampling rate, noise, torques, the velocities that each joint visits, and whether the whole state can be observed.
 Nothing is fitted and nothing is written.  Exit status 1 where something is bad.
 """
 _IDENTIFY = """\
@@ -101,7 +101,7 @@ examples:
 FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inputs, ready to be played), motion/*.csv
 (what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
 where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, apart (laws
-that the logs cannot tell apart), or all.
+that the logs cannot discriminate), or all.
 """
 _COMPARE = """\
 examples:
@@ -181,7 +181,7 @@ def parser() -> argparse.ArgumentParser:
     init = command("init", "write a first rig.toml for a log", _INIT)
     init.add_argument("log", metavar="LOG", type=Path, help="a CSV file with a header, MCAP or HDF5")
     machine = init.add_mutually_exclusive_group()
-    machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not tell it")
+    machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
     machine.add_argument(
         "--model", metavar="FILE", type=Path, help="the machine as MJCF or URDF, which stays where it is"
     )
@@ -226,8 +226,8 @@ def parser() -> argparse.ArgumentParser:
     design = command("design", "find the inputs to play next", _DESIGN)
     design.add_argument("folder", metavar="FIT", type=Path, help="model.npz or after.npz, or the folder that holds it")
     design.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
-    design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be told (default: all)")
-    design.add_argument("--rival", action="append", default=[], metavar="LAW", help="NAME[:JOINT]: tell it too")
+    design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be learned (default: all)")
+    design.add_argument("--rival", action="append", default=[], metavar="LAW", help="NAME[:JOINT]: one law more")
     design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
     design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
     design.add_argument(

@@ -116,7 +116,9 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     names = (folder.resolve().name for folder in folders)
     parts = {name: read_logs(place, rig, trust=trust) for name, place in zip(names, places, strict=True)}
     if len(parts) < len(folders):
-        raise DataError(f"{folders[0]}: two of the folders have one name; rename one: files are told by their folders")
+        raise DataError(
+            f"{folders[0]}: two of the folders have one name; rename one: the name of a file begins with it"
+        )
     return together(parts)
 
 

@@ -156,7 +156,7 @@ def _criterion(
     if name not in criteria | singles:
         known = ", ".join([*criteria, *singles]) or "none: the fit has no friction map, no parameter and no rival"
         why = {
-            "apart": "the fit has no effect that the data could not tell from another; name a law with --rival",
+            "apart": "the fit has no effect that the data could not discriminate from another; name a law with --rival",
             "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
             "friction": "the rig is declared free of friction",
         }.get(name, "not a question of this fit")

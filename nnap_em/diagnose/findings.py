@@ -279,7 +279,7 @@ def advice(
     suspects: Sequence["SuspectReport"] = (),
 ) -> list[str]:
     """Sentences on the next measurement."""
-    out = [f"To tell {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
+    out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     out += [MORE] if suspects else []
     out += [f"To see a {suspect.law} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm]
     out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
@@ -287,7 +287,7 @@ def advice(
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
         for key in finding.equivalent:
-            out.append(f"To tell it from {words(key)}: {catalogue[key[0]].confirm}")
+            out.append(f"To discriminate it from {words(key)}: {catalogue[key[0]].confirm}")
     if not out:
         out.append(
             "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."

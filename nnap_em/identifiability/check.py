@@ -187,9 +187,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         unit = system.force_unit(joint)
         torque = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = torque / needed[joint - 1]
-        text = (
-            f"{name}: up to {torque:.3g} {unit}, gravity and inertia of joint {joint} ask for {needed[joint - 1]:.3g}"
-        )
+        text = f"{name}: up to {torque:.3g} {unit}, gravity and inertia of joint {joint} need {needed[joint - 1]:.3g}"
         odd = ratio > 30 or 0 < ratio < 1e-3
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
@@ -201,7 +199,7 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     if kept:
         values = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
         text = (
-            "nothing drives the machine, so that its motion cannot tell the scale of its masses and friction: "
+            "nothing drives the machine, so that its motion does not determine the scale of its masses and friction: "
             f"kept as declared is {values}, and all else is relative to that"
         )
         yield CheckResult(_mark(True, False), "scale", text)
@@ -224,7 +222,7 @@ def drives(
         weight, whole = gravity[joint - 1] / gear, needed[joint - 1] / gear
         text = f"{name}: a {servo.kind} servo"
         text += f", limited to {limit:.3g} {unit}; " if np.isfinite(limit) else "; "
-        text += f"gravity and inertia of joint {joint} ask for {whole:.3g}, gravity alone for {weight:.3g} {unit}"
+        text += f"gravity and inertia of joint {joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
         low, delay = limit < 0.9 * weight, float(servo.values.get("delay", 0.0))
         if low:
             text += f": the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
@@ -294,7 +292,7 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         text += f"{100 * near_rest:.0f} % of the time near rest, {turns} changes of direction"
         hints = [
             (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
-            (turns < 4, "too few turns to tell Coulomb friction"),
+            (turns < 4, "too few turns to identify Coulomb friction"),
             (near_rest > 0.8, "it rests most of the time"),
             (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
         ]
@@ -379,9 +377,10 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
     weak = [name for name, share in zip(names, known, strict=True) if 0.2 < share <= 0.5]
     spoilt = any(name in names[dof:] for name in dark)
-    text = f"{_WIDTH:g} s of readings tell {rank} of {len(names)} directions of the state (condition 1e{condition:.0f})"
-    text += f"; they do not tell {', '.join(dark)}" if dark else ""
-    text += f"; they hardly tell {', '.join(weak)}" if weak else ""
+    text = f"{_WIDTH:g} s of readings determine {rank} of {len(names)} directions of the state"
+    text += f" (condition 1e{condition:.0f})"
+    text += f"; not determined: {', '.join(dark)}" if dark else ""
+    text += f"; hardly determined: {', '.join(weak)}" if weak else ""
     text += ": measure more of the state, or move so that the hidden joint shakes the rest" if spoilt else ""
     yield CheckResult(_mark(dark or weak, spoilt), "states", text)
 

@@ -110,9 +110,9 @@ def sentences(result: Identifiability) -> list[str]:
     if result.never:
         out.append(f"no motion feels {', '.join(result.never)}: kept as declared; take out what you do not doubt")
     if result.rubbed:
-        text = f"motions cannot tell {', '.join(result.rubbed)} from the learned friction of the joint"
+        text = f"motions do not separate {', '.join(result.rubbed)} from the learned friction of the joint"
         out.append(f"{text}: kept as declared, and friction is what is left; write a number where you know one")
     for group in result.together:
-        text = f"motions tell {', '.join(group)} only in combination"
+        text = f"motions determine {', '.join(group)} only in combination"
         out.append(f"{text}: along the rest they keep what is declared, and their std says so")
     return out

@@ -137,7 +137,7 @@ def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: N
         picture(
             "residual",
             "The force that the declared model lacks",
-            "What the smoothed motion asks for beyond the declared model, against everything that could cause it.",
+            "What the smoothed motion needs beyond the declared model, against everything that could cause it.",
             residual_figure(partial, names, left.get("after")),
         ),
         picture(
@@ -177,7 +177,7 @@ def _experiment(rig: Rig) -> list[str]:
     """The command that designs the next experiment."""
     if not rig.input_columns:
         return []
-    return ["nnap-em design FIT --out NEXT, FIT this folder: the inputs that would tell most, ready to be played."]
+    return ["nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."]
 
 
 def _round(step: Step, dt: float) -> dict[str, Any]:

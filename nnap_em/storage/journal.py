@@ -171,7 +171,7 @@ def digest(*trees: Any) -> str:
         elif callable(node) and hasattr(node, "__qualname__"):
             feed(f"{node.__module__}.{node.__qualname__}")
         else:
-            raise TypeError(f"{kind} cannot be told from another of its kind")
+            raise TypeError(f"{kind} cannot be distinguished from another of its kind")
 
     walk(trees)
     return sha256.hexdigest()

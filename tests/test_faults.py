@@ -452,7 +452,7 @@ def test_the_digest_tells_apart_what_is_not_the_same():
         0.0,
     ]
     assert len({digest(other) for other in others}) == len(others)
-    with pytest.raises(TypeError, match="object cannot be told"):
+    with pytest.raises(TypeError, match="object cannot be distinguished"):
         digest(object())
 
 

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from common_work import Case, Size, common_logs, common_model, compiled
 
+from nnap_em.model.state_space import Inputs
+
 
 def start_particles(size: Size):
     """Draws from the prior of the first row, (seq, state, particle), and the inputs (seq, time, input)."""
     model = common_model()
     noise = jax.random.normal(jax.random.key(3), (size.sequences, 4, size.particles))
-    x = model.start.mean[:, None] + jnp.sqrt(jnp.diag(model.start.cov))[:, None] * noise
+    x = model.start.mean[None, :, None] + jnp.sqrt(jnp.diag(model.start.cov))[None, :, None] * noise
     return x, common_logs(size).data.u[:, : size.steps]
 
 
@@ -64,7 +66,8 @@ def c_case(what: str, flags: tuple[str, ...], size: Size) -> Case:
     def prepare():
         library = build_c(flags)
         x, u = (np.asarray(a) for a in start_particles(size))
-        once = jax.vmap(jax.vmap(common_model().transition, (1, None), 1))(jnp.asarray(x), jnp.asarray(u[:, 0]))
+        move = lambda x, u: common_model().transition(x, Inputs.held(u))  # noqa: E731
+        once = jax.vmap(jax.vmap(move, (1, None), 1))(jnp.asarray(x), jnp.asarray(u[:, 0]))
         gap = float(np.max(np.abs(propagate_in_c(library, x, u[:, :1]) - np.asarray(once))))
         assert gap < 1e-4, f"the C transition is off by {gap:.1e}"
         return lambda: propagate_in_c(library, x, u)

@@ -243,8 +243,9 @@ def main() -> None:
             order = {"group": group, "size": size, "quick": args.quick}
             rows = child({"task": "speed", **order, "repeats": repeats, "budget": budget}, cpus[:1], cache)
             memory = child({"task": "memory", **order}, cpus[:1], cache, measure_memory=True)
-            lines += ["", f"## {titles[group]}", "", *speed_table(rows, memory)]
-            lines += limit_lines(rows) if group == "filter" else []
+            section = ["", f"## {titles[group]}", "", *speed_table(rows, memory)]
+            lines += [*section, *(limit_lines(rows) if group == "filter" else [])]
+            print("\n".join(section), file=sys.stderr, flush=True)  # a later group that fails loses nothing
         if "growth" in args.only:
             lines += growth(args.quick, cpus[:1], cache, out)
         if "cores" in args.only:

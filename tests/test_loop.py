@@ -83,6 +83,7 @@ def _exact_to_the_interface(report, page):
     error = report["error"]
     assert error["given_s"] == 1.0
     assert error["horizons_s"] == [0.1, 0.25, 0.5, 1.0, 2.0, 4.0]
+    assert error["reach_s"] == pytest.approx(1.5)
     assert list(error["before"]) == list(error["after"]) == ["x"]
     assert len(error["before"]["x"]) == 6
     assert report["verdict"] in page
@@ -115,6 +116,8 @@ def test_the_verdict_claims_a_fall_only_where_there_is_one():
     laws = [Finding(effect, {}, {}, (), "payload")]
     error = {"horizons_s": [1.0], "before": {"theta1": [0.2]}, "after": {"theta1": [0.1]}}
     assert "falls from 0.2 to 0.1" in verdict(laws, error)
+    assert "the 1 s prediction error" in verdict(laws, error | {"reach_s": 3.0})
+    assert "the 0.5 s prediction error" in verdict(laws, error | {"reach_s": 0.5})
     assert "do not trust" in verdict(laws, error | {"after": {"theta1": [0.3]}})
     mixed = {side: {"theta1": [x], "theta2": [y]} for side, x, y in (("before", 0.2, 0.3), ("after", 0.1, 0.4))}
     assert "falls from 0.2 to 0.1 and that of theta2 rises from 0.3 to 0.4 on" in verdict(laws, error | mixed)

@@ -1,10 +1,14 @@
 """One sample interval: the order of the method, a reference integrator, and derivatives both ways."""
 
+import shutil
+
 import diffrax
 import jax
 import jax.numpy as jnp
+import limits
 import numpy as np
 import pytest
+from common_work import Size
 from scipy.integrate import solve_ivp
 
 from nnap_em.numerics.ode import RK4, integrate
@@ -92,3 +96,13 @@ def test_one_loop_is_the_tableau():
         for solver in (RK4(), _Tableau())
     )
     np.testing.assert_allclose(one, other, rtol=1e-14)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_one_step_of_the_benchmarks_transition_in_c_is_ours():
+    """`c_case` holds the two against each other before it is timed; the particles move."""
+    size = Size(sequences=1, steps=2, particles=64)
+    with jax.enable_x64(False):
+        moved = limits.c_case("C transition", (), size).prepare()()
+        begun = np.asarray(limits.start_particles(size)[0])
+    assert np.max(np.abs(moved - begun)) > 1e-4

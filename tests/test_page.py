@@ -11,7 +11,7 @@ from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import number, with_std
 from nnap_em.report.page import MOST, Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
-from nnap_em.report.wording import label
+from nnap_em.report.wording import label, reached
 from nnap_em.residual.statistics import LEVEL
 
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
@@ -230,6 +230,18 @@ def test_numbers_as_a_reader_writes_them():
     assert with_std(12.3456, 3.21) == "12.3 ± 3.2"
     assert with_std(1.5e-6, 2e-7) == "(1.50 ± 0.20) × 10⁻⁶"
     assert with_std(3.0, None) == "3.000"
+
+
+def test_short_test_sequences_have_no_errors_beyond_their_end():
+    """The last horizon is the time that they last; without it, or beyond it, horizons are as they are."""
+    error = WHOLE["error"] | {"horizons_s": [0.25, 1.0, 2.0], "reach_s": 0.5}
+    assert reached(error) == [0.25, 0.5]
+    assert reached(error | {"reach_s": 1.0}) == [0.25, 1.0]
+    assert reached(error | {"reach_s": 9.0}) == [0.25, 1.0, 2.0]
+    assert reached(error | {"reach_s": -0.1}) == reached({}) == []
+    text = " ".join("".join(_parsed(page(WHOLE | {"error": error}, FIGURES)).text).split())
+    assert "error of theta1, 0.5 s ahead" in text
+    assert "2.0 s" not in text
 
 
 def test_every_effect_is_explained():

@@ -158,7 +158,7 @@ def verdict(
     text = f"The model lacks {names}"
     if not error:
         return text + "."
-    at = error["horizons_s"].index(1.0)
+    at, horizon = error["horizons_s"].index(1.0), f"{min(1.0, error.get('reach_s', 1.0)):.3g} s"
     ratios = [
         (c, error["before"][c][at], error["after"][c][at])
         for c in error["before"]
@@ -171,12 +171,12 @@ def verdict(
     if sum(growth.values()) >= 0:
         column, before, after = ratios[-1]
         return (
-            f"The training data support {names}, but on test data the 1 s prediction error of {column} does not fall "
-            f"with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
+            f"The training data support {names}, but on test data the {horizon} prediction error of {column} does not "
+            f"fall with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
         )
     column, before, after = ratios[0]
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
-    falls = f"the 1 s prediction error of {column} falls from {before:.3g} to {after:.3g}"
+    falls = f"the {horizon} prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
 
 

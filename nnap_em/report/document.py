@@ -90,10 +90,16 @@ def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str,
     return {name: predict(fitted, test.data, GIVEN, key=key) for name, fitted in sides.items()} if test else {}
 
 
-def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Any]:
-    """Errors of the predictions, for every column and horizon."""
-    by_model = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items() if test}
-    return {"given_s": GIVEN, "horizons_s": list(HORIZONS), **by_model}
+def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs) -> dict[str, Any]:
+    """Errors of the predictions, for every column and horizon; `reach_s` is where the longest sequence ends."""
+    by_model = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items()}
+    t, valid = (np.asarray(a) for a in (test.data.t, test.data.valid))
+    return {
+        "given_s": GIVEN,
+        "horizons_s": list(HORIZONS),
+        "reach_s": float(np.max((t - t[:, :1])[valid])) - GIVEN,
+        **by_model,
+    }
 
 
 def friction_law(fitted: Identified, table: FrictionTable) -> list[dict[str, Any]]:

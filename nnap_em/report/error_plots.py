@@ -12,6 +12,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 
 from ..residual.residual import Names
 from .style import ACROSS, AFTER, BEFORE, band, dotted, head, limits, panels, styled, symbol
+from .wording import reached
 
 _SIDES = {"before": (BEFORE, "s"), "fit": (AFTER, "o"), "after": (AFTER, "o")}
 
@@ -25,11 +26,11 @@ def error_figure(error: Mapping[str, Any], names: Names) -> Figure:
     size = (3.3 if across < 4 else 2.7) * across + 0.4, 0.6 + 2.7 * -(-len(columns) // across)
     figure = Figure(figsize=size, layout="constrained")
     (grid,) = panels(figure, len(columns))
-    horizons = np.asarray(error["horizons_s"], float)
+    horizons = np.asarray(reached(error), float)
     for ax, name in zip(grid, columns, strict=True):
         for side, values in sides.items():
             colour, mark = _SIDES[side]
-            y = np.asarray([math.nan if v is None else v for v in values[name]], float)
+            y = np.asarray([math.nan if v is None else v for v in values[name][: len(horizons)]], float)
             dotted(ax, horizons, np.where(y > 0, y, np.nan), colour, side, mark)
         ax.set(title=symbol(name), xlabel="time predicted ahead [s]", ylabel=f"rms error [{names.unit(name)}]")
         _logarithmic(ax, horizons)

@@ -58,7 +58,7 @@ def write_identification(
     entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files)),
-        "fit": error and {name: value for name, value in error.items() if name != "fit"} | error["fit"],
+        "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),
         "parameters": parameters(fitted),

@@ -18,7 +18,7 @@ from ..numerics.digits import finite, number
 from ..residual.statistics import LEVEL
 from . import wording
 from .vocabulary import MEANINGS, WORDS
-from .wording import ratio
+from .wording import ratio, reached
 
 PLACES = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
@@ -97,6 +97,7 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         effects=effects,
         errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
         tiles=_error_tiles(document) + _test_tiles(document),
+        horizons=reached(error),
         failed=_failures(document.get("tests")),
         doubted=_doubted(document),
         parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
@@ -138,14 +139,14 @@ def _environment() -> jinja2.Environment:
 def _error_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Title, number and remark of the errors about 1 s ahead of the first two columns."""
     error, units = document.get("error") or {}, document.get("units") or {}
-    horizons, after = error.get("horizons_s") or [], error.get("after") or {}
+    horizons, after = reached(error), error.get("after") or {}
     tiles = []
     for column, values in list((error.get("before") or error.get("fit") or {}).items())[:2]:
         if not horizons:
             break
         place = min(range(len(horizons)), key=lambda i: abs(horizons[i] - 1.0))
         first, last, unit = _at(values, place), _at(after.get(column), place), units.get(column) or ""
-        title = f"error of {column}, {horizons[place]:g} s ahead"
+        title = f"error of {column}, {horizons[place]:.3g} s ahead"
         if document.get("effects"):
             times = ratio(first, last)
             change = f"{number(first, 2)} → {number(last, 2)} {unit}"

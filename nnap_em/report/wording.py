@@ -1,5 +1,6 @@
 """Numbers and effects as a reader of a report would write them."""
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -30,6 +31,15 @@ def ratio(before: Any, after: Any) -> str:
     if 0.95 < times < 1.05:
         return "same"
     return f"{number(times, 2)} ×" if times > 1 else f"{number(1 / times, 2)} × larger"
+
+
+def reached(error: Mapping[str, Any]) -> list[float]:
+    """Horizons [s] of prediction errors, the last of them ending with the longest test sequence.
+
+    Those beyond it have the error of all its rows, too, and are left out.
+    """
+    horizons, reach = error.get("horizons_s") or [], error.get("reach_s", math.inf)
+    return [min(horizon, reach) for before, horizon in itertools.pairwise([0.0, *horizons]) if before < reach]
 
 
 def quantity(entry: Mapping[str, Any]) -> str:

@@ -229,7 +229,7 @@ def _near_rest_table(kind: str, rows: list[dict[str, Any]]) -> list[str]:
     lines = [
         f"{kind}:",
         "",
-        "| seed | joint | stated: 30 s, 30 s more, designed [mN m] | ratio | promised "
+        "| seed | joint | stated: 30 s, 30 s more, designed [mN m] | ratio | predicted "
         "| true: the same [mN m] | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -243,9 +243,9 @@ def _near_rest_table(kind: str, rows: list[dict[str, Any]]) -> list[str]:
             stated.append(ratios["stated"])
             true.append(ratios["true"])
             text = {kind: ", ".join(f"{v:.2g}" for v in values) for kind, values in sides.items()}
-            promised = 1e3 * row["expected"]["designed"][j]
+            predicted = 1e3 * row["expected"]["designed"][j]
             lines.append(
-                f"| {row['seed']} | {j + 1} | {text['stated']} | {ratios['stated']:.2f} | {promised:.2g} "
+                f"| {row['seed']} | {j + 1} | {text['stated']} | {ratios['stated']:.2f} | {predicted:.2g} "
                 f"| {text['true']} | {ratios['true']:.2f} |"
             )
     broken, plays = (sum(row[name] for row in rows) for name in ("broken", "plays"))

@@ -3,8 +3,8 @@
     python benchmarks/identify.py [--seeds 5] [--test 100] [--smoother cubature particle] [--start-std 0.5]
 
 For every seed: 20 x 500 training samples with the noise of the paper's case, friction from a random network, noise not
-told; 100 fresh test sequences.  The true model in the same filter is the yardstick, and the Cramer-Rao limit of the
-data set (information of the linearised model, for the ten parameters of the true law and for the network).
+declared; 100 fresh test sequences.  Compared with the true model in the same filter and with the Cramer-Rao limit of
+the data set (information of the linearised model, for the ten parameters of the true law and for the network).
 """
 
 import argparse

@@ -100,7 +100,8 @@ def _error_pictures(
     out = []
     if error:
         caption = "On test sequences that no fit and no choice has seen."
-        out.append(picture("error", "Prediction error", caption, error_figure(error, names)))
+        drawn = {key: value for key, value in error.items() if key != "after" or len(predicted) > 1}
+        out.append(picture("error", "Prediction error", caption, error_figure(drawn, names)))
     if tables:
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
         out.append(
@@ -169,8 +170,8 @@ def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> li
     chosen = named(words(first.accepted)) if first.accepted else None
     entries = [(named(words(key)), score) for key, score in first.screened[:10]]
     figure = screen_figure(entries, first.measure, chosen=chosen)
-    caption = f"What each candidate promises, before any refit: {first.measure}."
-    return [picture("details", "The first look", caption, figure)]
+    caption = f"Screening scores of the candidates, before any refit: {first.measure}."
+    return [picture("details", "The first screening round", caption, figure)]
 
 
 def _experiment(rig: Rig) -> list[str]:

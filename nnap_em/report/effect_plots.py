@@ -39,5 +39,5 @@ def screen_figure(
     ax.grid(axis="y", visible=False)
     ax.axvline(0, color=ZERO, lw=0.7)
     ax.set_xlabel(measure)
-    head(figure, "What the first look suggested", [ax])
+    head(figure, "Screening scores", [ax])
     return figure

@@ -119,7 +119,7 @@ def _environment() -> jinja2.Environment:
     names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence")
     environment.filters |= {name: getattr(wording, name) for name in names} | {
         "trust": _trust,
-        "look_first": _look_first,
+        "highest": _highest,
     }
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {
@@ -215,8 +215,8 @@ def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
     return next((word for least, word in decisive[0] if decisive[1] >= least), "A hint only")
 
 
-def _look_first(entries: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
-    """The most promising of what was looked at."""
+def _highest(entries: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
+    """The eight entries of highest score, highest first."""
     return sorted(entries or [], key=lambda entry: -(entry.get("gain") or 0.0))[:8]
 
 

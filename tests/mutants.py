@@ -805,9 +805,9 @@ MUTANTS = (
     ),
     Mutant(
         "forces unsaid that move no state",
-        "prediction_error/stated.py",
-        "pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)",
-        "pushed = jnp.concatenate([torque, linear.by_parameter, 0.0 * other], axis=-1)",
+        "prediction_error/multistep.py",
+        "[torque, linear.by_parameter, moved], axis=-1)",
+        "[torque, linear.by_parameter, 0.0 * moved], axis=-1)",
         "test_stated.py::test_forces_unsaid_move_states_as_the_same_input_does",
     ),
     Mutant(

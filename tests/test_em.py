@@ -201,7 +201,7 @@ def test_garbage_is_left_out(run):
 def test_all_lost_is_said(run):
     data = run.logs.data._replace(y=jnp.full(run.logs.data.y.shape, jnp.inf))
     state = begin(run.rig, run.logs.data, key=jax.random.key(0))
-    with pytest.raises(FitError, match="epoch 1: all 6 sequences are lost"):
+    with pytest.raises(FitError, match="epoch 1: all 6 sequences diverge"):
         identify(run.rig, data, key=jax.random.key(0), start=state)
 
 

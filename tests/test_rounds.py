@@ -60,7 +60,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MU
         tried.append(law.name)
         removed = 1 - (errors or {}).get(law.name, 1 - screened.share.least)
         after = hypothesis.plus(law, screened.candidate)
-        return Refit(screened, None, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
+        return Refit(screened, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
 
     size = sum(len(s.candidate.probes) for s in entries)
     seen = Screen(tuple(entries), (np.eye(size),) * 2, (np.eye(3, 6, dtype=bool) if members is None else members,) * 2)

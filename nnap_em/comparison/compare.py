@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 
 from ..data.formats import read_table
 from ..data.machine import unpacked
-from ..diagnose.findings import covariance, estimates
-from ..diagnose.hypothesis import blocks
+from ..diagnose.findings import estimates
+from ..diagnose.hypothesis import covariances
 from ..diagnose.keys import Key, key_of, listed, words
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
@@ -341,9 +341,9 @@ def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
     """The reported parameters of effects."""
     reports = []
     for fit in fits:
-        model, cov = fit.fitted.model, covariance(fit.fitted)
-        pairs = zip(model.effects, blocks(model, fit.fitted.m_step), strict=True)
-        reports.append({key_of(effect): estimates(effect, cov[block, block], model.system) for effect, block in pairs})
+        model = fit.fitted.model
+        pairs = zip(model.effects, covariances(model, fit.fitted.m_step, fit.fitted.state.hessian), strict=True)
+        reports.append({key_of(effect): estimates(effect, cov, model.system) for effect, cov in pairs})
     for key in dict.fromkeys(itertools.chain(*reports)):
         reported = [effects.get(key, {}) for effects in reports]
         for name in dict.fromkeys(itertools.chain(*reported)):

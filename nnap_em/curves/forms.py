@@ -96,12 +96,6 @@ def product(*axes: np.ndarray | list[float]) -> Places:
     return np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
-def _away(view: View, place: Float[np.ndarray, " place"]) -> Float[np.ndarray, "place node"]:
-    """Distance from a place, the short way round where the curve goes round [z]."""
-    away = view.z - place[:, None]
-    return away - np.round(away) if view.whole else away
-
-
 def _powers(order: int, view: View, place: Places) -> Columns:
     return np.stack([view.z**k for k in range(1, order + 1)], axis=1)[None]
 
@@ -178,7 +172,9 @@ def _describe_step(view: View, place: Place, size: Size) -> Description:
 
 
 def _bump(view: View, place: Places) -> Columns:
-    return np.exp(-0.5 * (_away(view, place[:, 0]) / np.exp(place[:, 1:])) ** 2)[..., None]
+    away = view.z - place[:, :1]
+    away = away - np.round(away) if view.whole else away  # the short way round where the curve goes round
+    return np.exp(-0.5 * (away / np.exp(place[:, 1:])) ** 2)[..., None]
 
 
 def _describe_bump(view: View, place: Place, size: Size) -> Description:

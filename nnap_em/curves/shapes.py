@@ -130,8 +130,7 @@ def _seen(curve: Curve, known: np.ndarray) -> _Seen:
 
 
 def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarray, float]:
-    """Place, size and squared residual of the best member of a family: the best three of its grid, polished."""
-    free = list(family.free)
+    """Place, size and squared residual of the best member of a family: the best two of its grid, polished."""
 
     def left(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         size, residual = seen.fit(family.columns(view, place[None]))
@@ -139,7 +138,7 @@ def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarr
 
     _, residual = seen.fit(family.columns(view, family.grid))
     rss = (residual**2).sum(axis=1)
-    free = [] if rss.min() > 0.5 * seen.target @ seen.target else free  # far from an explanation
+    free = [] if rss.min() > 0.5 * seen.target @ seen.target else list(family.free)  # far from an explanation
     places = [family.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
     low, high = family.grid.min(axis=0), family.grid.max(axis=0)
     if free:

@@ -20,8 +20,6 @@ from ..prediction_error.multistep import Columns
 class Track(NamedTuple):
     """The fitted model along the smoothed path of a sequence, in a form that does not depend on its structure."""
 
-    x: Float[Array, "*time state"]
-    """(q, v) in every row."""
     middle: Float[Array, "*time state"]
     """State (q, v) in the middle of every step."""
     acceleration: Float[Array, "*time dof"]
@@ -56,20 +54,19 @@ def _track(null: StateSpaceModel, one) -> Track:
     past = past.at[0].set(0.0)  # the first row has none
     drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, inputs)
     friction = jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
-    return Track(mean[:, : 2 * dof], middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
+    return Track(middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
 
 
 def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
     """Columns that `effect` adds, by its own hooks, to the machine `base` along a track."""
     alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
-    x = track.x
     drive, plain = (base.driving(laws, track.middle, track.inputs) for laws in (alone, ()))
     driven = scenes._replace(drive=drive)
 
     def remember(m, scene):
         return integrate(lambda m: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
 
-    memory = jnp.zeros((x.shape[0], effect.memory), x.dtype)
+    memory = jnp.zeros((track.middle.shape[0], effect.memory), track.middle.dtype)
     if effect.memory:
         _, memory = jax.lax.scan(remember, memory[0], driven)
 
@@ -165,12 +162,12 @@ def candidate_columns(
     size = sum(len(stack.places) for stack in stacks)
 
     def along(track: Track) -> Columns:
-        length = track.x.shape[1]
+        length = track.middle.shape[1]
         padding = [(0, 0), (0, max(0, rows - length))]
         longer = lambda a: np.pad(a, padding + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
         track = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
-        force, reading = (np.empty((len(track.x), size, length, n), track.x.dtype) for n in last)
+        force, reading = (np.empty((len(track.middle), size, length, n), track.middle.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):

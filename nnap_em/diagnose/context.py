@@ -28,7 +28,7 @@ Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
 LOOSER = 3.0
-"""Increase of the log of the process noise where a fit loses tracks: a looser filter keeps them."""
+"""Increase of the log of the process noise where sequences diverge: a looser filter follows them."""
 
 
 class Effort(NamedTuple):
@@ -71,7 +71,7 @@ class SearchContext(NamedTuple):
     @property
     def declared(self) -> Hypothesis:
         """The declared model."""
-        return Hypothesis(self.before.model, self.before.m_step)
+        return Hypothesis(self.before.model, self.before.m_step, (None,) * len(self.before.model.effects))
 
 
 def _cut(tree: _Tree, length: int) -> _Tree:
@@ -126,7 +126,7 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
     except FitError:
         state = run(looser(hypothesis.model))
     if np.isfinite(before.state.top).sum() > np.isfinite(state.top).sum():
-        try:  # tracks that the model without it keeps are lost
+        try:  # sequences that the model without it follows diverge
             other = run(looser(cast(StateSpaceModel, state.best)))
             state = other if ahead(other.top, state.top) > 0 else state
         except FitError:
@@ -181,13 +181,8 @@ def _predicting(context: SearchContext, hypothesis: Hypothesis, state: EMState) 
     return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)
 
 
-def trimmed(gain) -> float:
-    """Sum of gains with a sixth at either end replaced by the mean of the others."""
-    gain = np.sort(np.nan_to_num(gain, nan=-1e3))
+def ahead(a: Float[np.ndarray, " seq"], b: Float[np.ndarray, " seq"]) -> float:
+    """Log-likelihood of one fit over another [nat]; a sixth at either end counts as the mean of the others."""
+    gain = np.sort(np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3))
     cut = gain.size // 6
     return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
-
-
-def ahead(a: Float[np.ndarray, " seq"], b: Float[np.ndarray, " seq"]) -> float:
-    """Log-likelihood of one fit over another [nat]; a sixth of the sequences is trimmed at either end."""
-    return trimmed(np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3))

@@ -1,4 +1,4 @@
-"""The outcome of the loop in words and numbers: what was found, how sure, and what it is worth."""
+"""The outcome of the loop in words and numbers: what was found, how sure, and the error that it removes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
-from ..fit.identify import Identified, friction_table
+from ..fit.identify import friction_table
 from ..numerics.digits import number, with_std
 from ..systems import AbstractSystem
-from .hypothesis import blocks
-from .keys import Key, key_of, listed, remainder_of, with_article, words
+from .hypothesis import covariances
+from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
 from .outcome import Closed
 
 
@@ -27,15 +27,6 @@ class Estimate(NamedTuple):
     value: float
     std: float
     unit: str
-
-
-def covariance(fitted: Identified) -> Float[np.ndarray, "param param"]:
-    """Covariance of all estimated parameters, friction integrated out (Laplace)."""
-    prior = fitted.m_step.prior
-    cov = np.linalg.inv(np.asarray(fitted.state.hessian))
-    cut = cov.shape[0] - prior.size
-    std = np.asarray(prior.std)
-    return cov[cut:, cut:] * np.outer(std, std)
 
 
 def estimates(
@@ -85,16 +76,15 @@ class Finding(NamedTuple):
 def findings(closed: Closed) -> list[Finding]:
     """All effects found, each with its equivalents."""
     fitted, model = closed.after, closed.after.model
-    cov = covariance(fitted)
-    covariances = [cov[block, block] for block in blocks(model, fitted.m_step)]
+    numbers = covariances(model, fitted.m_step, fitted.state.hessian)
     laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]
-    entries = list(zip(model.effects, closed.found, covariances, laws, strict=True))
+    entries = list(zip(model.effects, closed.found, numbers, laws, strict=True))
     out = []
-    for effect, record, numbers, law in entries:
+    for effect, record, cov, law in entries:
         if law is not None:
             continue  # reported with the law that it completes
-        drawn = effect.curve(numbers, model.system)
-        parameters = estimates(effect, numbers, model.system)
+        drawn = effect.curve(cov, model.system)
+        parameters = estimates(effect, cov, model.system)
         sizes = ", ".join(f"{n} = {with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items())
         remainder = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
         form, remains = (shape(one) if one else None for one in (drawn, remainder))
@@ -224,14 +214,13 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
     """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
     for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
-        name, joint, channel, inputs = dispute.key
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
         text = (
             f"{words(dispute.key)} would remove {dispute.share:.0%} of the prediction error, but {listed(against)} "
             f"{'shows' if len(against) == 1 else 'show'} the opposite (up to {dispute.harm:.0%} more error)"
         )
-        key = catalogue[name].key()
-        out.append(Dispute(key, joint, channel, list(inputs), dispute.share, against, dispute.harm, text))
+        place, share = place_of(dispute.key), dispute.share
+        out.append(Dispute(**place, share_of_error=share, files=against, harm=dispute.harm, description=text))
     return out
 
 
@@ -256,14 +245,15 @@ def suspected(closed: Closed) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
     for suspect in [entry for step in closed.last for entry in step.suspects]:
-        name, joint, channel, inputs = suspect.key
+        law, confirm = words(suspect.key), catalogue[suspect.key[0]].confirm
         text = (
-            f"{words(suspect.key)} would remove {suspect.share:.0%} of the squared prediction error, "
+            f"{law} would remove {suspect.share:.0%} of the squared prediction error, "
             f"where chance removes {f'up to {suspect.chance:.0%}' if suspect.chance >= 0.005 else 'less than 1%'}"
         )
-        place = catalogue[name].key(), joint, channel, list(inputs)
-        report = SuspectReport(*place, suspect.share, suspect.chance, words(suspect.key), text, catalogue[name].confirm)
-        out.append(report)
+        place, share, chance = place_of(suspect.key), suspect.share, suspect.chance
+        out.append(
+            SuspectReport(**place, share_of_error=share, chance=chance, law=law, description=text, confirm=confirm)
+        )
     return out
 
 
@@ -301,13 +291,9 @@ MORE = "To be sure of a suspect, record as many different motions again and diag
 
 def entry(finding: Finding) -> dict[str, Any]:
     """A finding as the report has it."""
-    _, joint, channel, inputs = key_of(finding.effect)
     return {
         **({"shape": finding.shape.entry()} if finding.shape else {}),
-        "name": finding.effect.key(),
-        "joint": joint,
-        "channel": channel,
-        "inputs": list(inputs),
+        **place_of(key_of(finding.effect)),
         "parameters": {n: p._asdict() for n, p in finding.parameters.items()},
         "evidence": finding.evidence,
         "equivalent": [{"name": catalogue[k[0]].key(), "joint": k[1], "channel": k[2]} for k in finding.equivalent],

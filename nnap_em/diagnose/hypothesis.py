@@ -87,15 +87,17 @@ class Hypothesis(NamedTuple):
         """The same with other numbers in the model."""
         return self._replace(model=model)
 
-    def with_evidence(self, place: int, evidence: Found) -> "Hypothesis":
-        """The same with the evidence of the effect at `place`."""
-        entries = list(self.found)
-        entries[place] = evidence
-        return self._replace(found=tuple(entries))
-
 
 def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:
     """Slice of the parameters of every effect among all that are estimated."""
     sizes = [flat(effect).size for effect in model.effects]
     ends = np.cumsum(sizes) + m_step.prior.size - sum(sizes)
     return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
+
+
+def covariances(model: StateSpaceModel, m_step: ScoringMStep, hessian) -> list[Float[np.ndarray, "param param"]]:
+    """Covariance of the parameters of every effect, all else integrated out (Laplace)."""
+    cov, prior = np.linalg.inv(np.asarray(hessian)), m_step.prior
+    cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)
+    cov = cov[cut:, cut:] * np.outer(std, std)
+    return [cov[block, block] for block in blocks(model, m_step)]

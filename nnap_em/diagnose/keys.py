@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 
-from ..effects import AbstractEffect, flat
+from ..effects import AbstractEffect, catalogue, flat
 from ..model.state_space import StateSpaceModel
 from ..systems import AbstractSystem
 
@@ -16,6 +17,12 @@ Key = tuple[str, int | None, str | None, tuple[str, ...]]
 def key_of(effect: AbstractEffect) -> Key:
     """Identity of an effect: two with the same key are the same law in the same place."""
     return effect.name, effect.joint, effect.channel, effect.inputs_named()
+
+
+def place_of(key: Key) -> dict[str, Any]:
+    """A law as the report names it."""
+    name, joint, channel, inputs = key
+    return {"name": catalogue[name].key(), "joint": joint, "channel": channel, "inputs": list(inputs)}
 
 
 def words(key: Key) -> str:

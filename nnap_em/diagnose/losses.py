@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from ..data.dataset import Dataset
 from ..effects import Candidate
 from ..em.local import locals_along
-from ..em.quadratic import friction_columns, whitened_sensitivities
+from ..em.quadratic import whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.parallel import each, turns
 from ..prediction_error.multistep import (
@@ -34,7 +34,7 @@ from ..prediction_error.multistep import (
     followed,
     open_loop,
     ratio,
-    read_columns,
+    sensitivities,
     starts,
     weighed,
 )
@@ -74,17 +74,13 @@ class AbstractLoss(eqx.Module):
         """Share of the declared model's squared error that the accepted laws left; 1 where it does not matter."""
         return 1.0
 
-    def count(self, fit: SmoothedFit) -> float:
-        """Number of independent errors that the smallest gain in log-likelihood is spread over."""
-        return float(readings(fit.data, fit.used))
-
     @abstractmethod
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
-    @abstractmethod
     def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
         """A `trial` after what its fit by likelihood leaves to do."""
+        return trial
 
     @abstractmethod
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
@@ -111,7 +107,7 @@ class MultiStep(AbstractLoss):
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
-        """Filter errors forked every 50 ms, with robust weights."""
+        """Errors of predictions that begin from the filter every 50 ms, with robust weights."""
         model, path, data = fit.model, fit.path, fit.data
         weights = fit.m_step.weights(model)
         track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
@@ -173,10 +169,6 @@ class OneStep(AbstractLoss):
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
-        """The trial as it is: likelihood leaves nothing to do."""
-        return trial
-
     def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
         """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""
         gain = full.loglik - null.loglik
@@ -206,11 +198,7 @@ def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
 def _innovations(common, one) -> tuple[Float[Array, "time obs"], Float[Array, "time obs column"]]:
     """Whitened innovations of one sequence and what friction nodes, parameters and candidates take off them."""
     (log_q, log_r, start, nodes), (linear, middle, columns) = common, one
-    dof = nodes.shape[0]
     filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
-    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof:], linear.by_force)
-    states = jnp.concatenate([torque, linear.by_parameter, moved], axis=-1)
-    read = read_columns(nodes, linear, middle, columns)
+    states, read = sensitivities(nodes, linear, middle, columns)
     states = jnp.where(linear.seq.active[:, None, None], states, 0.0)
     return filtered.innovation, whitened_sensitivities(filtered, states, read, linear.seq.observed)

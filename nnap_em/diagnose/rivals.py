@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import numpy as np
@@ -13,8 +12,7 @@ from ..fit.identify import Identified, finished
 from ..fit.memory import extended
 from ..storage.log import silent
 from .context import EFFORT, SearchContext, extend, smooth
-from .hypothesis import Hypothesis
-from .keys import Key, key_of
+from .keys import key_of
 from .losses import OneStep
 from .outcome import Closed
 from .propose import proposals, seeded, surroundings
@@ -72,7 +70,9 @@ def compare_equivalents(closed: Closed, data: Dataset) -> Closed:
         if not evidence.equivalent:
             continue
         fitted, keys = closed.after, (key_of(closed.after.model.effects[place]), *evidence.equivalent)
-        reference, *others = ((key, instead(fitted, data, place, partial(_is, key))) for key in keys)
+        reference, *others = (
+            (key, instead(fitted, data, place, lambda effect, key=key: key_of(effect) == key)) for key in keys
+        )
         reference = max(_total(one) for one in (again(fitted, data), reference[1]) if one is not None)
         leads = {key: _total(other) - reference for key, other in others if other is not None}
         best, other = max(others, key=lambda entry: leads.get(entry[0], -math.inf))
@@ -87,28 +87,20 @@ def compare_equivalents(closed: Closed, data: Dataset) -> Closed:
     return closed
 
 
-def _is(key: Key, effect: AbstractEffect) -> bool:
-    return key_of(effect) == key
-
-
 def _settled(fitted: Identified, data: Dataset) -> Identified:
     """A quick refit after EM over the whole length."""
-    data = jax.device_put(data)
     context = _context(fitted, data)
-    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    return finished(fitted._replace(state=extend(context, hypothesis, context.longest)), data)
+    return finished(fitted._replace(state=extend(context, context.declared, context.longest)), context.data)
 
 
 def _context(fitted: Identified, data: Dataset) -> SearchContext:
-    return SearchContext(fitted, {}, data, OneStep(), EFFORT, silent)
+    return SearchContext(fitted, {}, jax.device_put(data), OneStep(), EFFORT, silent)
 
 
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:
     """Smoothed fit without one of its effects, over the whole length."""
-    data = jax.device_put(data)
-    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    hypothesis = hypothesis if place is None else hypothesis.without(place)
     context = _context(fitted, data)
+    hypothesis = context.declared if place is None else context.declared.without(place)
     return smooth(context, hypothesis, context.longest)[0]._replace(declared=hypothesis.having(()))
 
 

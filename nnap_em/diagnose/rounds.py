@@ -53,7 +53,8 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
         null = fitted(fit.hypothesis, fit.path, *fitting) if admitted else None
         while admitted and len(tried) < context.effort.shortlist:
             first = min(s.band for s in admitted)
-            entries = _entries([s for s in admitted if s.band == first], model)
+            band = [s for s in admitted if s.band == first]
+            entries = sorted(_standing(band, [s.ratio for s in band], model), key=lambda s: -score(s, model))
             tied = [s for s in entries if score(s, model) >= EQUIVALENT * score(entries[0], model)]
             group = tied + _inside(tied, admitted, model)
             cases = []
@@ -94,12 +95,6 @@ def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context
     same += [key_of(case.effect) for case in tied if case.effect.named and best.gain - case.gain < EQUIVALENT_NATS]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
-
-
-def _entries(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
-    """Laws of one band of horizons that none of the others stands for, best first."""
-    standing = _standing(admitted, [s.ratio for s in admitted], model)
-    return sorted(standing, key=lambda s: -score(s, model))
 
 
 def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[_Law]:

@@ -1,7 +1,6 @@
 """Close the loop: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
 
 import dataclasses
-import functools
 import math
 import time
 from typing import Any, NamedTuple, cast
@@ -28,13 +27,13 @@ from ..storage.log import Log, renamed, silent
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, remainder_of, replaced, words
-from .losses import AbstractLoss, MultiStep, OneStep
+from .losses import AbstractLoss, MultiStep, OneStep, readings
 from .outcome import Closed, Step
 from .quantised import quantised
 from .rivals import compare_equivalents
 from .rounds import Round, screening_round
 from .trial import Refit, fitted
-from .verdict import Rejection, explains, needed
+from .verdict import KEEP, Rejection, explains, needed
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -56,18 +55,17 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
 
 
 def _with(hypothesis: Hypothesis, case: Refit, evidence: Found, context: SearchContext) -> Hypothesis:
-    """The hypothesis with a refitted law; a named law gives way to a remainder that explains most of both."""
+    """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
     m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, hypothesis.m_step.tie)  # under the old hold on noise
-    following, remainder = case.after._replace(m_step=m_step), remainder_of(case.effect, hypothesis.model)
-    form = replaced(case.effect, hypothesis.model)
+    remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
     place = remainder if form is None else form
     law = None if place is None else hypothesis.found[place]
-    if law is None or (form is None and explains(law.removed, case.removed)):
-        return following.with_evidence(-1, evidence)
-    both = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))  # over the model without the older law
-    following = following.with_evidence(-1, both)
-    if form is not None:  # its place is taken already
+    stays = law is None or (form is None and explains(law.removed, case.removed))
+    if law is not None and not stays:  # over the model without the older law
+        evidence = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))
+    following = case.after._replace(m_step=m_step, found=(*case.after.found[:-1], evidence))
+    if stays or form is not None:  # its place is taken already
         return following
     context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
     return following.without(cast(int, remainder))
@@ -100,21 +98,18 @@ def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
         full = fitted(hypothesis, fit.path, fit, context.loss, context.effort.passes)
         losses = [_share_without(context, hypothesis, full, fit, place) for place in range(len(hypothesis.found))]
         least = int(np.argmin(losses))
-        floor = context.loss.bars.floor(context.loss.count(fit))
+        floor = context.loss.bars.floor(float(readings(fit.data, fit.used)))
         if needed(losses[least], floor):
             break
         name = words(key_of(hypothesis.model.effects[least]))
-        reason = f"without it {losses[least]:.1%} of the squared error is lost, {floor:.1%} counts"
+        reason = f"without it {losses[least]:.1%} of the squared error is lost, {KEEP * floor:.1%} counts"
         context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
         hypothesis = hypothesis.without(least)
     return hypothesis
 
 
 def _share_without(context: SearchContext, hypothesis: Hypothesis, full, fit, place: int) -> float:
-    """Share of the squared error of a fit without an effect that the fit with it removes, at its best band of horizons.
-
-    Infinite for steps of a reading, which are seen in the numbers themselves.
-    """
+    """Share of the squared error of a fit without an effect that the fit with it removes, at its best band."""
     effect = hypothesis.model.effects[place]
     if effect.read_off or any(remainder_of(other, hypothesis.model) == place for other in hypothesis.model.effects):
         return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
@@ -137,7 +132,11 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     decide, from the declared model on.
     """
     before, data = context.before, context.data
-    begun = _quantised(context)
+    try:  # steps of readings as noise: they spoil the noise that all else leans on
+        begun = quantised(context, context.declared)
+    except FitError as error:
+        context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
+        begun = context.declared, None
     one_step = _by_one_step(context, *begun) if white else None
     hypothesis, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
     if not hypothesis.found or state is None:
@@ -162,15 +161,6 @@ def _by_one_step(context: SearchContext, hypothesis: Hypothesis, state: EMState 
             "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
         )
     return searched if white else None
-
-
-def _quantised(context: SearchContext) -> tuple[Hypothesis, EMState | None]:
-    """The declared model with steps of readings as noise, which spoil the noise that all else leans on."""
-    try:
-        return quantised(context, context.declared)
-    except FitError as error:
-        context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
-        return context.declared, None
 
 
 def _ladder(context: SearchContext) -> list[int]:
@@ -209,7 +199,7 @@ class _Searched(NamedTuple):
 def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
     """Forward selection and backward elimination by one loss, until neither changes anything or the time is up.
 
-    The rounds look at `lengths` rows in turn, then, and after the first law at once, at all.  A law that was accepted
+    The rounds use `lengths` rows in turn, then, and after the first law at once, all.  A law that was accepted
     in time is fitted over the whole length, however long that takes.
     """
     searched: set[frozenset] = set()
@@ -269,13 +259,14 @@ def close_the_loop(
     data = jax.device_put(data)
     stages: Stages = {}
 
-    def watch(seen: Stages, state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
-        seen[rows] = (state, used)
-        log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
-
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}
-        outcome = identify(rig, part, key=key, smoother=_unbranched, watch=functools.partial(watch, seen))
+
+        def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
+            seen[rows] = (state, used)
+            log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+
+        outcome = identify(rig, part, key=key, smoother=_unbranched, watch=watch)
         stages.clear()  # a fit that fails leaves the stages of the one before
         stages.update(seen)
         return outcome

@@ -4,12 +4,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect, Candidate, flat
 from ..fit.memory import extended
 from ..numerics.gaussian import Gaussian
 from .findings import estimates
-from .hypothesis import Hypothesis, blocks
+from .hypothesis import Hypothesis, covariances
 from .keys import free_signals, replaced
 from .losses import AbstractLoss
 from .propose import seeded
@@ -20,10 +21,9 @@ from .verdict import Rejection, veto
 
 
 class Refit(NamedTuple):
-    """A hypothesis with one effect more (or another in the place of one), and what that is worth."""
+    """A hypothesis with one effect more (or another in the place of one), and the error that it removes."""
 
     screened: Screened
-    trial: Trial
     after: Hypothesis
     """The model with it."""
     removed: float
@@ -70,39 +70,24 @@ def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: Abst
     trial = fitted(full, extended(full.model, fit.path, fit.data), fit, loss, passes)
     after = full.refitted(trial.model)
     gain = np.nan_to_num(trial.loglik, nan=-1e3) - np.nan_to_num(null.loglik, nan=-1e3)
+    effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, trial.hessian)[-1]
+    reported = estimates(effect, cov, after.model.system).get("amplitude")
     return Refit(
         screened,
-        trial,
         after,
         1 - loss.ratio(null, trial, fit, screened.band),
         float(np.sum(gain[fit.used])),
-        certainty(candidate, after, trial.hessian),
-        _amplitude(after, trial.hessian),
+        certainty(candidate, effect, cov),
+        reported.value / reported.std if reported and reported.std > 0 else np.inf,
     )
 
 
-def _covariance(hypothesis: Hypothesis, hessian, place: int) -> np.ndarray:
-    """Covariance of the parameters of an effect, all else integrated out."""
-    prior, block = hypothesis.m_step.prior, blocks(hypothesis.model, hypothesis.m_step)[place]
-    cov = np.linalg.inv(np.asarray(hessian))
-    cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)[block]
-    return cov[cut:, cut:][block, block] * np.outer(std, std)
-
-
-def certainty(candidate: Candidate, hypothesis: Hypothesis, hessian, place: int = -1) -> float:
-    """Wald statistic of the strengths of the effect at `place`, jointly, in standard deviations [Wald 1943].
+def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:
+    """Wald statistic of the strengths of an effect, jointly, in standard deviations [Wald 1943].
 
     Half its square is the log-likelihood that would be lost without the effect, to second order.
     """
     none = np.asarray(flat(candidate.start))
     strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
-    cov = _covariance(hypothesis, hessian, place)[np.ix_(strong, strong)]
-    away = (np.asarray(flat(hypothesis.model.effects[place])) - none)[strong]
+    cov, away = cov[np.ix_(strong, strong)], (np.asarray(flat(effect)) - none)[strong]
     return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))
-
-
-def _amplitude(hypothesis: Hypothesis, hessian, place: int = -1) -> float:
-    """Standard deviations of the reported amplitude of an effect from zero."""
-    model, cov = hypothesis.model, _covariance(hypothesis, hessian, place)
-    reported = estimates(model.effects[place], cov, model.system).get("amplitude")
-    return reported.value / reported.std if reported and reported.std > 0 else np.inf

@@ -192,7 +192,7 @@ def fit(
     """EM from `state` until `epochs` are done or the likelihood rests.
 
     It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
-    nats twice running, or when a model that loses tracks was refused twice running.
+    nats twice running, or when a model on which sequences diverge was refused twice running.
     Raises FitError when no sequence can be followed.
     """
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
@@ -209,7 +209,7 @@ def fit(
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
-                f"epoch {state.epoch + 1}: all {used.size} sequences are lost over the first {seen} samples; "
+                f"epoch {state.epoch + 1}: all {used.size} sequences diverge within the first {seen} samples; "
                 "check units, signs and the start prior, or declare a wider one"
             )
         if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):

@@ -47,14 +47,12 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
         parts = [(machine.bodies[k], within[k]) for k in carrier if k >= 0 and carrier[k] == i]
         merged = _together(parts) if len(parts) > 1 else body
         parent = number[carrier[body.parent]]
-        bodies.append(
-            merged._replace(name=body.name, parent=parent, place=_vector(pose.place), turn=_matrix(pose.turn))
-        )
+        bodies.append(merged._replace(name=body.name, parent=parent, place=vector(pose.place), turn=matrix(pose.turn)))
     order = {joint.name: k for k, joint in enumerate(joints)}
     names = [joint.name for joint in machine.joints]
 
     def place(body: int, at: Vector) -> Vector:
-        return _vector(within[body].place + within[body].turn @ np.asarray(at))
+        return vector(within[body].place + within[body].turn @ np.asarray(at))
 
     def free(parts: tuple) -> tuple:
         present = [part for part in parts if names[part.joint] in order]
@@ -74,7 +72,7 @@ def lock(machine: Machine, values: Mapping[str, float], joined: Collection[int] 
             sensor._replace(
                 body=number[carrier[sensor.body]],
                 place=place(sensor.body, sensor.place),
-                turn=_matrix(within[sensor.body].turn @ np.asarray(sensor.turn)),
+                turn=matrix(within[sensor.body].turn @ np.asarray(sensor.turn)),
             )
             for sensor in machine.sensors
         ),
@@ -108,8 +106,8 @@ def _held(body: Body, joints: list[Joint], values: Mapping[str, float]) -> tuple
         pose = pose.of(change)
         free = [
             other._replace(
-                axis=_vector(turn.T @ np.asarray(other.axis)),
-                anchor=_vector(turn.T @ (np.asarray(other.anchor) - change.place)),
+                axis=vector(turn.T @ np.asarray(other.axis)),
+                anchor=vector(turn.T @ (np.asarray(other.anchor) - change.place)),
             )
             for other in free
         ]
@@ -136,14 +134,16 @@ def _together(parts: list[tuple[Body, Pose]]) -> Body:
         way = at - centre
         inertia += pose.turn @ np.asarray(body.inertia) @ pose.turn.T
         inertia += body.mass * (way @ way * np.eye(3) - np.outer(way, way))
-    return parts[0][0]._replace(mass=mass, centre=_vector(centre), inertia=_matrix(0.5 * (inertia + inertia.T)))
+    return parts[0][0]._replace(mass=mass, centre=vector(centre), inertia=matrix(0.5 * (inertia + inertia.T)))
 
 
-def _vector(values: np.ndarray) -> Vector:
+def vector(values: np.ndarray) -> Vector:
+    """Three numbers of NumPy as a vector."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
-def _matrix(values: np.ndarray) -> Rotation:
-    a, b, c = (_vector(row) for row in values)
+def matrix(values: np.ndarray) -> Rotation:
+    """Nine as a matrix."""
+    a, b, c = (vector(row) for row in values)
     return a, b, c

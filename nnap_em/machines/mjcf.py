@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site, Vector
+from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site
 from ..data.rig import RigError, RigWarning, nearest
 from ..data.servo import TORQUE
-from .locked import NOTHING, groups, lock
+from .locked import NOTHING, groups, lock, matrix, vector
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
 
@@ -60,7 +60,7 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
     driven = [motor for motor in _motors(model, part) if motor.joint in numbers]
     machine = Machine(
         file=path.name,
-        gravity=_vector(model.opt.gravity * (model.opt.disableflags & _flag("mjDSBL_GRAVITY") == 0)),
+        gravity=vector(model.opt.gravity * (model.opt.disableflags & _flag("mjDSBL_GRAVITY") == 0)),
         bodies=bodies,
         joints=joints,
         motors=tuple(motor._replace(joint=numbers.index(motor.joint)) for motor in driven),
@@ -70,7 +70,7 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
             if sensor.joint in numbers
         ),
         sites=tuple(
-            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
+            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, vector(model.site_pos[i]))
             for i in range(model.nsite)
             if model.site_bodyid[i] > 0
         ),
@@ -497,10 +497,10 @@ def _bodies(model: Any) -> tuple[Body, ...]:
         Body(
             name=model.body(i).name or f"body{i}",
             parent=int(model.body_parentid[i]) - 1,
-            place=_vector(model.body_pos[i]),
+            place=vector(model.body_pos[i]),
             turn=_rotation(model.body_quat[i]),
             mass=float(model.body_mass[i]),
-            centre=_vector(model.body_ipos[i]),
+            centre=vector(model.body_ipos[i]),
             inertia=_inertia(model, i),
         )
         for i in range(1, model.nbody)
@@ -510,7 +510,7 @@ def _bodies(model: Any) -> tuple[Body, ...]:
 def _inertia(model: Any, i: int) -> Rotation:
     turn = np.asarray(_rotation(model.body_iquat[i]))
     whole = turn @ np.diag(model.body_inertia[i]) @ turn.T
-    return _matrix(0.5 * (whole + whole.T))
+    return matrix(0.5 * (whole + whole.T))
 
 
 def _joint(model: Any, j: int) -> Joint:
@@ -519,8 +519,8 @@ def _joint(model: Any, j: int) -> Joint:
         name=model.joint(j).name,
         body=int(model.jnt_bodyid[j]) - 1,
         slide=int(model.jnt_type[j]) == _SLIDE,
-        axis=_vector(model.jnt_axis[j]),
-        anchor=_vector(model.jnt_pos[j]),
+        axis=vector(model.jnt_axis[j]),
+        anchor=vector(model.jnt_pos[j]),
         zero=float(model.qpos0[place]),
         stiffness=float(np.ravel(model.jnt_stiffness[j])[0]),
         rest=float(model.qpos_spring[place]),
@@ -618,12 +618,12 @@ def _sensors(model: Any) -> Iterator[Sensor]:
         place, turn = (model.site_pos[at], model.site_quat[at]) if at >= 0 else (np.zeros(3), np.array([1.0, 0, 0, 0]))
         body = int(model.site_bodyid[at]) - 1 if at >= 0 else -1
         for axis, letter in enumerate("xyz"):
-            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
+            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, vector(place), _rotation(turn))
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:
     w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
-    return _matrix(
+    return matrix(
         np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -632,13 +632,3 @@ def _rotation(quaternion: np.ndarray) -> Rotation:
             ]
         )
     )
-
-
-def _matrix(values: np.ndarray) -> Rotation:
-    a, b, c = (_vector(row) for row in values)
-    return a, b, c
-
-
-def _vector(values: np.ndarray) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

@@ -1,6 +1,6 @@
 """Multi-step prediction errors, how everything that is estimated would move them, and a fit to them.
 
-The filter is forked at regular starts and the model runs on alone from there.  The sensitivities are those of the
+Open-loop predictions begin from the filter at regular starts.  The sensitivities are those of the
 filter up to the start and of the open loop from there on, so that the errors are linear in what is estimated.
 """
 
@@ -27,7 +27,7 @@ from ..smoother.kalman import CUBATURE, kalman_filter
 from .shape import friction_prior
 
 HORIZONS = (0.25, 0.5)
-"""Horizons [s] at which errors are looked at."""
+"""Horizons [s] at which errors are compared."""
 JUDGED = (*HORIZONS, 1.0)
 """Horizons [s] at which a model is judged: what only bends the first half second fails later."""
 SHORT_HORIZONS = (0.05, 0.1)
@@ -55,7 +55,7 @@ class Grid(eqx.Module):
     ages: tuple[int, ...] = eqx.field(static=True)
 
     def starts(self, rows: int) -> Int[np.ndarray, " start"]:
-        """Rows at which a sequence of `rows` samples is forked."""
+        """Rows of a sequence of `rows` samples at which a prediction begins."""
         return np.arange(self.stride, rows - self.ages[-1], self.stride)
 
 
@@ -78,12 +78,12 @@ def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Gri
 
 
 def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Int[np.ndarray, " start"]:
-    """Rows at which all sequences are forked."""
+    """Rows of all sequences at which a prediction begins."""
     return _grid(model, data, horizons).starts(data.t.shape[1])
 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
-    """Places in y of what is looked at: measured coordinates and sensors, or where there are none all."""
+    """Places in y of the readings compared: measured coordinates and sensors, or where there are none all."""
     rates = range(dof := len(model.system.coordinates), 2 * dof)
     return tuple(i for i, s in enumerate(model.measured) if s not in rates) or tuple(range(len(model.measured)))
 
@@ -190,29 +190,26 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
     return jnp.stack([known[starts + age] - read[age - 1] for age in grid.ages], axis=1)
 
 
-def read_columns(
+def sensitivities(
     nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], columns: Columns
-) -> Float[Array, "time obs column"]:
-    """Change of the readings of one sequence by friction nodes, parameters and further `columns`."""
+) -> tuple[Float[Array, "time state column"], Float[Array, "time obs column"]]:
+    """Change of next states and of readings of one sequence by friction nodes, parameters and further `columns`."""
     dof = nodes.shape[0]
+    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], linear.by_force)
+    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
     estimated = reading_columns(nodes, middle[:, None, dof : 2 * dof], linear)
     read = jnp.moveaxis(columns.reading, 0, -1)
     if linear.reading_by_force is not None:
         read = read + jnp.einsum("tod,ctd->toc", linear.reading_by_force, columns.force)
-    return jnp.concatenate([estimated, read], axis=-1)
+    return jnp.concatenate([torque, linear.by_parameter, moved], axis=-1), jnp.concatenate([estimated, read], axis=-1)
 
 
 def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     """Change of the predictions of one sequence by every column."""
     (nodes, grid), (linear, gain, middle, columns) = common, one
     single = lambda tree: jax.tree.map(lambda a: a.astype(jnp.float32), tree)  # noqa: E731
-    dof = nodes.shape[0]
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(middle[:, dof : 2 * dof], linear.by_force)
-    moved = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
-    read = read_columns(nodes, linear, middle, columns)
-    push = jnp.where(
-        linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter, moved], axis=-1), 0.0
-    )
+    push, read = sensitivities(nodes, linear, middle, columns)
+    push = jnp.where(linear.seq.active[:, None, None], push, 0.0)
     matrix, rows, gain, push, read = single((linear.affine.matrix, linear.reading.rows, gain, push, read))
 
     def absorb(s, slices):
@@ -224,7 +221,7 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     _, known = jax.lax.scan(absorb, jnp.zeros_like(push[0]), (matrix, rows, gain, push, read))
     starts = grid.starts(push.shape[0])
 
-    def fork(one):
+    def ahead(one):
         s, start = one
         out = []
         for first, last in itertools.pairwise((0, *grid.ages)):
@@ -233,7 +230,7 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
             out.append(rows[start + last] @ s + read[start + last])
         return jnp.stack(out)
 
-    return jax.lax.map(fork, (known[starts], jnp.asarray(starts)))
+    return jax.lax.map(ahead, (known[starts], jnp.asarray(starts)))
 
 
 # --- how large

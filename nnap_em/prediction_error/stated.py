@@ -15,13 +15,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..em.local import locals_along
 from ..em.mstep import ScoringMStep
-from ..em.quadratic import friction_columns
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
-from .multistep import Columns, OpenLoop, followed, open_loop, read_columns, weighed
+from .multistep import Columns, OpenLoop, followed, open_loop, sensitivities, weighed
 
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""
@@ -119,11 +118,7 @@ def of_states(
 def _moved(common, one) -> Float[Array, "time state state"]:
     """Change of one sequence."""
     (log_q, log_r, start, nodes, draws), (linear, mean, columns) = common, one
-    dof = nodes.shape[0]
-    torque = jax.vmap(lambda v, b: friction_columns(nodes, v[None], b))(mean[:, dof : 2 * dof], linear.by_force)
-    other = jnp.einsum("tsd,ctd->tsc", linear.by_force, columns.force)
-    pushed = jnp.concatenate([torque, linear.by_parameter, other], axis=-1)
-    read = read_columns(nodes, linear, mean, columns)
+    pushed, read = sensitivities(nodes, linear, mean, columns)
     still = start._replace(mean=jnp.zeros_like(start.mean))
     seq = linear.seq._replace(y=jnp.zeros_like(linear.seq.y))
 

@@ -3,12 +3,12 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.dataset import DataError
+from ..data.formats import refuse
 from ..data.rig import nearest
 
 EXTRA = 'pip install "nnap-em[logs]"'
@@ -71,11 +71,6 @@ class Address(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.topic}:{self.path}" if self.topic else self.path
-
-
-def refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
-    """Raise the DataError."""
-    raise DataError(f"{path}: {where}: {problem}; {hint}")
 
 
 def address(text: str) -> tuple[str, str]:

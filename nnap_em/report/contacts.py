@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from ..diagnose.findings import Estimate, covariance, estimates, filled
-from ..diagnose.hypothesis import blocks
+from ..diagnose.findings import Estimate, estimates, filled
+from ..diagnose.hypothesis import covariances
 from ..effects import flat
 from ..fit.identify import Identified
 from ..model.dynamic_friction import DynamicFriction, Hysteresis, hysteresis
@@ -55,12 +55,12 @@ class Contact(NamedTuple):
 
 def contacts(fitted: Identified) -> list[Contact]:
     """Contacts of a fit; standard deviations by the delta method, friction integrated out."""
-    model, cov, out = fitted.model, covariance(fitted), []
-    for effect, block in zip(model.effects, blocks(model, fitted.m_step), strict=True):
-        parameters = estimates(effect, cov[block, block], model.system)
+    model, out = fitted.model, []
+    for effect, cov in zip(model.effects, covariances(model, fitted.m_step, fitted.state.hessian), strict=True):
+        parameters = estimates(effect, cov, model.system)
         contact = cast(DynamicFriction, effect)
         torque, slopes = map(np.asarray, _loop(contact, parameters["distance"].value))
-        std = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", slopes, cov[block, block], slopes), 0.0))
+        std = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", slopes, cov, slopes), 0.0))
         loop = hysteresis(contact, parameters["distance"].value)
         out.append(Contact(contact.joint, parameters, loop._replace(torque=torque), std))
     return out

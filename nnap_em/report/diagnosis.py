@@ -11,9 +11,8 @@ from jaxtyping import Float
 from ..data.logs import Logs
 from ..data.rig import Rig
 from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
-from ..diagnose.keys import Key, key_of, words
+from ..diagnose.keys import Key, key_of, place_of, words
 from ..diagnose.outcome import Closed, Step
-from ..effects import catalogue
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.predict import GIVEN, Prediction
 from ..residual.innovations import tests
@@ -78,7 +77,7 @@ def write_diagnosis(
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "looks": [_round(step, closed.before.rig.dt) for step in closed.steps],
         "disagreements": [d._asdict() for d in disputed],
-        "cannot_tell": [_place(key) | {"name": catalogue[key[0]].key()} for key in rivals],
+        "cannot_tell": [place_of(key) for key in rivals],
         "suspects": [suspect._asdict() for suspect in suspects],
         "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(closed.before.rig)],
     }
@@ -198,12 +197,7 @@ def _disturbance(force: Intervention, files: Sequence[str]) -> dict[str, Any]:
 
 
 def _screened(key: Key, gain: float) -> dict[str, Any]:
-    return _place(key) | {"gain": gain}
-
-
-def _place(key: Key) -> dict[str, Any]:
-    name, joint, channel, inputs = key
-    return {"name": name, "joint": joint, "channel": channel, "inputs": list(inputs)}
+    return place_of(key) | {"name": key[0], "gain": gain}
 
 
 def _velocities(residuals: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:

@@ -52,8 +52,8 @@ class AbstractSmoother(eqx.Module):
         """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
 
     def tolerant(self) -> "AbstractSmoother":
-        """The same for a finished model, where no next epoch recovers a lost track: slower and more patient, if it
-        can.
+        """The same for a finished model, where no next epoch recovers a diverged sequence: slower and more patient,
+        if it can.
         """
         return self
 

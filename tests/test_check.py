@@ -14,7 +14,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
-from nnap_em.identifiability.check import CheckResult, check, gramian, torques
+from nnap_em.identifiability.check import CheckResult, check, gramian, torques, undetermined
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems import specs
 from nnap_em.systems.acrobot import table_i
@@ -128,6 +128,13 @@ def test_the_gramian_of_a_double_integrator():
     wanted = 4 * np.array([[rows, t.sum()], [t.sum(), (t**2).sum()]])
     np.testing.assert_allclose(gramian(a, c, np.ones(2)), wanted, rtol=1e-12)
     np.testing.assert_allclose(gramian(a, c, np.array([3.0, 0.5])), wanted * np.outer([3, 0.5], [3, 0.5]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e20])
+def test_a_sum_of_states_read_exactly_determines_neither(size):
+    """A reading of their sum leaves the variance 1/2 of each; inverted as a matrix, the larger one is singular."""
+    left = undetermined(size * np.ones((2, 2)))
+    np.testing.assert_allclose(left, np.sqrt(0.5 + 0.5 / (1 + 2 * size)), rtol=1e-7)
 
 
 def test_a_place_that_nothing_tells_is_named(slide):

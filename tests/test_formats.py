@@ -169,3 +169,16 @@ def test_predictions_of_such_logs_are_csv_files(tmp_path):
     values = np.zeros((1, 50, 4))
     write_states(tmp_path / "out", logs, specs["acrobot"].states, values, values)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["01.csv"]
+    write_states(tmp_path / "out", logs, specs["acrobot"].states, values, values)  # its own files are replaced
+
+
+def test_states_never_replace_a_log(tmp_path):
+    """Nothing is written beside a file that would be lost, either."""
+    for name in ("01", "02"):
+        write_csv(tmp_path / f"{name}.csv", _log())
+    logs = read_logs(tmp_path, RIG)
+    (tmp_path / "01.csv").unlink()
+    log = (tmp_path / "02.csv").read_text()
+    with pytest.raises(DataError, match="02.csv: is there already with other columns, as a log; give another --out"):
+        write_states(tmp_path, logs, specs["acrobot"].states, np.zeros((2, 50, 4)), np.zeros((2, 50, 4)))
+    assert [path.read_text() for path in tmp_path.iterdir()] == [log]

@@ -134,16 +134,23 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
 
 
 def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:
-    """One file per sequence; a value that is no number becomes an empty field, with a message."""
-    for i, file in enumerate(logs.files):
+    """One file per sequence; a value that is no number becomes an empty field, with a message.
+
+    Raises DataError, before anything is written, where a file with other columns, as a log is, would be replaced.
+    """
+    names = ("time", *states, *(f"{name}_std" for name in states))
+    paths = [(folder / file).with_suffix(".csv") for file in logs.files]
+    for path in paths:
+        if path.exists() and path.read_text(errors="replace").partition("\n")[0].strip() != ",".join(names):
+            raise DataError(f"{path}: is there already with other columns, as a log; give another --out")
+    for i, (file, path) in enumerate(zip(logs.files, paths, strict=True)):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)
         if not np.isfinite(values).all():
             warnings.warn(f"{file}: {np.count_nonzero(~np.isfinite(values))} values run away: empty", DataWarning, 2)
             values = np.where(np.isfinite(values), values, np.nan)
-        names = (*states, *(f"{name}_std" for name in states))
-        time = {"time": np.asarray(logs.data.t[i])[rows]}
-        write_csv((folder / file).with_suffix(".csv"), time | dict(zip(names, values.T, strict=True)))
+        columns = np.asarray(logs.data.t[i])[rows], *values.T
+        write_csv(path, dict(zip(names, columns, strict=True)))
 
 
 def states_of(fitted: Identified, mean, std) -> Channel:

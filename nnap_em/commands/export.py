@@ -32,5 +32,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
         log(f"wrote {args.draws} draws of the posterior to {args.out}: {TABLE}")
     elif args.out is not None:
-        export(fitted, args.out)
-        log(f"wrote parameters.json, predictor.py and model.stablehlo to {args.out}")
+        reason = export(fitted, args.out)
+        log(f"no predictor.py: {reason}" if reason else f"wrote predictor.py to {args.out}")
+        log(f"wrote parameters.json and model.stablehlo to {args.out}")

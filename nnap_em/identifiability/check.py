@@ -364,14 +364,15 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     for i in range(len(along.x)):
         last = min(rows, int(valid[i].sum()))
         if last >= 2 and np.isfinite(along.transition[i, :last]).all():
-            grams.append(gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale))
+            gram = gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale)
+            grams += [gram] if np.isfinite(gram).all() else []
     if not grams:
         yield CheckResult(
             BAD, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
         )
         return
     values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
-    known = np.median([np.sqrt(np.diag(np.linalg.inv(gram + np.eye(len(names))))) for gram in grams], axis=0)
+    known = np.median([undetermined(gram) for gram in grams], axis=0)
     rank = int(np.sum(values > 1))
     condition = np.log10(values[-1] / max(values[0], 1e-300 * values[-1]))
     dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
@@ -383,6 +384,12 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     text += f"; hardly determined: {', '.join(weak)}" if weak else ""
     text += ": measure more of the state, or move so that the hidden joint shakes the rest" if spoilt else ""
     yield CheckResult(_mark(dark or weak, spoilt), "states", text)
+
+
+def undetermined(gram: Float[np.ndarray, "state state"]) -> Float[np.ndarray, " state"]:
+    """Standard deviation of every state after the readings over that before, sqrt(diag((I + gram)^-1))."""
+    values, axes = np.linalg.eigh(gram)
+    return np.sqrt(np.sum(axes**2 / (1 + np.maximum(values, 0.0)), axis=1))
 
 
 def gramian(

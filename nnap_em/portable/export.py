@@ -31,15 +31,26 @@ class ExportError(ValueError):
     """A model that has no plain NumPy form: the message names what it is about it."""
 
 
-def export(fitted: Identified, out: Path) -> None:
+def export(fitted: Identified, out: Path) -> str:
     """Write parameters.json, predictor.py and model.stablehlo to the folder `out`, each whole or not at all.
 
-    Raises ExportError, before anything is written, where the model has an effect that NumPy cannot follow.
+    Returns the reason why there is no predictor.py, as for a law of the command; empty where there is one.
+    Raises ExportError, before anything is written, where the inputs are commands of servos.
     """
-    code, step = predictor(fitted), stablehlo(fitted.model)
+    if fitted.model.servos:
+        raise ExportError("its inputs are commands of servos, which have no exported form yet; use nnap-em predict")
+    try:
+        code, reason = predictor(fitted), ""
+    except ExportError as error:
+        code, reason = "", str(error)
+    step = stablehlo(fitted.model)
     write_json(out / PARAMETERS, parameters(fitted))
-    replace_text(out / PREDICTOR, code)
     replace_bytes(out / STEP, step)
+    if code:
+        replace_text(out / PREDICTOR, code)
+    else:
+        (out / PREDICTOR).unlink(missing_ok=True)  # of another fit
+    return reason
 
 
 def parameters(fitted: Identified) -> dict[str, Any]:
@@ -101,11 +112,9 @@ def predictor(fitted: Identified) -> str:
     Raises ExportError where the model has an effect that NumPy cannot follow.
     """
     rig, model, prior = fitted.rig, fitted.model, fitted.m_step.prior
-    if model.servos:
-        raise ExportError("its inputs are commands of servos, which have no exported form yet; use nnap-em predict")
     for effect in model.effects:
         if of_command(effect):
-            raise ExportError(f"the effect {effect.name!r} changes the inputs over time; use {STEP}")
+            raise ExportError(f"{effect.name!r} acts on the command; use {STEP}, whose inputs are what reaches the joints")
     x, u, z = jnp.zeros(len(_states(model))), jnp.zeros(_width(model)), prior.read(model)
     force = jnp.zeros(len(model.system.coordinates))
 

@@ -375,7 +375,9 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path
         assert _run(*argv) == 130
     said = capsys.readouterr().err
     assert said.startswith("nnap-em: compiling for 4 sequences of 151 rows")
-    assert re.search(r"epoch   2 of 9  horizon 0\.60 s  log-likelihood [\d.]+ per sequence  noise std x 0\.00", said)
+    assert re.search(
+        r"epoch   2 of 9  horizon 0\.60 s  log-likelihood [\d.]+ nat per sequence  noise std x 0\.00", said
+    )
     assert f"stopped with 9 finished steps kept; to go on: nnap-em identify {bench} --out {out}" in said
     assert all(name.startswith("unfinished/em_step-") for name in _files(out))
     assert _run(*argv, "--resume") == 0

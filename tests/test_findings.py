@@ -1,5 +1,6 @@
 """What was found, as it is told: each effect with its own curve, joint and units, whatever stands beside it."""
 
+import dataclasses
 import json
 
 import jax
@@ -18,6 +19,7 @@ from nnap_em.diagnose.outcome import Closed, Disputed, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 from nnap_em.fit.identify import begin
+from nnap_em.report import identification
 from nnap_em.report.diagnosis import write_diagnosis
 
 ROWS = 60
@@ -96,6 +98,14 @@ def _doubtful() -> Closed:
 
 def _law(name: str) -> AbstractEffect:
     return catalogue[name](jnp.asarray(0.1), joint=2)
+
+
+def test_a_fit_says_what_it_was_fitted_to():
+    """Of a machine whose numbers are all trusted and without friction, the noise; sequences that diverged are apart."""
+    rig = dataclasses.replace(SLIDE, friction=False)
+    fitted = begin(rig, _data(rig), key=jax.random.key(0))
+    assert identification._verdict(fitted, 4, 1) == "Fitted the noise to 3 of 4 sequences in 0 epochs."
+    assert identification._verdict(fitted, 4, 0) == "Fitted the noise to 4 sequences in 0 epochs."
 
 
 def test_a_recording_that_disagrees_is_named():

@@ -179,6 +179,6 @@ def test_states_never_replace_a_log(tmp_path):
     logs = read_logs(tmp_path, RIG)
     (tmp_path / "01.csv").unlink()
     log = (tmp_path / "02.csv").read_text()
-    with pytest.raises(DataError, match="02.csv: is there already with other columns, as a log; give another --out"):
+    with pytest.raises(DataError, match=r"02\.csv: is there already with other columns, as a log; give another --out"):
         write_states(tmp_path, logs, specs["acrobot"].states, np.zeros((2, 50, 4)), np.zeros((2, 50, 4)))
     assert [path.read_text() for path in tmp_path.iterdir()] == [log]

@@ -297,5 +297,7 @@ def test_label():
 def test_what_the_test_sequences_do_not_bear_out_is_doubted():
     error = WHOLE["error"] | {"after": {"theta1": [0.3, 0.9], "dtheta1": [1.0, None]}}
     assert "Doubtful" in page(WHOLE | {"error": error})
+    error = {"horizons_s": [1.0], "before": {"x": [1.0], "dx": [1.0]}, "after": {"x": [1.1], "dx": [0.5]}}
+    assert "Doubtful" not in page(WHOLE | {"error": error})  # what one column loses, another one more than gains
     assert "Doubtful" not in page(WHOLE)
     assert "Beyond doubt" in page(WHOLE)

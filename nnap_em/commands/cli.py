@@ -84,7 +84,7 @@ test/ serves for the reported prediction error only, never for the fit.
 _DIAGNOSE = """\
 examples:
   nnap-em diagnose bench --out found
-  nnap-em diagnose bench --out found --minutes 5    answer in that time; what was not tried is tried with --resume
+  nnap-em diagnose bench --out found --minutes 5    answer after about that time; --resume goes on
   nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
 
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
@@ -221,7 +221,7 @@ def parser() -> argparse.ArgumentParser:
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
     diagnose.add_argument(
-        "--minutes", type=_minutes, metavar="M", help="answer within M minutes with what is found by then"
+        "--minutes", type=_minutes, metavar="M", help="answer after about M minutes with what is found by then"
     )
     design = command("design", "find the inputs to play next", _DESIGN)
     design.add_argument("folder", metavar="FIT", type=Path, help="model.npz or after.npz, or the folder that holds it")

@@ -65,7 +65,7 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
         log(
             f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s"
-            f"  log-likelihood {loglik:.2f} per sequence"
+            f"  log-likelihood {loglik:.2f} nat per sequence"
             f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {seconds:.1f} s"
         )
 

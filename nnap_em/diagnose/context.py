@@ -158,7 +158,7 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> EMState | None:
         own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)
         if ahead(state.top, np.asarray(own.loglik)) <= 0:
             return None
-        context.log("  with friction from its start it is likelier over the first horizon, and is fitted from there")
+        context.log("  friction as declared is the likelier start over the first horizon, and is fitted from")
         return fit(state, context.data, before.smoother, fresh.m_step)
     except FitError:
         return None

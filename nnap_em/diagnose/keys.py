@@ -47,8 +47,8 @@ def with_article(key: Key) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names joined as in a sentence."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    """Names joined as in a sentence; without any, an empty text."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
 
 
 def remainder_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:

@@ -108,7 +108,7 @@ def sentences(result: Identifiability) -> list[str]:
     """Sentences of a report on parameters that are not identifiable."""
     out = []
     if result.never:
-        out.append(f"no motion feels {', '.join(result.never)}: kept as declared; take out what you do not doubt")
+        out.append(f"no motion depends on {', '.join(result.never)}: kept as declared; declare them as numbers")
     if result.rubbed:
         text = f"motions do not separate {', '.join(result.rubbed)} from the learned friction of the joint"
         out.append(f"{text}: kept as declared, and friction is what is left; write a number where you know one")

@@ -114,7 +114,9 @@ def predictor(fitted: Identified) -> str:
     rig, model, prior = fitted.rig, fitted.model, fitted.m_step.prior
     for effect in model.effects:
         if of_command(effect):
-            raise ExportError(f"{effect.name!r} acts on the command; use {STEP}, whose inputs are what reaches the joints")
+            raise ExportError(
+                f"{effect.name!r} acts on the command; use {STEP}, whose inputs are what reaches the joints"
+            )
     x, u, z = jnp.zeros(len(_states(model))), jnp.zeros(_width(model)), prior.read(model)
     force = jnp.zeros(len(model.system.coordinates))
 

@@ -143,7 +143,7 @@ def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: N
         picture(
             "residual",
             "One-step errors",
-            "Left: they should not remember each other. Right: they should follow the line.",
+            "Left: the autocorrelation should stay within its bounds. Right: the quantiles should follow the line.",
             innovation_figure(left["before"], names, left.get("after")),
         ),
     ]

@@ -22,6 +22,7 @@ from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, page, picture
 from .tables import visited_nodes, write_friction, write_json
+from .wording import reached
 
 
 def write_identification(
@@ -57,7 +58,7 @@ def write_identification(
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
     entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
-        "verdict": _verdict(fitted, len(train.files)),
+        "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"])),
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),
@@ -78,11 +79,12 @@ def write_identification(
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
 
 
-def _verdict(fitted: Identified, sequences: int) -> str:
+def _verdict(fitted: Identified, sequences: int, diverged: int) -> str:
     dof = len(fitted.model.system.coordinates)
     friction = [f"the friction of {_counted(dof, 'joint')}"] * fitted.rig.friction
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
-    return f"Fitted {estimated} to {_counted(sequences, 'sequence')} in {_counted(fitted.state.epoch, 'epoch')}."
+    used = f"{sequences - diverged} of " * bool(diverged) + _counted(sequences, "sequence")
+    return f"Fitted {estimated} to {used} in {_counted(fitted.state.epoch, 'epoch')}."
 
 
 def _counted(count: int, noun: str) -> str:
@@ -94,9 +96,11 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         log(law["text"])
     for text in document["friction_memory"]:
         log(text)
+    if document["left_out"]:
+        log(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}
     for name, values in error["fit"].items():
-        pairs = zip(error["horizons_s"], values, strict=True)
+        pairs = zip(reached(error), values, strict=False)  # no test sequence reaches the others
         log(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
     for name, entry in document["parameters"].items():
         log(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")

@@ -55,9 +55,9 @@ def write_page(folder: Path, document: Mapping[str, Any]) -> None:
     """Write import.json and import.html."""
     write_json(folder / "import.json", document)
     caption = (
-        "Each bar is a topic while it speaks, its gaps in orange; below, the sequences that were made of it, and what "
-        "was dropped. On the right the time from one message to the next: its median, one standard deviation, and the "
-        "largest that is no gap; the dashed line is one row of the data set."
+        "Each bar is a topic while it has messages, its gaps in orange; below, the sequences that were made of it, "
+        "and what was dropped. On the right the time from one message to the next: its median, one standard deviation, "
+        "and the largest that is no gap; the dashed line is one row of the data set."
     )
     figure = picture("found", "Topics and sequences", caption, timeline(document))
     replace_text(folder / "import.html", rendered("import.html.j2", document=document, pictures=[figure]))

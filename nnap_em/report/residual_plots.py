@@ -194,8 +194,8 @@ def _scale(
     round_ = kind.wrapped()
     edges = np.linspace(-np.pi, np.pi, bins + 1)
     if _binned(kind.values, r, plain).share > _binned(round_.values, r, edges).share + 0.02:
-        return kind._replace(label=kind.label.replace(" [", " over turns [")), plain, False
-    return round_._replace(label=kind.label.replace(" [", " in its turn [")), edges, True
+        return kind._replace(label=kind.label.replace(" [", " unwrapped [")), plain, False
+    return round_._replace(label=kind.label.replace(" [", " wrapped [")), edges, True
 
 
 def _edges(kind: _Cause, r: Float[np.ndarray, "seq time"], bins: int) -> Float[np.ndarray, " edge"]:
@@ -205,13 +205,12 @@ def _edges(kind: _Cause, r: Float[np.ndarray, "seq time"], bins: int) -> Float[n
 
 
 def _turn_ticks(ax: Axes, edges) -> None:
-    """Ticks at half turns, or as many as fit."""
+    """Ticks at half turns, or as many as fit, where there are three or more."""
     span = (edges[-1] - edges[0]) / np.pi
-    if span < 1.2:
-        return
     every = max(1, 2 * math.ceil(span / 10)) if span > 3 else 1
     ticks = [k for k in range(math.ceil(edges[0] / np.pi), math.floor(edges[-1] / np.pi + 1e-9) + 1) if k % every == 0]
-    ax.set_xticks([k * np.pi for k in ticks], [_half_turns(k) for k in ticks])
+    if len(ticks) > 2:
+        ax.set_xticks([k * np.pi for k in ticks], [_half_turns(k) for k in ticks])
 
 
 def _half_turns(k: int) -> str:

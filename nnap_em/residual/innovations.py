@@ -98,8 +98,9 @@ def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> s
     else:
         passed, failed = {
             "whiteness": (
-                f"One error in {channel} says nothing about the next.",
-                f"Errors in {channel} follow each other (correlation up to {size:.2g}): something acts that lasts.",
+                f"Errors in {channel} are uncorrelated over time.",
+                f"Errors in {channel} are correlated over time (up to {size:.2g}): "
+                f"{'something acts that lasts' if size > 0 else 'they alternate, as with filtered readings'}.",
             ),
             "normality": (
                 f"Errors in {channel} are bell-shaped.",

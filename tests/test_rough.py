@@ -191,6 +191,15 @@ def test_a_stuck_sensor_is_found_by_what_the_other_says(name, level):
     assert set(range(151, 201)) <= rows <= set(range(150, 201))
 
 
+@pytest.mark.parametrize("name", NOISE)
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_a_sensor_that_dies_is_found(name, share):
+    """A sequence that is longer dead than alive, too: the run is not its own measure."""
+    readings, last = _motion(4, 1.0), round(ROWS * (1 - share))
+    readings[name][last:] = readings[name][last - 1]
+    assert _faults(readings) == {("stuck", name): set(range(last, ROWS))}
+
+
 def test_a_stuck_sensor_is_found_alone():
     """By the jump where it wakes up; and where it wakes up at the same place, by the noise that it lacks."""
     theta = _motion(5)["theta1"]

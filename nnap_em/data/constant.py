@@ -45,7 +45,8 @@ def constant_readings(
     lengths = end - first
     if lengths.max(initial=0) >= np.isfinite(y).sum():
         return
-    usual = float(np.median(np.repeat(lengths, lengths)))
+    others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
+    usual = float(np.median(np.repeat(others, others)))
     full = np.zeros(y.size, bool)
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
         at_limit = [every[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]

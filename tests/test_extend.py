@@ -42,7 +42,7 @@ def test_friction_too_steep_for_the_integration_is_left(fitted):
     model = weights.write(before.model, weights.fit(before.model.unknown, w, precise @ steep, precise, 500))
     assert abs(float(model.unknown(jnp.ones(1))[0])) > 100
     state, lines = _extended(fitted, eqx.tree_at(lambda m: m.log_q, model, model.log_q + 8))
-    assert any("friction from its start" in line for line in lines)
+    assert any("friction as declared is the likelier start" in line for line in lines)
     np.testing.assert_allclose(state.top, before.state.top, rtol=1e-9)
     v = np.array([[-4.0, -1.0, -0.3, 0.3, 1.0, 4.0]])
     table = friction_table(before._replace(state=state), jnp.asarray(v))

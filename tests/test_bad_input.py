@@ -144,7 +144,14 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "blank file": (lambda _: "\n \n", "line 1", "empty", "write a header"),
     "header only": (lambda s: s.splitlines()[0], "line 1", "found 0 rows", "2 rows or more"),
     "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 rows", "2 rows or more"),
-    "no header": (lambda s: s.split("\n", 1)[1], "line 1, column 'time'", "missing", "possible here: 0, 0, 0, 6"),
+    "no header": (
+        lambda s: s.split("\n", 1)[1],
+        "line 1, column 'time'",
+        "missing",
+        "line 1 holds numbers: write a header",
+    ),
+    "comment": (lambda s: f"# of Monday\n{s}", "line 1, column 'time'", "missing", "remove the lines above the header"),
+    "units": (lambda s: s.replace("\n", "\ns,N m,rad,rad/s\n", 1), "line 2", "'s,N m,rad", "remove the row of units"),
     "column missing": (lambda s: s.replace("dtheta1", "speed"), "column 'dtheta1'", "missing", "possible here: speed"),
     "column cut off": (
         lambda s: "\n".join(line.rpartition(",")[0] for line in s.splitlines()),

@@ -322,6 +322,7 @@ BAD = {  # the file, and words of the message
         ["'/js/time'", "backwards at row 2"],
     ),
     "CSV without time": ("a.csv", lambda p: write_csv(p, {"q": T}), ["no column of times (found q)", "'time'"]),
+    "CSV with semicolons": ("a.csv", lambda p: p.write_text("time;q\n0;1\n1;1\n"), ["(found time;q)", "(not ';')"]),
     "no such file": ("b.mcap", lambda p: None, ["no such file"]),
     "another kind": ("a.bag", lambda p: p.write_text("x"), ["logs end in .mcap, .h5", "rename"]),
 }

@@ -83,6 +83,11 @@ def _digits(name: str, values: Float[np.ndarray, " time"]) -> str:
     return "%r" if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4 else "%.12g"
 
 
+def header_hint(path: Path) -> str | None:
+    """The hint where line 1 of a CSV file is no header of columns separated by ','; None where it may be one."""
+    return _header_hint(_text(path)) if path.suffix.lower() == ".csv" else None
+
+
 def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
     """The names in the header of a CSV file, and the fields of every row under it."""
     text = _text(path)
@@ -96,9 +101,7 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
     """
     text = _text(path)
     names = _header(text)
-    other = next((mark for mark in (";", "\t") if mark in text.split("\n", 1)[0]), None)
-    hint = f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
-    _check_names(path, names, (*required, *gaps), "line 1, ", hint)
+    _check_names(path, names, (*required, *gaps), "line 1, ", _header_hint(text))
     columns = list(zip(*_rows(path, text), strict=True))
     return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
 
@@ -203,6 +206,34 @@ def _header(text: str) -> list[str]:
     return [name.strip().strip('"').strip() for name in text.split("\n", 1)[0].split(",")]
 
 
+def _ends(text: str) -> tuple[str, str]:
+    """The first and the last line."""
+    return text.split("\n", 1)[0], text.rstrip().rpartition("\n")[2]
+
+
+def _separator_hint(text: str) -> str | None:
+    first, last = _ends(text)
+    other = next((mark for mark in (";", "\t") if mark in first and mark in last), None)
+    return f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
+
+
+def _header_hint(text: str) -> str | None:
+    first, last = _ends(text)
+    if all(map(_is_number, first.split(","))):
+        return "line 1 holds numbers: write a header"
+    above = "remove the lines above the header" if first.count(",") < last.count(",") else None
+    return _separator_hint(text) or above
+
+
+def _is_number(field: str) -> bool:
+    """True for a number and for an empty field."""
+    try:
+        float(field.strip() or "nan")
+    except ValueError:
+        return False
+    return True
+
+
 def _rows(path: Path, text: str) -> list[list[str]]:
     """The fields of every row under the header, as many as it has names."""
     lines = text.rstrip().split("\n")
@@ -212,8 +243,11 @@ def _rows(path: Path, text: str) -> list[list[str]]:
     names = lines[0].count(",") + 1
     for number, row in enumerate(rows, 2):
         if len(row) != names:
-            hint = "separate columns by ',', write decimals with '.', and give every column a field"
-            refuse(path, f"line {number}", f"found {len(row)} fields under {names} names", hint)
+            hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
+            problem = f"found {len(row)} fields under {names} names"
+            refuse(path, f"line {number}", problem, _separator_hint(text) or hint)
+    if not any(map(_is_number, rows[0])):
+        refuse(path, "line 2", f"holds no number, found {lines[1]!r}", _header_hint(text) or "remove the row of units")
     return rows
 
 

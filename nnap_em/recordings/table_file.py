@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.formats import column_names, read_table
+from ..data.formats import column_names, header_hint, read_table
 from .clock import rising
 from .hdf5_file import TIME, UNITS
 from .recording import Recording, Topic, Track, refuse
@@ -33,5 +33,6 @@ def _clock(path: Path, names: Sequence[str]) -> str:
     """The column that is the time."""
     column = next((name for name in names if TIME.match(name)), None)
     if column is None:
-        refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", "name it 'time' [s]")
+        hint = header_hint(path) or "name it 'time' [s]"
+        refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", hint)
     return column

@@ -50,7 +50,7 @@ SYSTEMS = {  # columns, system given, the system, inputs and joints that must be
 def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
     drafted = _draft(tmp_path, *names, system=given)
     assert not drafted.notes
-    assert drafted.missing == [name for name in specs[system].parameters if name != "g"]
+    assert drafted.missing == {"model": [name for name in specs[system].parameters if name != "g"]}
     (tmp_path / "rig.toml").write_text(_filled(drafted.text))
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert (rig.system, rig.name, rig.dt, rig.clock, rig.friction) == (system, "bench", DT, "sequence", True)
@@ -99,7 +99,7 @@ def test_every_machine_can_be_drafted_and_one_of_ones_own(tmp_path, system):
     path = tmp_path / "01.csv"
     write_csv(path, _log("u", known[system].states[0]))
     drafted = draft(path, system, known)
-    assert drafted.missing == [name for name in known[system].parameters if name != "g"]
+    assert drafted.missing == {"model": [name for name in known[system].parameters if name != "g"]}
     (tmp_path / "rig.toml").write_text(_filled(drafted.text))
     rig = read_rig(tmp_path / "rig.toml", known)
     assert rig.input_joints == (2 if system in ("acrobot", "cart") else 1,)
@@ -132,7 +132,13 @@ def test_a_clock_in_ms_and_no_clock_are_noticed(tmp_path):
     write_csv(path, {name: columns[name] for name in ("u", "x")})
     drafted = draft(path, None, specs)
     assert drafted.notes == ("no column 'time': add one [s]",)
-    assert drafted.missing == ["m", "dt"]
+    assert drafted.missing == {"model": ["m"], "sampling": ["dt"]}
+    write_csv(path, columns | {"time": 1000 * columns["time"]})
+    assert draft(path, None, specs).notes == ("column 'time': rows are 20 s apart: is the clock in ms? write s",)
+    write_csv(path, columns | {"time": columns["time"] - DT * (np.arange(ROWS) > 7)})
+    assert draft(path, None, specs).notes == (
+        "line 10, column 'time': time does not run on: remove or correct the row",
+    )
 
 
 def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
@@ -141,7 +147,8 @@ def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
     columns["time"][7] += 0.1 * DT
     write_csv(path, columns)
     drafted = draft(path, "slide", specs)
-    assert drafted.missing == ["m", "columns", "joints", "dt", "columns"]
+    lists = {"input": ["columns", "joints"], "sampling": ["dt"], "measurement": ["columns"]}
+    assert drafted.missing == {"model": ["m"]} | lists
     assert "0.018 to 0.022 s apart: resample" in drafted.text
     assert 'clock = "session"' in drafted.text
 
@@ -169,13 +176,44 @@ def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
         _draft(tmp_path, *names)
 
 
+NO_COLUMNS = {  # the change of a log, and words of the message
+    "semicolons": (lambda s: s.replace(",", ";"), "line 2: holds no number", "separate columns by ',' (not ';')"),
+    "semicolons and decimal commas": (lambda s: s.replace(",", ";").replace(".", ","), "line 2", "(not ';')"),
+    "no header": (
+        lambda s: s.split("\n", 1)[1],
+        "line 1: no column is recognised",
+        "line 1 holds numbers: write a header",
+    ),
+    "other names": (
+        lambda s: s.replace("time,u,x", "a,b,c"),
+        "line 1: no column is recognised",
+        "names such as time, u",
+    ),
+    "a comment": (lambda s: f"# of Monday\n{s}", "line 2: found 3 fields", "line 1 is the header"),
+    "units": (lambda s: s.replace("x\n", "x\ns,N,m\n"), "line 2: holds no number", "remove the row of units"),
+    "dates": (lambda s: s.replace("\n", "\n2026-"), "column 'time': holds texts; write seconds"),
+}
+
+
+@pytest.mark.parametrize("change, words", [(c, w) for c, *w in NO_COLUMNS.values()], ids=NO_COLUMNS)
+def test_a_log_without_known_columns_is_refused_and_nothing_is_written(tmp_path, capsys, change, words):
+    path = tmp_path / "log.csv"
+    write_csv(path, _log("u", "x"))
+    path.write_text(change(path.read_text().rstrip()))
+    assert cli.main(["init", str(path), "--system", "slide", "--out", str(tmp_path / "mine")]) == 2
+    said = capsys.readouterr().err
+    for word in words:
+        assert word in said
+    assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
+
+
 def test_the_command_writes_once_and_never_over(tmp_path, capsys):
     write_csv(tmp_path / "bench/train/01.csv", _log("u", "x_mm"))
     argv = ["init", str(tmp_path / "bench/train/01.csv")]
     assert cli.main(argv) == 0
     said = capsys.readouterr().err
     assert "in the log: column 'x_mm': name it 'x' and convert it from mm to m" in said
-    assert f"wrote {tmp_path / 'bench/rig.toml'}; fill in m, columns" in said
+    assert f"wrote {tmp_path / 'bench/rig.toml'}; fill in [model] m; [measurement] columns" in said
     first = (tmp_path / "bench/rig.toml").read_bytes()
     assert cli.main([*argv, "--system", "slide"]) == 2
     assert "rig.toml: is there already; give another --out" in capsys.readouterr().err

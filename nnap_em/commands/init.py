@@ -24,4 +24,5 @@ def run(args: argparse.Namespace, log: Log) -> None:
     replace_text(path, drafted.text)
     for note in drafted.notes:
         log(f"in the log: {note}")
-    log(f"wrote {path}" + (f"; fill in {', '.join(drafted.missing)}" if drafted.missing else ""))
+    missing = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in drafted.missing.items())
+    log(f"wrote {path}" + (f"; fill in {missing}" if missing else ""))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.formats import csv_fields
+from ..data.formats import csv_fields, header_hint, place, refuse
 from ..data.rig import SystemSpec, toml_text
 from ..data.units import parameter_unit
 from ..em.build import reading_noise
@@ -38,6 +38,8 @@ _PARAMETERS = {
     "Ir": "rotor inertia of the drives",
     "gr": "gear ratio of the drives",
 }
+SLOW = 0.5
+"""Interval of the rows [s] above which the clock may be in ms."""
 HEAD = """\
 format = 1
 name = {name}
@@ -54,9 +56,11 @@ class Draft(NamedTuple):
     """Changes that the log needs."""
 
     @property
-    def missing(self) -> list[str]:
-        """The keys that stand as comments."""
-        return re.findall(r"(?m)^# (\w+) = \.\.\.", self.text)
+    def missing(self) -> dict[str, list[str]]:
+        """The keys that stand as comments, by their tables."""
+        _, *parts = re.split(r"(?m)^\[([\w.]+)\]", self.text)
+        keys = (re.findall(r"(?m)^# (\w+) = \.\.\.", lines) for lines in parts[1::2])
+        return {table: names for table, names in zip(parts[::2], keys, strict=True) if names}
 
 
 class _Column(NamedTuple):
@@ -75,7 +79,11 @@ def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Dr
 
     Raises DataError where the log cannot be read or the system not be recognised.
     """
-    return drafted(path, numbers(path), system, specs)
+    table = numbers(path)
+    if not any(meaning(name).kind for name in table):
+        hint = header_hint(path) or "write a header with names such as time, u, theta1, dtheta1"
+        refuse(path, "line 1", f"no column is recognised (found {', '.join(table)})", hint)
+    return drafted(path, table, system, specs)
 
 
 def drafted(
@@ -93,7 +101,8 @@ def drafted(
         *sampling(table, columns),
         *measurement(table, measured, spec),
     ]
-    return Draft("\n".join([HEAD.format(name=name), *lines]) + "\n", tuple(_notes(columns, spec)))
+    notes = (*_notes(columns, spec), *_clock_notes(path, table, columns))
+    return Draft("\n".join([HEAD.format(name=name), *lines]) + "\n", notes)
 
 
 def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
@@ -106,7 +115,8 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
         try:
             columns[name] = np.array([float(text.strip() or "nan") for text in texts])
         except ValueError:
-            continue
+            if meaning(name).kind == "time":
+                refuse(path, place(path, name), "holds texts", "write seconds")
     return columns
 
 
@@ -188,7 +198,7 @@ def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Ite
     steps = np.diff(t)
     dt = float(f"{np.median(steps):.6g}")
     if dt > 0 and np.max(np.abs(steps - dt)) <= 0.01 * dt:
-        yield f"dt = {dt!r}    # s" + ("; is the clock in ms?" if dt > 0.5 else "")
+        yield f"dt = {dt!r}    # s" + ("; is the clock in ms?" if dt > SLOW else "")
     else:
         between = f"{np.min(steps):.3g} to {np.max(steps):.3g} s" if time else "no time"
         yield f"# dt = ...    # s; the rows of this log are {between} apart: resample it to uniform rows"
@@ -235,5 +245,16 @@ def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
         hints += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
         if hints:
             yield f"column {column.name!r}: {' and '.join(hints)}"
-    if "time" not in {column.kind for column in columns}:
+
+
+def _clock_notes(path: Path, table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Iterator[str]:
+    """Absence, standstill or wrong unit of the time."""
+    time = next((column for column in columns if column.kind == "time"), None)
+    if time is None:
         yield "no column 'time': add one [s]"
+        return
+    steps = np.diff(table[time.name])
+    if (stands := np.flatnonzero(steps <= 0)).size:
+        yield f"{place(path, time.name, int(stands[0]) + 1)}: time does not run on: remove or correct the row"
+    if not time.unit and (dt := np.median(steps)) > SLOW:
+        yield f"column {time.name!r}: rows are {dt:.6g} s apart: is the clock in ms? write s"

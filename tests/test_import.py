@@ -388,6 +388,12 @@ def test_what_cannot_be_imported_is_refused_and_nothing_is_written(tmp_path, cap
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "rig.toml"]
 
 
+def test_a_table_in_ms_is_refused_as_check_refuses_it(tmp_path, capsys):
+    write_csv(tmp_path / "a.csv", {"time": 1000 * T, "u": np.cos(T), "theta1": _theta(T), "dtheta1": 3 * np.cos(3 * T)})
+    assert _import(tmp_path / "a.csv", "--rig", _rig(tmp_path, columns=""), "--out", tmp_path / "out") == 2
+    assert "the readings, 10 s apart (theta1); one of the two is in ms: write s" in capsys.readouterr().err
+
+
 def test_a_folder_that_is_not_empty_is_left_alone(tmp_path, capsys):
     log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
     (tmp_path / "out").mkdir()

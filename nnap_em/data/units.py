@@ -20,6 +20,11 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
     return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
 
 
+def thousandfold(ratio: float) -> bool:
+    """True where one of two intervals that should be the same is in ms, the other in s."""
+    return 0.99 < ratio / 1000 < 1.01 or 0.99 < ratio * 1000 < 1.01
+
+
 def joint_called(coordinates: Sequence[str], joint: int) -> str:
     """A joint, counted from 1, as a reader finds it: by its number, and its name where it has one of its own."""
     name = coordinates[joint - 1] if 0 < joint <= len(coordinates) else ""

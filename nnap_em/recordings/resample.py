@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..data.dataset import DataError
 from ..data.rig import Rig, nearest
+from ..data.units import thousandfold
 from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
@@ -176,10 +177,11 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
     if best.interval > COARSE * dt:
-        problem = (
-            f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart in {best.topic!r} ({name})"
-        )
-        refuse(path, "[sampling] dt", problem, f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml")
+        place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
+        problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
+        other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"
+        hint = "one of the two is in ms: write s" if thousandfold(best.interval / dt) else other
+        refuse(path, "[sampling] dt", problem, hint)
 
 
 def _present(

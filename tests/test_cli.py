@@ -99,7 +99,8 @@ assert not {"jax", "numpy", "equinox", "matplotlib"} & set(sys.modules)
     process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr
     assert process.stdout.count("example") >= 9
-    for command in ("simulate bench", "identify bench --out fit", "predict fit bench/test", "smooth fit bench/test"):
+    first = ("simulate bench", "init log.csv --system acrobot --out mine", "identify bench --out fit")
+    for command in (*first, "predict fit bench/test", "smooth fit bench/test"):
         assert f"nnap-em {command}" in process.stdout
 
 

@@ -22,7 +22,7 @@ _MODULES = {"import": "import_logs"}
 _MAIN = """\
 examples:
   nnap-em simulate bench                            the paper's acrobot: a data set with known truth
-  nnap-em init bench/train/01.csv --system acrobot  a first rig.toml from the log, to be filled in
+  nnap-em init log.csv --system acrobot --out mine  a first rig.toml from the log, to be filled in
   nnap-em import run.mcap --rig rig.toml --out bench  a data set from logs of a robot: MCAP, HDF5, CSV, ...
   nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
@@ -45,10 +45,10 @@ OUT gets rig.toml, train/, test/, and truth/ with all states and the true fricti
 """
 _INIT = """\
 examples:
-  nnap-em init bench/train/01.csv --system acrobot  writes bench/rig.toml
-  nnap-em init log.csv --out bench
-  nnap-em init run.mcap --system acrobot --out bench    with a table [import] of what was found where
-  nnap-em init run.mcap --model arm.xml --out bench     joints, motors and sensors by the names of the file
+  nnap-em init log.csv --system acrobot --out mine  writes mine/rig.toml
+  nnap-em init mine/train/01.csv                    the same: rig.toml stands beside train/
+  nnap-em init run.mcap --system acrobot --out mine with a table [import] of what was found where
+  nnap-em init run.mcap --model arm.xml --out mine  joints, motors and sensors by the names of the file
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.

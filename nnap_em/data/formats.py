@@ -101,7 +101,7 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
     """
     text = _text(path)
     names = _header(text)
-    _check_names(path, names, (*required, *gaps), "line 1, ", _header_hint(text))
+    _check_names(path, names, required, gaps, "line 1, ", _header_hint(text))
     columns = list(zip(*_rows(path, text), strict=True))
     return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
 
@@ -110,7 +110,7 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
     """The same of a Parquet file, where null and NaN are missing samples."""
     file = _parquet_file(path)
     names = file.schema_arrow.names
-    _check_names(path, names, (*required, *gaps))
+    _check_names(path, names, required, gaps)
     with _damaged(path, "Parquet"):
         table = file.read(columns=[*required, *gaps])
         columns = {name: table[name].to_numpy() for name in (*required, *gaps)}
@@ -120,7 +120,7 @@ def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) 
 def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
     columns = _mat_columns(path)
-    _check_names(path, list(columns), (*required, *gaps))
+    _check_names(path, list(columns), required, gaps)
     return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps)
 
 
@@ -252,13 +252,22 @@ def _rows(path: Path, text: str) -> list[list[str]]:
 
 
 def _check_names(
-    path: Path, names: Sequence[str], required: Sequence[str], line: str = "", hint: str | None = None
+    path: Path,
+    names: Sequence[str],
+    required: Sequence[str],
+    gaps: Sequence[str],
+    line: str = "",
+    hint: str | None = None,
 ) -> None:
-    spare = [name for name in names if name not in required]
-    for name in required:
+    every = (*required, *gaps)
+    spare = [name for name in names if name not in every]
+    for name in every:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            refuse(path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) if spare else alone))
+            other = "; or correct [input] columns in rig.toml" if name in required and name != "time" else ""
+            refuse(
+                path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) + other if spare else alone)
+            )
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 

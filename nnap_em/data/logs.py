@@ -215,7 +215,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
         problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
-        hint = "resample to uniform rows; a missing sample is an empty field in a uniformly spaced row"
+        hint = "resample to uniform rows with `nnap-em import`; a missing sample is an empty field of a row"
         refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} s)")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
         hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'

@@ -147,10 +147,8 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
         ):
             fit, ratio = _follows(columns[one], columns[two], dt)
             if fit > 0.95 and 0.8 < ratio < 1.25:
-                problem = f"{two!r} is the rate of {one!r}, and {rate!r} is not that of {name!r}"
-                yield Implausible(
-                    True, wrong, None, problem, f"columns {wrong!r} and {other!r} look swapped: name them right"
-                )
+                problem = f"{two!r} is the rate of {one!r}"
+                yield Implausible(True, wrong, None, problem, f"swap the names {wrong!r} and {other!r}")
                 return
         if _moves(columns[name]) and _moves(columns[rate]):
             yield Implausible(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")

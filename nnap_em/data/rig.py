@@ -41,6 +41,7 @@ _HINTS = {  # how the line of a key or table should look
     "joints": "a list of different joints, one per column, joints = [1, 2]",
     "kind": 'kind = "position" (a servo that is given a position), or kind = "torque"',
     "dt": "a number above 0, dt = 0.01 (s)",
+    "g": "g = 9.81 (m/s^2)",
     "input_hold": 'input_hold = "zero-order"',
     "mean": "both numbers, { mean = 0.2, std = 0.02 }",
     "std": "both numbers, { mean = 0.2, std = 0.02 }",
@@ -308,13 +309,17 @@ class _Table:
                 self.refuse(
                     key, "unknown table or key", nearest(key, [name for name in known if name not in self.items])
                 )
-        for key in required:
-            self.value(key)
+        if missing := [key for key in required if key not in self.items]:
+            self._missing(*missing)
+
+    def _missing(self, key: str, *others: str) -> NoReturn:
+        hint = _HINTS.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
+        problem = f"missing (found only: {', '.join(self.items) or 'nothing'})"
+        self.refuse(", ".join((key, *others)), problem, f"write {hint}" + ", and so on" * bool(others))
 
     def value(self, key: str) -> object:
         if key not in self.items:
-            hint = _HINTS.get(key, f"{key} = 0.2 (trusted) or {key} = {{ mean = 0.2, std = 0.02 }}")
-            self.refuse(key, f"missing (found only: {', '.join(self.items) or 'nothing'})", f"write {hint}")
+            self._missing(key)
         return self.items[key]
 
     def table(self, key: str, absent: Mapping[str, object] | None = None) -> "_Table":

@@ -257,7 +257,11 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
 
 @pytest.mark.parametrize(
     "question, reason",
-    {"apart": "--rival", "spring": "possible here: friction, parameters, m", "friction ": "not a question"}.items(),
+    {
+        "apart": "--rival",
+        "spring": "possible here: friction, parameters, m, all",
+        "friction ": "not a question",
+    }.items(),
 )
 def test_a_question_that_the_fit_cannot_answer_is_told(slide, question, reason):
     _, _, data, fitted = slide
@@ -274,7 +278,7 @@ def test_rivals_are_fitted_in_the_place_of_a_law(slide):
     assert [effect.name for effect in other.other.model.effects] == ["input_delay"]
     with pytest.raises(DesignError, match="the fit holds no payload; it holds no effect"):
         rivals(fitted, data, [(Law("payload"), Law("input_delay"))])
-    with pytest.raises(DesignError, match=r"cannot have base tilt; possible here: .*motor gain at joint 1"):
+    with pytest.raises(DesignError, match=r"cannot have base tilt; possible here: .*motor_gain:1"):
         rivals(fitted, data, [(None, Law("base_tilt"))])
 
 

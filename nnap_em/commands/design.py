@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 
 from ..data.rig import read_rig
-from ..design.experiment import design_experiment
+from ..design.experiment import check_question, design_experiment
 from ..design.limits import DesignError
 from ..design.rivals import Law, open_pairs, rivals
 from ..fit.identify import Identified
@@ -25,10 +25,11 @@ def run(args: argparse.Namespace, log: Log) -> None:
     began = time.perf_counter()
     stored = read(model_file(args.folder))
     fitted, bench = _logs(args, stored)
-    key, question = jax.random.key(args.seed), vars(args)["for"]
+    key, question, laws = jax.random.key(args.seed), vars(args)["for"], _wanted(args, fitted)
+    check_question(question, fitted, bool(laws))
     with resumable(args, bench, log):
         data = bench.train.data
-        pairs = rivals(fitted, data, _wanted(args, fitted), log) if question in ("all", "apart") else []
+        pairs = rivals(fitted, data, laws, log) if question in ("all", "apart") else []
         design = design_experiment(
             fitted, data, key=key, question=question, rivals=pairs,
             seconds=args.seconds, sequences=args.sequences, log=log,

@@ -139,10 +139,28 @@ def design_experiment(
     )
 
 
+def check_question(name: str, fitted: Identified, rivals: bool) -> None:
+    """Raise DesignError where a fit, with or without rivals, has no criterion of that name."""
+    prior = fitted.m_step.prior
+    several = {"friction": fitted.rig.friction, "parameters": prior.size, "apart": rivals}
+    known = [kind for kind, there in several.items() if there]
+    if known:
+        known += [*prior.declared, "all"]
+    if name not in known:
+        why = {
+            "apart": "the fit has no effect that the data could not discriminate from another; name a law with --rival",
+            "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
+            "friction": "the rig is declared free of friction",
+        }.get(name, "not a question of this fit")
+        names = ", ".join(known) or "none: the fit has no friction map, no parameter and no rival"
+        raise DesignError(f"--for {name}: {why}; possible here: {names}")
+
+
 def _criterion(
     name: str, fitted: Identified, fit: Fit, friction: Friction, discrimination: Discrimination | None
 ) -> AbstractCriterion:
     """The criterion of that name, or all of those that there are."""
+    check_question(name, fitted, discrimination is not None)
     prior, criteria = fitted.m_step.prior, {}
     if fitted.rig.friction:
         criteria["friction"] = friction
@@ -151,17 +169,7 @@ def _criterion(
     singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
     if discrimination is not None:
         criteria["apart"] = discrimination
-    if name == "all" and criteria:
-        return Several(tuple(criteria.values()))
-    if name not in criteria | singles:
-        known = ", ".join([*criteria, *singles]) or "none: the fit has no friction map, no parameter and no rival"
-        why = {
-            "apart": "the fit has no effect that the data could not discriminate from another; name a law with --rival",
-            "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
-            "friction": "the rig is declared free of friction",
-        }.get(name, "not a question of this fit")
-        raise DesignError(f"--for {name}: {why}; possible here: {known}")
-    return (criteria | singles)[name]
+    return Several(tuple(criteria.values())) if name == "all" else (criteria | singles)[name]
 
 
 def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, "row dof"]:

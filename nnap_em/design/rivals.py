@@ -25,6 +25,12 @@ class Law(NamedTuple):
         place = f" at joint {self.joint}" if self.joint else f" on {self.channel}" if self.channel else ""
         return self.name.replace("_", " ") + place
 
+    @property
+    def typed(self) -> str:
+        """NAME, NAME:JOINT or NAME:CHANNEL, as --rival reads it."""
+        place = self.joint or self.channel
+        return f"{self.name}:{place}" if place else self.name
+
     def means(self, effect: AbstractEffect) -> bool:
         """True for this law."""
         matches = self.joint in (None, effect.joint) and self.channel in (None, effect.channel)
@@ -77,6 +83,6 @@ def _instead(fitted: Identified, data: Dataset, law: Law | None, other: Law) -> 
         raise DesignError(f"the fit holds no {law}; it holds {held or 'no effect'}")
     refit = instead(fitted, data, place, other.means)
     if refit is None:
-        known = sorted({words(key_of(effect)) for effect in possible(fitted, data)})
+        known = sorted({Law(effect.name, effect.joint, effect.channel).typed for effect in possible(fitted, data)})
         raise DesignError(f"this machine cannot have {other}; possible here: {', '.join(known)}")
     return refit

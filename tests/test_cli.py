@@ -19,10 +19,12 @@ from mcap.reader import make_reader
 
 import nnap_em
 from nnap_em.commands import cli
+from nnap_em.commands import diagnose as diagnose_command
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands import smooth as smooth_command
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.em.loop import FitError
 from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
 from nnap_em.report import tables
@@ -208,6 +210,21 @@ def test_identify_writes_whole_results(bench, fit):
     assert "Nothing is missing" not in html
 
 
+@pytest.mark.parametrize("command, file", [(identify_command, "model.npz"), (diagnose_command, "after.npz")])
+def test_results_that_will_be_replaced_are_named_before(bench, tmp_path, monkeypatch, capsys, command, file):
+    def stop(*_, **__):
+        raise FitError("the fit would begin here")
+
+    monkeypatch.setattr(command, "resumable", stop)
+    name = command.__name__.rpartition(".")[2]
+    for _ in range(2):
+        assert _run(name, bench, "--out", tmp_path) == 2
+        (tmp_path / file).touch()
+    first, replaced, second = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(rf"nnap-em: the (fit|diagnosis) in {tmp_path} will be replaced", replaced)
+    assert first == second == "nnap-em: error: the fit would begin here"
+
+
 def test_particles_identify_as_well(bench, fit, tmp_path):
     """Two epochs with few particles, against the same epochs of the cubature smoother: the slide is almost linear."""
     argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")
@@ -235,8 +252,9 @@ def test_the_learned_friction_is_the_true_one(bench, fit):
     assert np.sqrt(np.mean(miss**2) / np.mean(exact**2)) < 0.15
 
 
-def test_reported_errors_are_those_of_the_predictions(bench, fit, tmp_path):
+def test_reported_errors_are_those_of_the_predictions(bench, fit, tmp_path, capsys):
     assert _run("predict", fit, bench / "test", "--given", "1.0", "--out", tmp_path / "p") == 0
+    assert "test: no row of 001.csv is later than --given 1 s: nothing is predicted there" in capsys.readouterr().err
     assert _files(tmp_path / "p") == [f"{i:03d}.csv" for i in range(4)]
     since, miss = [], []
     for name in _files(tmp_path / "p"):
@@ -499,6 +517,11 @@ BAD = {
     ),
     "no logs": (lambda b: shutil.rmtree(b / "test"), PREDICT, "bench/test: is no folder"),
     "column lost": (_bench_file("test/001.csv", ",x", ",z"), PREDICT, r"test/001\.csv: line 1, column 'x': missing"),
+    "question unknown": (
+        lambda b: None,
+        ("design", "{fit}", "--out", "{out}", "--for", "speed"),
+        "--for speed: not a question of this fit; possible here: friction, .*all",
+    ),
     "state unknown": (
         lambda b: None,
         ("simulate", "{out}", "--system", "slide", "--measured", "y"),

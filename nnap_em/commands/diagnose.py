@@ -8,7 +8,7 @@ import jax
 
 from ..diagnose.findings import findings
 from ..diagnose.search import close_the_loop
-from ..fit.store import fingerprint, save
+from ..fit.store import AFTER, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
 from .common import go_on, read_bench, resumable, warn_of_torques
@@ -26,6 +26,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
     seconds = SHARE * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
+    if (args.out / AFTER).exists():
+        log(f"the diagnosis in {args.out} will be replaced")
     with resumable(args, bench, log) as journal:
 
         def report(text: str) -> None:
@@ -40,8 +42,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
-        for name, fitted in (("before", closed.before), ("after", closed.after)):
-            save(args.out / f"{name}.npz", fitted, fingerprint=mark, notes=notes)
+        for name, fitted in (("before.npz", closed.before), (AFTER, closed.after)):
+            save(args.out / name, fitted, fingerprint=mark, notes=notes)
         write_diagnosis(args.out, closed, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
     if journal.open:
         log(go_on(args, journal))

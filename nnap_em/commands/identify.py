@@ -26,6 +26,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
+    if (args.out / MODEL).exists():
+        log(f"the fit in {args.out} will be replaced")
     data, epochs = bench.train.data, []
     with resumable(args, bench, log):
         most = args.epochs * (1 + bench.rig.memory)

@@ -1,12 +1,14 @@
 """nnap-em predict: states from the first readings of each sequence and all inputs."""
 
 import argparse
+import warnings
 
 import jax
 import numpy as np
 
-from ..data.logs import read_logs
-from ..fit.predict import predict
+from ..data.logs import DataWarning, read_logs
+from ..diagnose.keys import listed
+from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
 from ..recordings.mcap_writer import require_mcap, write_mcap
 from ..storage.log import Log
@@ -19,6 +21,10 @@ def run(args: argparse.Namespace, log: Log) -> None:
         require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
+    known, valid = given_samples(logs.data, args.given), np.asarray(logs.data.valid)
+    if ended := [file for file, ahead in zip(logs.files, valid & ~known, strict=True) if not ahead.any()]:
+        problem = f"no row of {listed(ended)} is later than --given {args.given:g} s: nothing is predicted there"
+        warnings.warn(f"{args.folder}: {problem}", DataWarning, 2)
     prediction = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
     mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)

@@ -143,7 +143,7 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "empty file": (lambda _: "", "line 1", "empty", "write a header"),
     "blank file": (lambda _: "\n \n", "line 1", "empty", "write a header"),
     "header only": (lambda s: s.splitlines()[0], "line 1", "found 0 rows", "2 rows or more"),
-    "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 rows", "2 rows or more"),
+    "one row": (lambda s: "\n".join(s.splitlines()[:2]), "line 2", "found 1 row;", "2 rows or more"),
     "no header": (
         lambda s: s.split("\n", 1)[1],
         "line 1, column 'time'",
@@ -186,7 +186,7 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     "blank time": (with_field(202, "time", " "), "line 202, column 'time'", "found ''", "never empty"),
     "row too short": (lambda s: s.replace("\n0.03,", "\n"), "line 5", "3 fields under 4 names", "every column a field"),
     "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5", "5 fields under 4", "every column a field"),
-    "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 fields under 4", "every column a field"),
+    "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5", "1 field under 4", "every column a field"),
     "gap of half a row": (
         _column("time", lambda t: t + 0.004 * (np.arange(t.size) > 4)),
         "line 7, column 'time'",
@@ -368,7 +368,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
     "gap": (
         _log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
         "line 7, column 'time'",
-        "a gap: 0.04 s, then 0.06 s (1 rows are missing in all)",
+        "a gap: 0.04 s, then 0.06 s (1 row missing in all)",
         "inputs there are interpolated from the rows around",
     ),
     "gap in noisy inputs": (
@@ -378,7 +378,7 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, then the wor
             )
         ),
         "line 102, column 'time'",
-        "a gap: 0.99 s, then 1.1 s (91 rows follow in all)",
+        "a gap: 0.99 s, then 1.1 s (91 rows after it in all)",
         "cannot be interpolated: not used",
     ),
     "spike": (

@@ -227,7 +227,7 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     _heavier(folder)
     assert cli.main(["check", str(folder)]) == 1
     bad = capsys.readouterr()
-    assert "1 of 8 answers are bad" in bad.err
+    assert "bad answers: 1 of 8" in bad.err
     assert re.search(r"(?m)^bad   torque    u: up to .* look at its unit", bad.out)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -107,7 +107,7 @@ def _shorter(columns):
 MISTAKES = {  # name: (suffix, the bytes or the columns, then the words of the message)
     "parquet: column missing": (".parquet", lambda c: {n: c[n] for n in ("time", "theta1", "dtheta1")}, "'u': missing"),
     "parquet: text": (".parquet", lambda c: c | {"u": ["0.1"] * 50}, "column 'u'", "holds object", "floating point"),
-    "parquet: one row": (".parquet", lambda c: {n: v[:1] for n, v in c.items()}, "found 1 rows", "2 rows or more"),
+    "parquet: one row": (".parquet", lambda c: {n: v[:1] for n, v in c.items()}, "found 1 row;", "2 rows or more"),
     "parquet: no such file": (".parquet", b"PAR1 and nothing", "no Parquet file, or damaged", "another copy"),
     "parquet: empty": (".parquet", b"", "no Parquet file, or damaged", "another copy"),
     "parquet: gap": (

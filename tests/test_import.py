@@ -218,7 +218,7 @@ def test_more_test_sequences_than_there_are_is_refused(tmp_path, capsys):
     t = DT * np.arange(200)
     log = _write(tmp_path / "a.mcap", t, t, np.cos(t))
     assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 2
-    assert "the logs give 1 sequences, and one is needed to train on" in capsys.readouterr().err
+    assert "the logs give 1 sequence, and one is needed to train on" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -360,7 +360,7 @@ def _said(old: str, new: str) -> dict[str, str]:
 REFUSED = {  # what is wrong with the rig's table, or with the log, and words of the message
     "unknown topic": (_said("/cmd:", "/cmmd:"), {}, ["column 'u'", "no topic '/cmmd'", "did you mean '/cmd'"]),
     "unknown field": (_said("data[0]", "dat"), {}, ["column 'u'", "no field 'dat'", "data[0]"]),
-    "wrong index": (_said("data[0]", "data[3]"), {}, ["'data' of '/cmd' has 1 values", "count from 0 to 0"]),
+    "wrong index": (_said("data[0]", "data[3]"), {}, ["'data' of '/cmd' has 1 value", "count from 0 to 0"]),
     "unknown joint": (_said("position[joint]", "position[jiont]"), {}, ["did you mean 'position[joint]'"]),
     "not declared": ({"columns": ""}, {}, ["column 'u': nothing is called so", "[import.columns] u =", "/cmd:data[0]"]),
     "unknown key": ({"more": "gaps = 1"}, {}, ["[import] gaps", "unknown", "did you mean 'gap'"]),

@@ -216,7 +216,7 @@ CLOCKS = {  # header stamps, the clock that is taken, and what is said
     "all 0": (0 * ns(T), "log time", "header stamps are all 0"),
     "backwards": (ns(T) - 3 * (np.arange(300) == 50) * 10**7, "log time", "run backwards (1 times)"),
     "another clock": (ns(T) - EPOCH, "log time", "of another clock, 1.7e+09 s"),
-    "twice": (ns(np.round(T, 1)), "header stamp", "messages have the time of the next one"),
+    "twice": (ns(np.round(T, 1)), "header stamp", "messages with the time of the next one"),
 }
 
 
@@ -240,7 +240,7 @@ def test_a_log_that_is_a_little_out_of_order_is_sorted(tmp_path):
         writer.finish()
     track = _read(path, x=("x",))["/x"]
     np.testing.assert_array_equal(track.values["x"], np.arange(5))
-    assert "1 messages were out of order by up to 0.01 s: sorted" in track.notes
+    assert "1 message out of order by up to 0.01 s: sorted" in track.notes
 
 
 def _cut(path):

@@ -315,7 +315,7 @@ def test_lost_rows_come_back_without_readings(tmp_path):
     kept[50:60] = kept[100] = False
     _write(tmp_path, columns, kept)
     logs, (said,) = _read(tmp_path)
-    assert "line 52, column 'time': a gap: 0.49 s, then 0.6 s (11 rows are missing in all)" in said
+    assert "line 52, column 'time': a gap: 0.49 s, then 0.6 s (11 rows missing in all)" in said
     np.testing.assert_allclose(logs.data.t[0], columns["time"], atol=1e-9)
     np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], atol=1e-4)
     np.testing.assert_array_equal(np.isnan(logs.data.y[0]).all(axis=1), ~kept)

@@ -16,5 +16,5 @@ def run(args: argparse.Namespace, log: Log) -> int:
     for finding in results:
         print(f"{finding.mark:4}  {finding.subject:8}  {bench.rig.named(finding.text)}")
     bad = sum(finding.mark == BAD for finding in results)
-    log(f"{bad} of {len(results)} answers are bad" if bad else "the logs allow a fit")
+    log(f"bad answers: {bad} of {len(results)}" if bad else "the logs allow a fit")
     return int(bad > 0)

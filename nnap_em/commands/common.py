@@ -26,6 +26,7 @@ from ..fit.identify import Identified
 from ..fit.predict import GIVEN
 from ..fit.store import fingerprint
 from ..identifiability.check import BAD, torques
+from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
@@ -182,7 +183,7 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
         journal.check()
-        message = f"resumed with {len(journal)} finished steps"
+        message = f"resumed with {counted(len(journal), 'finished step')}"
         log(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
     with _folder(args.out), _reporting(lambda: go_on(args, journal)):
         if args.resume:
@@ -190,7 +191,7 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
         else:
             journal.clear()
         count, rows = bench.train.data.valid.shape
-        log(f"compiling for {count} sequences of {rows} rows (the first time takes longest) ...")
+        log(f"compiling for {counted(count, 'sequence')} of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
             yield journal
         if not journal.open:
@@ -212,7 +213,8 @@ def go_on(args: argparse.Namespace, journal: Journal) -> str:
         for one in value if isinstance(value, list) else [value]:
             command += [name, str(one)]
     command += ["--trust-readings"] * args.trust_readings
-    return f"stopped with {len(journal)} finished steps kept; to go on: {shlex.join([*command, '--resume'])}"
+    kept = counted(len(journal), "finished step")
+    return f"stopped with {kept} kept; to go on: {shlex.join([*command, '--resume'])}"
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import argparse
 import jax
 
 from ..fit.store import load, model_file
+from ..numerics.digits import counted
 from ..portable.c99 import write_c
 from ..portable.draws import TABLE, write_draws
 from ..portable.export import export
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         log(f"wrote {args.c}")
     if args.draws is not None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
-        log(f"wrote {args.draws} draws of the posterior to {args.out}: {TABLE}")
+        log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")
     elif args.out is not None:
         reason = export(fitted, args.out)
         log(f"no predictor.py: {reason}" if reason else f"wrote predictor.py to {args.out}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
+from ..numerics.digits import counted
 from ..recordings.declared import read_plan
 from ..recordings.folder import completed, places, write_sequences
 from ..recordings.resample import Resampled, resample
@@ -38,7 +39,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
     for line in document["look"]:
         log(f"look at this: {line}")
     test = sum(file.startswith("test/") for file in files)
-    log(f"wrote {len(files) - test} training and {test} test sequences to {args.out}; read {args.out / 'import.html'}")
+    amount = f"{len(files) - test} training and {counted(test, 'test sequence')}"
+    log(f"wrote {amount} to {args.out}; read {args.out / 'import.html'}")
 
 
 def _reaching(text: str, folder: Path, out: Path) -> str:
@@ -52,4 +54,4 @@ def _reaching(text: str, folder: Path, out: Path) -> str:
 
 def _summary(log: Resampled) -> str:
     used = [stretch for stretch in log.sequences if not stretch.why]
-    return f"{len(used)} sequence{'s' * (len(used) != 1)}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"
+    return f"{counted(len(used), 'sequence')}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

@@ -10,6 +10,7 @@ from ..data.logs import DataWarning, read_logs
 from ..diagnose.keys import listed
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
+from ..numerics.digits import counted
 from ..recordings.mcap_writer import require_mcap, write_mcap
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     prediction = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
     mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
-    log(f"wrote {len(logs.files)} files to {args.out}")
+    log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")
     if args.mcap is not None:
         write_mcap(args.mcap, logs, {"/log": log_of(fitted, logs), "/predicted": states_of(fitted, mean, std)})
         log(f"wrote {args.mcap}")

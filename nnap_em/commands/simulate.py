@@ -13,6 +13,7 @@ from ..data.formats import write_csv
 from ..data.rig import Rig, nearest, write_rig
 from ..model.simulate import Experiment, declared, examples, sensed, sweep_experiment
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import counted
 from ..report.tables import visited_nodes, write_friction
 from ..storage.files import whole_folder
 from ..storage.log import Log
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         count, key = args.sequences + args.test, jax.random.key(args.seed)
         experiment = sweep_experiment(model, sweep, count, args.steps, key=key)
         _write(part, model, declared(args.system, model), experiment, args.sequences)
-    log(f"wrote {args.sequences} training and {args.test} test sequences to {args.out}")
+    log(f"wrote {args.sequences} training and {counted(args.test, 'test sequence')} to {args.out}")
 
 
 def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:

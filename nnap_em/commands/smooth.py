@@ -10,6 +10,7 @@ from ..fit.branches import Branch, branches
 from ..fit.identify import Identified
 from ..fit.predict import smoothed_states
 from ..fit.store import load, model_file
+from ..numerics.digits import counted
 from ..recordings.mcap_writer import Channel, require_mcap, write_mcap
 from ..residual.residual import names_of, residual
 from ..storage.log import Log
@@ -25,7 +26,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     state = smoothed_states(fitted, logs.data)
     mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
-    log(f"wrote {len(logs.files)} files to {args.out}")
+    log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")
     for other in branches(fitted.model, logs.data, fitted.smoother.tolerant(), key=fitted.state.key):
         log(_line(other, fitted, logs))
     if args.mcap is not None:

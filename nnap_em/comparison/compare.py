@@ -19,6 +19,7 @@ from ..fit.identify import Identified, friction_table, nodes_between, parameter_
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, UNITS, fit_law
+from ..numerics.digits import counted
 from ..residual.statistics import holm
 from .pooling import JointTest, Pooled, joint_test, pool
 
@@ -148,23 +149,21 @@ class Comparison(NamedTuple):
         between = f"between {listed(self.names)}"
         if not self.changed:
             nothing = "No tested quantity" if self.differences else "Nothing"
-            return f"{nothing} changed {between} beyond the stated errors: {_counted(tests)} tested at {CHANGED:.0%}."
+            tested = counted(tests, "quantity", "quantities")
+            return f"{nothing} changed {between} beyond the stated errors: {tested} tested at {CHANGED:.0%}."
         changed = []
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
             changed += [f"the {curve.name}{parts}"] * curve.changed
         changed += [number.name for number in self.numbers if number.changed]
         unchanged = tests - len(changed)
-        others = f"{_counted(unchanged, 'other ')} did not" if unchanged else "no other quantity was tested"
+        others = f"{counted(unchanged, 'other quantity', 'other quantities')} did not"
+        others = others if unchanged else "no other quantity was tested"
         text = f"{listed(changed)} changed {between}; {others}."
         return text[0].upper() + text[1:]
 
     def __str__(self) -> str:
         return "\n  ".join(["Comparison", self.verdict, *self.warnings])
-
-
-def _counted(quantities: int, kind: str = "") -> str:
-    return f"{quantities} {kind}{'quantity' if quantities == 1 else 'quantities'}"
 
 
 def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Comparison:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..numerics.digits import counted
+
 Array = jax.Array | np.ndarray  # host or device
 
 
@@ -28,7 +30,7 @@ class Dataset(NamedTuple):
         count, gone = valid[..., 0].size, np.isnan(y[valid]).mean() if y[valid].size else 0.0
         t = np.asarray(self.t)
         longest, inputs = float(np.max(t[..., -1] - t[..., 0])), np.shape(self.u)[-1]
-        size = f"{count} sequence{'s' * (count != 1)}, {valid.sum()} rows, the longest {longest:.3g} s"
+        size = f"{counted(count, 'sequence')}, {valid.sum()} rows, the longest {longest:.3g} s"
         return f"Dataset: {size}; {inputs} inputs, {y.shape[-1]} readings, {100 * gone:.2g} % missing"
 
 

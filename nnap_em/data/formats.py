@@ -11,6 +11,7 @@ import numpy as np
 import scipy.io
 from jaxtyping import Float, Real
 
+from ..numerics.digits import counted
 from ..storage.files import replace_text
 from .dataset import Array, DataError
 from .rig import nearest
@@ -238,13 +239,15 @@ def _rows(path: Path, text: str) -> list[list[str]]:
     """The fields of every row under the header, as many as it has names."""
     lines = text.rstrip().split("\n")
     if len(lines) < 3:
-        refuse(path, f"line {len(lines)}", f"found {len(lines) - 1} rows", "write a header and 2 rows or more")
+        refuse(
+            path, f"line {len(lines)}", f"found {counted(len(lines) - 1, 'row')}", "write a header and 2 rows or more"
+        )
     rows = [line.split(",") for line in lines[1:]]
     names = lines[0].count(",") + 1
     for number, row in enumerate(rows, 2):
         if len(row) != names:
             hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
-            problem = f"found {len(row)} fields under {names} names"
+            problem = f"found {counted(len(row), 'field')} under {counted(names, 'name')}"
             refuse(path, f"line {number}", problem, _separator_hint(text) or hint)
     if not any(map(_is_number, rows[0])):
         refuse(path, "line 2", f"holds no number, found {lines[1]!r}", _header_hint(text) or "remove the row of units")
@@ -303,7 +306,7 @@ def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float
     """Columns of numbers side by side, checked as those of a CSV file are."""
     rows = np.size(next(iter(columns.values())))
     if rows < 2:
-        refuse(path, "the file", f"found {rows} rows", "write 2 rows or more")
+        refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
     out = []
     for name, values in columns.items():
         if values.dtype.kind not in "iuf":

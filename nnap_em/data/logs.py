@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..numerics.digits import counted
 from .constant import FULL
 from .dataset import DataError, Dataset, pad
 from .formats import log_files, place, read_table, refuse
@@ -192,7 +193,7 @@ def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     for entry in entries:
         k, count = int(entry.rows[0]), entry.rows.size
         masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
-        problem = f"{count} reading{'s' * (count > 1)} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
+        problem = f"{counted(count, 'reading')} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
         hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
         warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {hint}", DataWarning, 2)
     return _Sequence((t, u, y), (t, u, read), masked)
@@ -214,7 +215,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
-        problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({count} places in all)"
+        problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({counted(count, 'place')} in all)"
         hint = "resample to uniform rows with `nnap-em import`; a missing sample is an empty field of a row"
         refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} s)")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
@@ -250,7 +251,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
             problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
-            problem += f" ({count} rows {'are missing' if kind == 'gap' else 'follow'} in all)"
+            problem += f" ({counted(count, 'row')} {'missing' if kind == 'gap' else 'after it'} in all)"
             warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], used, masked)
 

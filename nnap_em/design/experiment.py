@@ -13,6 +13,7 @@ from ..data.dataset import Dataset
 from ..em.mstep import kept
 from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, smooth
+from ..numerics.digits import counted
 from ..storage.log import Log, renamed, silent
 from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
 from .information import Fit, known
@@ -106,7 +107,9 @@ def design_experiment(
     criterion = _criterion(question, fitted, fit, friction, discrimination)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
-        raise DesignError(f"{sequences} sequences in {seconds:g} s have {rows} rows each; give more --seconds")
+        raise DesignError(
+            f"{counted(sequences, 'sequence')} in {seconds:g} s: {counted(rows, 'row')} each; give more --seconds"
+        )
     t = fitted.rig.dt * np.arange(rows + 1)
     setup = Setup(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
@@ -210,7 +213,7 @@ def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log)
         ok = allowed(trials, setup.limits)
         if ok.all():
             break
-        log(f"{np.sum(~ok)} sequences come too near a limit in {CHECKED} trials: made smaller")
+        log(f"too near a limit in {CHECKED} trials: {counted(np.sum(~ok), 'sequence')} made smaller")
         proposal.shape[~ok, :, -1] *= SHRINKS
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")

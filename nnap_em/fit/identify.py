@@ -20,6 +20,7 @@ from ..em.mstep import ScoringMStep, kept
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
+from ..numerics.digits import counted
 from ..prediction_error.multistep import FALLS, JUDGED, errors, finish, followed, ratio
 from ..prediction_error.noise import white_readings
 from ..prediction_error.stated import widened
@@ -61,7 +62,7 @@ class Identified(NamedTuple):
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
         line = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
-        return f"Identified {self.rig.name!r} after {self.state.epoch} epochs{line}\n  {self.model}"
+        return f"Identified {self.rig.name!r} after {counted(self.state.epoch, 'epoch')}{line}\n  {self.model}"
 
 
 class FrictionTable(NamedTuple):

@@ -11,6 +11,7 @@ from ..data.dataset import Dataset, fill_missing
 from ..em.loop import e_step
 from ..em.prior import ParameterPrior
 from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
 from ..prediction_error.stated import of_states
@@ -36,7 +37,7 @@ class Prediction(NamedTuple):
     def __str__(self) -> str:
         ahead = np.asarray(self.ahead)
         std = ", ".join(f"{x:.2g}" for x in np.sqrt(np.nanmean(np.asarray(self.std)[ahead] ** 2, axis=0)))
-        amount = f"{len(ahead)} sequences, {ahead.sum()} rows ahead"
+        amount = f"{counted(len(ahead), 'sequence')}, {counted(ahead.sum(), 'row')} ahead"
         return f"Prediction: {amount}; std of the states there [rad and rad/s, or m and m/s]: {std}"
 
 

@@ -20,6 +20,7 @@ from ..fit.identify import begin
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import counted
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
@@ -107,12 +108,12 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     long = "cut them into sequences of some seconds" if rows.max() * rig.dt > 20 else ""
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, shortage)
-    amount = f"{len(rows)} training sequences, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
+    amount = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
     yield CheckResult(mark, "length", "; ".join(filter(None, (amount, shortage or little, short, long))))
     if test is None:
         yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
     else:
-        yield CheckResult(OK, "test", f"{len(test.files)} test sequences, none of them in train")
+        yield CheckResult(OK, "test", f"{counted(len(test.files), 'test sequence')}, none of them in train")
 
 
 def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
@@ -132,7 +133,8 @@ def _rough(train: Logs) -> Iterator[CheckResult]:
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
         entries = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
         count, what = sum(entry.amount for entry in entries), f"{column}: " if column else ""
-        text = f"{what}{kind}: {count} {'readings' if column else 'rows'} in {len(entries)} of {len(train.files)} files"
+        amount = counted(count, "reading" if column else "row")
+        text = f"{what}{kind}: {amount} in {len(entries)} of {counted(len(train.files), 'file')}"
         yield CheckResult(
             _mark(True, count > 0.3 * total),
             "rough",

@@ -7,6 +7,7 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..data.machine import unpacked
 from ..data.rig import Rig
+from ..numerics.digits import counted
 
 NEAR = 0.005
 """Share of the range within which a reading counts as at its end."""
@@ -26,5 +27,7 @@ def at_stops(rig: Rig, data: Dataset) -> Iterator[str]:
         touched = np.isfinite(y) & ((y < low + margin) | (y > high - margin))
         if touched.any():
             unit = rig.unit(name)
-            text = f"{name}: {touched.sum()} readings at or beyond its range of {low:.4g} to {high:.4g} {unit}"
+            text = (
+                f"{name}: {counted(touched.sum(), 'reading')} at or beyond its range of {low:.4g} to {high:.4g} {unit}"
+            )
             yield f"{text}; stops have no force in the model: leave those stretches out, or let diagnose find hard_stop"

@@ -1,12 +1,17 @@
 """Numbers in as many digits as they deserve."""
 
 import math
-from typing import Any
+from typing import Any, SupportsIndex
 
 
 def finite(value: Any) -> bool:
     """True for a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
+
+
+def counted(count: SupportsIndex, noun: str, plural: str = "") -> str:
+    """A number of things, with their noun in singular or plural (`noun` + s where no other is given)."""
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"
 
 
 def number(value: Any, digits: int = 3) -> str:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from ..numerics.digits import counted
 from .recording import refuse
 
 APART = 10.0
@@ -50,7 +51,7 @@ def choose(
         amount = float(np.maximum.accumulate(log)[k] - log[k + 1]) * 1e-9
         if amount > BACK:
             refuse(path, where, *_backwards(f"message {k + 2}", amount))
-        notes.append(f"{int(back.sum())} messages were out of order by up to {amount:.2g} s: sorted")
+        notes.append(f"{counted(back.sum(), 'message')} out of order by up to {amount:.2g} s: sorted")
     return _single(log[order], order, "log time", tuple(notes))
 
 
@@ -74,7 +75,8 @@ def _single(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " m"], name: str, n
     """The last of the messages at one time: the last command is held."""
     last = np.append(np.diff(t) > 0, True)
     if not last.all():
-        notes = (*notes, f"{int(np.sum(~last))} messages have the time of the next one: the last of each is taken")
+        same = counted(np.sum(~last), "message")
+        notes = (*notes, f"{same} with the time of the next one: the last of each is taken")
     return Clock(t[last], order[last], name, notes)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..data.dataset import DataError
 from ..data.formats import write_csv
 from ..data.rig import Rig, toml_text
+from ..numerics.digits import counted
 from .recording import Address
 from .resample import Resampled
 
@@ -24,7 +25,9 @@ def places(logs: Sequence[Resampled], test: float) -> list[str]:
     tests = round(test) if test >= 1 else min(math.ceil(test * count - 1e-9), count - 1)
     if tests >= count:
         hint = "give fewer, or set [import] longest lower in rig.toml"
-        raise DataError(f"--test {test:g}: the logs give {count} sequences, and one is needed to train on; {hint}")
+        raise DataError(
+            f"--test {test:g}: the logs give {counted(count, 'sequence')}, and one is needed to train on; {hint}"
+        )
     digits = max(len(str(count - 1)), 3)
     return [f"train/{i:0{digits}d}.csv" for i in range(count - tests)] + [
         f"test/{i:0{digits}d}.csv" for i in range(tests)

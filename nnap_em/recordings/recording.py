@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from ..data.formats import refuse
 from ..data.rig import nearest
+from ..numerics.digits import counted
 
 EXTRA = 'pip install "nnap-em[logs]"'
 
@@ -94,7 +95,8 @@ def field_of(file: Path, topic: Topic, path: str, where: str) -> str:
     if match and row:
         if int(match[2]) < len(row):
             return row[int(match[2])]
-        refuse(file, where, f"{match[1]!r} of {topic.name!r} has {len(row)} values", f"count from 0 to {len(row) - 1}")
+        problem = f"{match[1]!r} of {topic.name!r} has {counted(len(row), 'value')}"
+        refuse(file, where, problem, f"count from 0 to {len(row) - 1}")
     if not topic.fields:
         refuse(file, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
     refuse(file, where, f"topic {topic.name!r} has no field {path!r}", near(path, topic.fields))

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from ..data.dataset import DataError
 from ..data.rig import Rig, nearest
 from ..data.units import thousandfold
+from ..numerics.digits import counted
 from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
@@ -104,9 +105,8 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
     y = recording.tracks[at.topic].values[at.path]
     finite = np.isfinite(y)
     if np.count_nonzero(finite) < 2:
-        problem = (
-            f"from {str(at)!r}: {np.count_nonzero(finite)} numbers in {y.size} messages, the rest are NaN or absent"
-        )
+        amount = f"{counted(np.count_nonzero(finite), 'number')} in {counted(y.size, 'message')}"
+        problem = f"from {str(at)!r}: {amount}, the rest are NaN or absent"
         hint = "name a field that holds numbers in [import.columns], or take the log out"
         refuse(recording.path, f"column {name!r}", problem, hint)
     if finite.all():
@@ -141,7 +141,7 @@ def _gridded(
     used = [segment for segment in segments if not segment.why]
     if not used:
         most = max((segment.end - segment.first for segment in segments), default=0)
-        problem = f"the longest stretch in which all topics have messages has {most} rows"
+        problem = f"the longest stretch in which all topics have messages has {counted(most, 'row')}"
         hint = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
         refuse(recording.path, "the log", problem, hint)
     around = tuple(rig.measured)

@@ -11,7 +11,7 @@ from ..data.formats import write_csv
 from ..design.criteria import Information, after
 from ..design.experiment import Design
 from ..diagnose.keys import key_of, listed, words
-from ..numerics.digits import number
+from ..numerics.digits import counted, number
 from ..residual.residual import names_of
 from ..storage.files import replace_text
 from ..storage.log import Log
@@ -44,7 +44,7 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
     replace_text(out / "design.html", named(text))
     log(document["verdict"])
-    log(f"wrote {out / 'design.html'}, design.json and {len(files)} files in {out / INPUTS}")
+    log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUTS}")
 
 
 def _write_sequences(out: Path, design: Design) -> list[str]:
@@ -190,7 +190,7 @@ def _verdict(document: dict[str, Any]) -> str:
             f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
         )
     gains = gains or ["hardly anything surer: widen [limits], or give more --seconds"]
-    what = f"{document['sequences']} sequences of {number(document['seconds_each'])} s"
+    what = f"{counted(document['sequences'], 'sequence')} of {number(document['seconds_each'])} s"
     return f"{what} should make {listed(gains)}."
 
 

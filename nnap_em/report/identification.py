@@ -13,6 +13,7 @@ from ..data.logs import Logs
 from ..diagnose.keys import listed
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.predict import smooth
+from ..numerics.digits import counted
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
 from ..storage.log import Log
@@ -81,14 +82,10 @@ def write_identification(
 
 def _verdict(fitted: Identified, sequences: int, diverged: int) -> str:
     dof = len(fitted.model.system.coordinates)
-    friction = [f"the friction of {_counted(dof, 'joint')}"] * fitted.rig.friction
+    friction = [f"the friction of {counted(dof, 'joint')}"] * fitted.rig.friction
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
-    used = f"{sequences - diverged} of " * bool(diverged) + _counted(sequences, "sequence")
-    return f"Fitted {estimated} to {used} in {_counted(fitted.state.epoch, 'epoch')}."
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}" + "s" * (count != 1)
+    used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
+    return f"Fitted {estimated} to {used} in {counted(fitted.state.epoch, 'epoch')}."
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:

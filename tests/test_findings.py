@@ -144,6 +144,11 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     first, second, *_ = advice([], [], (), [suspect])
     assert "record as many different motions" in first
     assert second == f"To see a motor gain at joint 2 by itself: {catalogue['motor_gain'].confirm}"
+    for law, named in (
+        ("unknown function of u", "an unknown function of u"),
+        ("cogging at joint 1", "cogging at joint 1"),
+    ):
+        assert advice([], [], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
 
 
 @pytest.mark.slow

@@ -172,7 +172,7 @@ def verdict(
 
 def _sized(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
-    name, curve = with_article(key_of(finding.effect)), finding.curve
+    name, curve = with_article(words(key_of(finding.effect))), finding.curve
     for symbol, estimate in finding.parameters.items():
         return f"{name} ({symbol} = {with_std(estimate.value, estimate.std)} {estimate.unit}".rstrip(" -") + ")"
     if curve is None:
@@ -271,7 +271,9 @@ def advice(
     """Sentences on the next measurement."""
     out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     out += [MORE] if suspects else []
-    out += [f"To see a {suspect.law} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm]
+    out += [
+        f"To see {with_article(suspect.law)} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm
+    ]
     out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
     for finding in accepted:
         if finding.effect.confirm:

@@ -35,15 +35,15 @@ def words(key: Key) -> str:
     return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
 
 
-MASS_NOUNS = ("air_drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "emf")
+MASS_NOUNS = ("air drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "emf")
 """Last words of the laws that take no article."""
 
 
-def with_article(key: Key) -> str:
-    """Name of an effect with its article, as in a sentence."""
-    if key[0].endswith(MASS_NOUNS):
-        return words(key)
-    return ("an " if re.match("[aeiu]|o(?!ne)", key[0]) else "a ") + words(key)
+def with_article(name: str) -> str:
+    """Name of an effect, as `words` writes it, with its article."""
+    if re.split(" of | at | on ", name)[0].endswith(MASS_NOUNS):
+        return name
+    return ("an " if re.match("[aeiu]|o(?!ne)", name) else "a ") + name
 
 
 def listed(names: Sequence[str]) -> str:

@@ -254,7 +254,7 @@ def _answered_in_time(rig: Path, out: Path, capsys) -> None:
     steps = len(_steps(out))
     code, said = _called(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"), capsys)
     assert code == 0 and re.search(r"\[\d+:\d\d over\] ", said), said
-    assert re.search(r"finished steps kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
+    assert re.search(r"finished steps? kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
     report = json.loads((out / "report.json").read_text())
     assert not report["complete"] and not report["effects"]
     assert "The search was not finished" in report["verdict"] and report["verdict"] in said

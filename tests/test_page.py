@@ -8,7 +8,7 @@ import pytest
 
 from nnap_em.diagnose.keys import words
 from nnap_em.effects import catalogue
-from nnap_em.numerics.digits import number, with_std
+from nnap_em.numerics.digits import counted, number, with_std
 from nnap_em.report.page import MOST, Picture, page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, reached
@@ -230,6 +230,8 @@ def test_numbers_as_a_reader_writes_them():
     assert with_std(12.3456, 3.21) == "12.3 ± 3.2"
     assert with_std(1.5e-6, 2e-7) == "(1.50 ± 0.20) × 10⁻⁶"
     assert with_std(3.0, None) == "3.000"
+    assert [counted(n, "row") for n in (0, 1, 2)] == ["0 rows", "1 row", "2 rows"]
+    assert [counted(n, "quantity", "quantities") for n in (1, 2)] == ["1 quantity", "2 quantities"]
 
 
 def test_short_test_sequences_have_no_errors_beyond_their_end():

@@ -101,7 +101,7 @@ def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
 
     assert torque(1.0).mark == "ok"
     assert re.search(r"up to 7.8\d N m, gravity and inertia of joint 3 need 7.[89]", torque(1.0).text)
-    assert [torque(1e3).mark, torque(1e-4).mark] == ["bad", "bad"]
+    assert [torque(1e3).mark, torque(1e-4).mark] == ["error", "error"]
 
 
 def test_bodies_that_make_no_machine_are_bad_and_nothing_else_is_tried():
@@ -113,7 +113,7 @@ def test_bodies_that_make_no_machine_are_bad_and_nothing_else_is_tried():
     build_system(rig)
     rig = replace(rig, parameters={**values, "I2": Declared(-0.006, 0.0)})
     mark, text = _report(logs, rig)["bodies"][0]
-    assert mark == "bad"
+    assert mark == "error"
     assert "the declared masses and inertias make no machine" in text
     with pytest.raises(RigError, match="rig 'a': the declared masses and inertias make no machine"):
         build_system(rig)
@@ -141,48 +141,53 @@ def test_a_place_that_nothing_tells_is_named(slide):
     """A slide knows no place: its rate tells nothing of it, and friction does not mind."""
     report = _report(_changed(slide, y=lambda y: y[..., 1:]), _rig(("dx",)))
     ((mark, text),) = report["states"]
-    assert mark == "look"
+    assert mark == "warning"
     assert "1 of 2 directions" in text
     assert "not determined: x" in text
 
 
 def test_readings_that_tell_no_velocity_are_bad(slide):
     report = _report(slide, _rig(noise={"x": 50.0, "dx": 50.0}))
-    assert report["states"][0][0] == "bad"
+    assert report["states"][0][0] == "error"
     assert "0 of 2" in report["states"][0][1]
-    assert report["noise"][0][0] == "bad"
+    assert report["noise"][0][0] == "error"
     assert "the motion hardly rises above it" in report["noise"][0][1]
 
 
 CASES = {  # name: (change, subject, mark, words)
-    "few rows": (dict(valid=lambda v: v & (np.arange(ROWS) < 15)), "length", "bad", "too few"),
-    "short sequences": (dict(valid=lambda v: v & (np.arange(ROWS) < 50)), "length", "look", "0.5 s"),
+    "few rows": (dict(valid=lambda v: v & (np.arange(ROWS) < 15)), "length", "error", "too few"),
+    "short sequences": (dict(valid=lambda v: v & (np.arange(ROWS) < 50)), "length", "warning", "0.5 s"),
     "gaps": (
         dict(y=lambda y: np.where((np.arange(ROWS) % 3 > 0)[None, :, None], np.nan, y)),
         "missing",
-        "look",
+        "warning",
         "x: 67 %",
     ),
     "hardly any reading": (
         dict(y=lambda y: np.where((np.arange(ROWS) % 20 > 3)[None, :, None], np.nan, y)),
         "missing",
-        "bad",
+        "error",
         "x: 80 %",
     ),
-    "forces in mN": (dict(u=lambda u: 1000 * u), "torque", "bad", "look at its unit (N)"),
-    "forces in kN": (dict(u=lambda u: u / 1e5), "torque", "bad", "look at its unit (N)"),
-    "one way": (dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)), "motion", "look", "one direction only"),
-    "no motion": (dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)), "motion", "bad", "hardly moves"),
+    "forces in mN": (dict(u=lambda u: 1000 * u), "torque", "error", "look at its unit (N)"),
+    "forces in kN": (dict(u=lambda u: u / 1e5), "torque", "error", "look at its unit (N)"),
+    "one way": (
+        dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)),
+        "motion",
+        "warning",
+        "one direction only",
+    ),
+    "no motion": (dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)), "motion", "error", "hardly moves"),
     "rest": (
         dict(y=lambda y: y * np.where(np.arange(ROWS) < 20, 1.0, 1e-3)[None, :, None]),
         "motion",
-        "look",
+        "warning",
         "it rests most of the time",
     ),
     "more noise than declared": (
         dict(y=lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0]),
         "noise",
-        "look",
+        "warning",
         "declare more",
     ),
 }
@@ -196,21 +201,21 @@ def test_what_is_bad_is_found(slide, change, subject, mark, words):
 
 def test_a_filtered_log_is_noticed(slide):
     answers = _report(slide, _rig(noise={"x": 1e-3, "dx": 0.1}))["noise"]
-    assert answers[1][0] == "look"
+    assert answers[1][0] == "warning"
     assert "was filtered" in answers[1][1]
 
 
 def test_with_hardly_any_rows_nothing_else_is_asked(slide):
     report = _report(_logs(Dataset(*(part[:, :2] for part in slide.data))))
     assert list(report) == ["length", "test", "missing"]
-    assert report["length"][0][0] == "bad"
+    assert report["length"][0][0] == "error"
 
 
 def test_slow_sampling_is_noticed(slide):
     """Every 10th row: half a second of a sweep is five rows."""
     slow = Dataset(*(part[:, ::10] for part in slide.data))
     report = _report(_logs(slow), _rig(dt=0.1))
-    assert report["sampling"][0][0] == "look"
+    assert report["sampling"][0][0] == "warning"
     assert "sample faster" in report["sampling"][0][1]
 
 
@@ -223,12 +228,12 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     assert cli.main(["check", str(folder)]) == 0
     good = capsys.readouterr()
     assert "the logs allow a fit" in good.err
-    assert all(re.match(r"(ok|look)   *[a-z]+ +\S", line) for line in good.out.splitlines())
+    assert all(re.match(r"(ok|warning)  *[a-z]+ +\S", line) for line in good.out.splitlines())
     _heavier(folder)
     assert cli.main(["check", str(folder)]) == 1
     bad = capsys.readouterr()
-    assert "bad answers: 1 of 8" in bad.err
-    assert re.search(r"(?m)^bad   torque    u: up to .* look at its unit", bad.out)
+    assert "nnap-em: 1 error" in bad.err
+    assert re.search(r"(?m)^error    torque      u: up to .* look at its unit", bad.out)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -249,7 +254,7 @@ def test_the_acrobot_with_a_hidden_joint_passes():
     rig = Rig("a", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", measured, {}, {})
     data = Dataset(*(np.asarray(part) for part in data))
     report = _report(Logs(tuple("abcd"), data, ("u", *measured)), rig)
-    assert "bad" not in {mark for answers in report.values() for mark, _ in answers}
+    assert "error" not in {mark for answers in report.values() for mark, _ in answers}
     assert "4 of 4 directions" in report["states"][0][1]
     assert any("joint 2 (never seen, by the declared model)" in text for _, text in report["motion"])
     assert jnp.isfinite(data.y).all()

@@ -463,7 +463,7 @@ def test_what_is_left_of_a_cut_log_is_imported_and_told(tmp_path, capsys):
     log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
-    assert "look at this: a.mcap: the file is cut short" in capsys.readouterr().err
+    assert "warning: a.mcap: the file is cut short" in capsys.readouterr().err
     assert "the file is cut short" in (tmp_path / "out/import.html").read_text()
     u = _table(tmp_path / "out/train/000.csv")[:, 1]
     assert 50 < u.size < 300

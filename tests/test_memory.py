@@ -185,7 +185,9 @@ def test_a_static_map_is_kept_where_there_is_no_memory():
     assert fitted.memory.startswith("joint 1: the static map is kept, no memory")
 
 
-@pytest.mark.parametrize(("turns", "amplitude", "marks"), [(20, 0.5, "ok"), (19, 0.5, "look"), (20, 0.02, "look")])
+@pytest.mark.parametrize(
+    ("turns", "amplitude", "marks"), [(20, 0.5, "ok"), (19, 0.5, "warning"), (20, 0.02, "warning")]
+)
 def test_check_counts_reversals_and_compares_the_noise_with_the_range(turns, amplitude, marks):
     """A sine that reverses so often, its angle read with 6 mrad: below a tenth of a range of 1 rad, not of .04 rad."""
     t = 0.02 * np.arange(1000)

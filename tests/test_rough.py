@@ -379,5 +379,5 @@ def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
 
     assert error(spoilt) < 1.3 * error(train)
     rows = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
-    assert [f.mark for f in rows] == ["look", "look"]
+    assert [f.mark for f in rows] == ["warning", "warning"]
     assert "x: spike: " in rows[0].text

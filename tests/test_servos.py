@@ -22,7 +22,7 @@ from nnap_em.em.servos import build_servos
 from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
-from nnap_em.identifiability.check import BAD, LOOK, OK, check
+from nnap_em.identifiability.check import ERROR, OK, WARNING, check
 from nnap_em.identifiability.identifiability import identifiability, sentences
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
@@ -336,9 +336,9 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("line", "mark", "said"),
     [
-        ("limit = 0.2", BAD, "the limit is too low; write a higher one"),
+        ("limit = 0.2", ERROR, "the limit is too low; write a higher one"),
         ("limit = 30.0", OK, "a position servo, limited to 30 N m"),
-        ("delay = 1.0", LOOK, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
+        ("delay = 1.0", WARNING, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
     ],
 )
 def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, mark, said):
@@ -356,7 +356,7 @@ def test_check_says_that_a_gain_is_too_stiff_for_the_samples(tmp_path):
     t = 0.01 * np.arange(200)
     y = 1.2 * np.sin(6.0 * t)[None, :, None]
     train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
-    remarks = [each.text for each in check(rig, train, None, key=jax.random.key(0)) if each.mark == BAD]
+    remarks = [each.text for each in check(rig, train, None, key=jax.random.key(0)) if each.mark == ERROR]
     assert any(re.search("stiffest servo would need .* integration steps of a sample, and gets 64", x) for x in remarks)
 
 

@@ -4,17 +4,18 @@ import argparse
 
 import jax
 
-from ..identifiability.check import BAD, check
+from ..identifiability.check import ERROR, check
+from ..numerics.digits import counted
 from ..storage.log import Log
 from .common import read_bench
 
 
 def run(args: argparse.Namespace, log: Log) -> int:
-    """A line per question; 1 where they cannot."""
+    """A line per subject; 1 where one has an error."""
     bench = read_bench(args.folder, args.trust_readings)
     results = check(*bench, key=jax.random.key(0))
     for finding in results:
-        print(f"{finding.mark:4}  {finding.subject:8}  {bench.rig.named(finding.text)}")
-    bad = sum(finding.mark == BAD for finding in results)
-    log(f"bad answers: {bad} of {len(results)}" if bad else "the logs allow a fit")
-    return int(bad > 0)
+        print(f"{finding.mark:7}  {finding.subject:10}  {bench.rig.named(finding.text)}")
+    errors = sum(finding.mark == ERROR for finding in results)
+    log(counted(errors, "error") if errors else "the logs allow a fit")
+    return int(errors > 0)

@@ -68,9 +68,9 @@ _CHECK = """\
 example:
   nnap-em check bench
 
-One line per question: ok, look (it may do, but look at it) or bad (a fit would be in vain).  Length, missing samples,
+One line per subject: ok, warning (a fit may do) or error (a fit would be in vain).  Length, missing samples,
 sampling rate, noise, torques, the velocities that each joint visits, and whether the whole state can be observed.
-Nothing is fitted and nothing is written.  Exit status 1 where something is bad.
+Nothing is fitted and nothing is written.  Exit status 1 where one has an error.
 """
 _IDENTIFY = """\
 examples:
@@ -271,7 +271,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command: 0 is done, 1 a check that found something bad, 2 refused with one line on stderr, 130 Ctrl-C."""
+    """Run one command: 0 is done, 1 a check with an error, 2 refused with one line on stderr, 130 Ctrl-C."""
     arguments = parser()
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":

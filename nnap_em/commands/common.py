@@ -25,7 +25,7 @@ from ..em.loop import FitError
 from ..fit.identify import Identified
 from ..fit.predict import GIVEN
 from ..fit.store import fingerprint
-from ..identifiability.check import BAD, torques
+from ..identifiability.check import ERROR, torques
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
@@ -128,7 +128,7 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
     rig, data = bench.rig, bench.train.data
     system = build_system(rig)
     for finding in torques(rig, system, data, measure_scales(rig, system, data)):
-        if finding.mark == BAD:
+        if finding.mark == ERROR:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
         elif finding.subject in ("scale", "range"):
             warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)

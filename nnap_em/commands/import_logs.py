@@ -37,7 +37,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         document = describe(logs, files, rig, plan, shifts, seconds=time.perf_counter() - began)
         write_page(part, document)
     for line in document["look"]:
-        log(f"look at this: {line}")
+        log(f"warning: {line}")
     test = sum(file.startswith("test/") for file in files)
     amount = f"{len(files) - test} training and {counted(test, 'test sequence')}"
     log(f"wrote {amount} to {args.out}; read {args.out / 'import.html'}")

@@ -1,4 +1,4 @@
-"""Test of whether logs can identify what is declared, before EM: one line per subject, ok, look or bad."""
+"""Test of whether logs can identify what is declared, before EM: one line per subject, ok, warning or error."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
 from .stops import at_stops
 
-OK, LOOK, BAD = "ok", "look", "bad"
+OK, WARNING, ERROR = "ok", "warning", "error"
 SEQUENCES, SECONDS = 6, 1.0
 """Number and length of the sequences smoothed with the first model: a wrong one loses a hidden joint later on."""
 POSES = 256
@@ -42,7 +42,7 @@ class CheckResult(NamedTuple):
     """Result of one check of a data set, in plain words."""
 
     mark: str
-    """`ok`, `look` (it may do, but look at it) or `bad` (a fit would be in vain)."""
+    """`ok`, `warning` (a fit may do) or `error` (a fit would be in vain)."""
     subject: str
     text: str
 
@@ -63,12 +63,12 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     """Results of all checks of a data set, or what is missing where there is too little of it; nothing is fitted."""
     data = Dataset(*(np.asarray(part) for part in train.data))
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
-    if amount[0].mark == BAD:
+    if amount[0].mark == ERROR:
         return amount
     try:
         problem = begin(rig, data, key=key)
     except RigError:
-        return [CheckResult(BAD, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
+        return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
     if stiff := list(_stiff(rig, system, data)):
         return [*amount, *stiff]
@@ -98,7 +98,7 @@ def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tu
 
 
 def _mark(warning: object, bad: object = False) -> str:
-    return BAD if bad else LOOK if warning else OK
+    return ERROR if bad else WARNING if warning else OK
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
@@ -111,7 +111,7 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     amount = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
     yield CheckResult(mark, "length", "; ".join(filter(None, (amount, shortage or little, short, long))))
     if test is None:
-        yield CheckResult(LOOK, "test", "no test sequences: no prediction error will be reported")
+        yield CheckResult(WARNING, "test", "no test sequences: no prediction error will be reported")
     else:
         yield CheckResult(OK, "test", f"{counted(len(test.files), 'test sequence')}, none of them in train")
 
@@ -194,9 +194,9 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
         yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
     for text in at_stops(rig, data):
-        yield CheckResult(LOOK, "range", text)
+        yield CheckResult(WARNING, "range", text)
     for text in sentences(identifiability(rig, system, servos)):
-        yield CheckResult(LOOK, "untold", text)
+        yield CheckResult(WARNING, "parameters", text)
     kept = not_identifiable(rig, system, data)
     if kept:
         values = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
@@ -233,7 +233,7 @@ def drives(
         yield CheckResult(_mark(low or limit < whole or late, limit < 0.5 * weight), "servo", text)
         if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
             yield CheckResult(
-                LOOK, "servo", f"{name}: its command never changes, so that it shows no gain and no delay"
+                WARNING, "servo", f"{name}: its command never changes, so that it shows no gain and no delay"
             )
 
 
@@ -242,7 +242,7 @@ def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckRes
     steps = steps_of_sample(system, build_servos(rig), data, rig.dt)
     if steps > MOST_STEPS:
         text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
-        yield CheckResult(BAD, "servo", f"{text}: look at the units of its gains, or sample faster")
+        yield CheckResult(ERROR, "servo", f"{text}: look at the units of its gains, or sample faster")
 
 
 def _loads_along(
@@ -283,7 +283,7 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         noise = rig.noise_std.get(name, 0.0) if name in rig.measured else 0.0
         if top <= 3 * noise or top < 1e-9:
             yield CheckResult(
-                BAD, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
+                ERROR, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
             )
             continue
         near_rest = float(np.mean(np.abs(inner) < 0.05 * top))
@@ -370,7 +370,7 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
             grams += [gram] if np.isfinite(gram).all() else []
     if not grams:
         yield CheckResult(
-            BAD, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
+            ERROR, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
         )
         return
     values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)

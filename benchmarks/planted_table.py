@@ -305,9 +305,12 @@ def table(records: Sequence[Entry]) -> str:
             f"\nAs recorded: {len(as_recorded)} rigs, something reported on {reported}, the .5 s test error raised"
         )
         lines.append(f"by more than 2 % on {raised}.")
-    true, hits, false = (sum(s.touches[i] for s in scores.values()) for i in range(3))
-    span = sum(r["log_seconds"] for r in records)
-    lines += ["", f"Touches: {hits} of {true} found, {false} false ones in {span:.0f} s of training recordings.", ""]
+    true, hits = (sum(s.touches[i] for s in scores.values()) for i in range(2))
+    lines += ["", f"External disturbances: {hits} of {true} known ones found; beside them", ""]
+    for state, kept in (("as recorded", as_recorded), ("with planted effects", planted)):
+        span = sum(r["log_seconds"] for r in records if scores[r["case"]] in kept)
+        lines.append(f"- {state}: {sum(s.touches[2] for s in kept)} in {span:.0f} s of training recordings")
+    lines.append("")
     lines += _head(CASE_COLUMNS)
     for record in sorted(records, key=lambda r: (r["truth"]["strength"] == "none", r["case"])):
         lines.append(_line(record, scores[record["case"]]))

@@ -108,8 +108,8 @@ def test_report_and_page_name_the_file(tmp_path):
     expected = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
     assert read == expected
     text = page({"effects": [], "interventions": [entry]})
-    assert all(word in text for word in ("Touches from outside", "train/b.csv", "−0.60 ± 0.10 N m"))
-    assert "Touches from outside" not in page({"effects": [], "interventions": []})
+    assert all(word in text for word in ("External disturbances", "train/b.csv", "−0.60 ± 0.10 N m"))
+    assert "External disturbances" not in page({"effects": [], "interventions": []})
 
 
 def test_the_shared_rig_declares_what_a_touch_needs(shared):

@@ -107,6 +107,13 @@ def test_what_a_key_cannot_tell_is_not_kept(cache):
     assert not _kept(cache)
 
 
+def test_what_is_not_kept_takes_its_arguments_anew(cache):
+    """Other numbers of the same shapes are not answered with the result of the first."""
+    for factor in (2.0, 3.0):
+        product = parallel.each(_own, jnp.asarray(factor), jnp.arange(3.0))
+        np.testing.assert_array_equal(product, factor * np.arange(3.0))
+
+
 def _called_back(common, one):
     return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), one.dtype), one, vmap_method="sequential")
 

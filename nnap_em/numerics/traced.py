@@ -40,10 +40,10 @@ class Cache(Protocol):
 
 
 class _Programs:
-    """The cache in use, and the programs made ready in this process."""
+    """The cache in use, and the programs made ready in this process; None for one that cannot be kept."""
 
     cache: ClassVar[Cache | None] = None
-    ready: ClassVar[dict[Any, Callable]] = {}
+    ready: ClassVar[dict[Any, Callable | None]] = {}
 
 
 def use_cache(cache: Cache | None) -> None:
@@ -61,8 +61,9 @@ def traced(run: Callable, function: Callable) -> Callable:
             return plain(*arguments)
         known = function, structure, tuple(_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
         if known not in _Programs.ready:
-            _Programs.ready[known] = _ready(run, function, arguments, _Programs.cache) or (lambda *_: plain(*arguments))
-        return _Programs.ready[known](*(leaf for leaf in leaves if eqx.is_array(leaf)))
+            _Programs.ready[known] = _ready(run, function, arguments, _Programs.cache)
+        program = _Programs.ready[known]
+        return plain(*arguments) if program is None else program(*(leaf for leaf in leaves if eqx.is_array(leaf)))
 
     return call
 

@@ -435,7 +435,7 @@ MUTANTS = (
         "loud recordings decide alone",
         "prediction_error/multistep.py",
         "np.sqrt(whole * single)",
-        "np.sqrt(whole * whole)",
+        "np.sqrt(whole * whole + 0 * single)",
         "test_forks.py::test_a_loud_recording_counts_by_the_root_of_its_loudness",
     ),
     Mutant(

@@ -667,7 +667,7 @@ MUTANTS = (
         "design/play.py",
         "return inside & below & above",
         "return np.ones_like(inside)",
-        "test_design.py::test_no_motion_of_a_design_leaves_what_the_logs_visited",
+        "test_design.py::test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread",
     ),
     Mutant(
         "covariance after an experiment transposed",

@@ -22,7 +22,7 @@ from nnap_em.design.criteria import Discrimination, Friction, Information, Sever
 from nnap_em.design.experiment import design_experiment
 from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
 from nnap_em.design.limits import DesignError, Limits, limits_of
-from nnap_em.design.play import motions
+from nnap_em.design.play import Motions, allowed, motions
 from nnap_em.design.rivals import Law, open_pairs, rivals
 from nnap_em.design.search import Effort
 from nnap_em.design.signals import FAMILIES, drawn, mutated, played
@@ -220,6 +220,18 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     assert not np.array_equal(
         design.u, design_experiment(fitted, data, key=jax.random.key(3), seconds=4.0, sequences=3, effort=SMALL).u
     )
+
+
+def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread():
+    """Limits 0 and 10, two paths each: well inside; beyond one end; beyond the other; inside by less than its spread."""
+    lowest = np.array([[4.0, 4.2], [-0.1, 4.0], [4.0, 4.2], [4.0, 4.2]])[..., None]
+    highest = np.array([[6.0, 6.2], [6.0, 6.2], [6.0, 10.1], [5.0, 9.0]])[..., None]
+    zero, ten = np.zeros(1), np.full(1, 10.0)
+    limits = Limits(zero, ten, ten, zero, ten, zero, ten)
+    trials = Motions(jnp.asarray(lowest), jnp.asarray(highest), jnp.zeros((4, 1, 1, 1)))
+    np.testing.assert_array_equal(allowed(trials, limits), [True, False, False, False])
+    lost = trials._replace(highest=trials.highest.at[0, 0].set(jnp.nan))
+    assert not allowed(lost, limits)[0]
 
 
 def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says_it(slide):

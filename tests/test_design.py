@@ -223,7 +223,7 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
 
 
 def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread():
-    """Limits 0 and 10, two paths each: well inside; beyond one end; beyond the other; inside by less than its spread."""
+    """Limits 0 and 10, two paths each: well inside, beyond either end, and inside by less than their spread."""
     lowest = np.array([[4.0, 4.2], [-0.1, 4.0], [4.0, 4.2], [4.0, 4.2]])[..., None]
     highest = np.array([[6.0, 6.2], [6.0, 6.2], [6.0, 10.1], [5.0, 9.0]])[..., None]
     zero, ten = np.zeros(1), np.full(1, 10.0)

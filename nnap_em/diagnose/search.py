@@ -16,6 +16,7 @@ from ..data.rig import Rig
 from ..em.loop import EMState, FitError
 from ..fit.identify import Identified, finished, identify
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import counted
 from ..numerics.programs import release_programs
 from ..prediction_error.noise import white_readings
 from ..residual.innovations import white_innovations
@@ -278,7 +279,7 @@ def close_the_loop(
         return _branching(search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True))
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
-        log(f"{len(disturbances)} external disturbances: their rows are left out")
+        log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
     closed = search(SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), white=False)
     return _branching(closed._replace(interventions=disturbances, pieces=pieces))
 

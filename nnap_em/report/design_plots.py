@@ -25,7 +25,7 @@ def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
         for side, (colour, label) in sides.items():
             ax.plot(entry["velocity"], entry[side], color=colour, label=label)
         ax.set_xscale("symlog", linthresh=entry["near_rest_below"])
-        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) > 1.5 * entry["near_rest_below"]])
+        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= entry["near_rest_below"]])
         ax.set_yscale("log")
         ax.axvspan(
             -entry["near_rest_below"], entry["near_rest_below"], color="#F1F1F1", lw=0, zorder=0, label="near rest"

@@ -142,7 +142,7 @@ def test_the_gradient_passes_missing_readings():
     assert grad.tolist() == [6.0, 0.0]
 
 
-_values = st.floats(allow_infinity=False, width=64)
+_values = st.floats(allow_infinity=False, allow_subnormal=False)
 
 
 @settings(deadline=None)  # it writes files

@@ -71,7 +71,7 @@ def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
     np.testing.assert_allclose(logs.data.y[0].T, [columns["theta1"], columns["dtheta1"]], rtol=1e-11)
 
 
-_values = st.floats(allow_infinity=False, width=64)
+_values = st.floats(allow_infinity=False, allow_subnormal=False)
 
 
 @pytest.mark.parametrize("suffix, write", [WRITERS["parquet"], WRITERS["mat"]], ids=["parquet", "mat"])

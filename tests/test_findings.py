@@ -101,7 +101,7 @@ def _law(name: str) -> AbstractEffect:
 
 
 def test_a_fit_says_what_it_was_fitted_to():
-    """Of a machine whose numbers are all trusted and without friction, the noise; sequences that diverged are apart."""
+    """A frictionless machine with trusted numbers has its noise estimated; the verdict counts the sequences used."""
     rig = dataclasses.replace(SLIDE, friction=False)
     fitted = begin(rig, _data(rig), key=jax.random.key(0))
     assert identification._verdict(fitted, 4, 1) == "Fitted the noise to 3 of 4 sequences in 0 epochs."

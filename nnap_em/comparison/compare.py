@@ -157,8 +157,8 @@ class Comparison(NamedTuple):
             changed += [f"the {curve.name}{parts}"] * curve.changed
         changed += [number.name for number in self.numbers if number.changed]
         unchanged = tests - len(changed)
-        others = f"{counted(unchanged, 'other quantity', 'other quantities')} did not"
-        others = others if unchanged else "no other quantity was tested"
+        others = counted(unchanged, "other quantity", "other quantities")
+        others = f"{others} did not" if unchanged else "no other quantity was tested"
         text = f"{listed(changed)} changed {between}; {others}."
         return text[0].upper() + text[1:]
 

@@ -14,7 +14,7 @@ from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..fit.identify import friction_table
-from ..numerics.digits import number, with_std
+from ..numerics.digits import finite, number, with_std
 from ..systems import AbstractSystem
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
@@ -148,17 +148,12 @@ def verdict(
     text = f"The model lacks {names}"
     if not error:
         return text + "."
-    at, horizon = error["horizons_s"].index(1.0), f"{min(1.0, error.get('reach_s', 1.0)):.3g} s"
-    ratios = [
-        (c, error["before"][c][at], error["after"][c][at])
-        for c in error["before"]
-        if error["after"][c][at] and math.isfinite(error["before"][c][at])
-    ]
-    if not ratios:
+    grows = growth(error)
+    if not grows:
         return text + "."
-    growth = {c: math.log(max(a, 1e-300) / max(b, 1e-300)) for c, b, a in ratios}
-    ratios.sort(key=lambda entry: growth[entry[0]])
-    if sum(growth.values()) >= 0:
+    at, horizon = error["horizons_s"].index(1.0), f"{min(1.0, error.get('reach_s', 1.0)):.3g} s"
+    ratios = [(c, error["before"][c][at], error["after"][c][at]) for c in sorted(grows, key=grows.__getitem__)]
+    if sum(grows.values()) >= 0:
         column, before, after = ratios[-1]
         return (
             f"The training data support {names}, but on test data the {horizon} prediction error of {column} does not "
@@ -168,6 +163,16 @@ def verdict(
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     falls = f"the {horizon} prediction error of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
+
+
+def growth(error: Mapping[str, Any]) -> dict[str, float]:
+    """Log of the test error 1 s ahead with the accepted effects over that without, by column; known ones alone."""
+    if 1.0 not in (error.get("horizons_s") or []):
+        return {}
+    at, before, after = error["horizons_s"].index(1.0), error["before"], error["after"]
+    pairs = {column: (before[column][at], after[column][at]) for column in before if column in after}
+    known = {column: pair for column, pair in pairs.items() if all(map(finite, pair))}
+    return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in known.items()}
 
 
 def _sized(finding: Finding) -> str:

@@ -6,7 +6,6 @@
 import base64
 import io
 import itertools
-import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
+from ..diagnose.findings import growth
 from ..numerics.digits import finite, number
 from ..residual.statistics import LEVEL
 from . import wording
@@ -194,15 +194,9 @@ def _fails(test: Mapping[str, Any]) -> bool:
 
 
 def _doubted(document: Mapping[str, Any]) -> bool:
-    """True where the accepted effects lower no test error at 1 s, in the geometric mean over all columns."""
-    error = document.get("error") or {}
-    horizons = error.get("horizons_s") or []
-    if 1.0 not in horizons or not document.get("effects"):
-        return False
-    at = horizons.index(1.0)
-    pairs = [(error["before"][c][at], error["after"][c][at]) for c in error["before"] if c in error["after"]]
-    growth = [math.log(max(a, 1e-300) / max(b, 1e-300)) for b, a in pairs if finite(b) and finite(a)]
-    return bool(growth) and sum(growth) >= 0
+    """True where the test error 1 s ahead does not fall with the accepted effects, in the geometric mean of columns."""
+    grows = growth(document.get("error") or {}) if document.get("effects") else {}
+    return bool(grows) and sum(grows.values()) >= 0
 
 
 def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:

@@ -14,6 +14,7 @@ from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, start_
 from ..em.mstep import kept
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import counted
 from ..prediction_error.multistep import JUDGED, errors, followed, ratio
 from ..storage.log import Log
 from .hypothesis import Hypothesis
@@ -136,7 +137,8 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
     if context.loss.predicts:
         state = _predicting(context, hypothesis, state)
     reached = np.nanmean(state.top)
-    context.log(f"  fitted over the whole length in {state.epoch - 1} epochs: {reached:.1f} nat per sequence")
+    epochs = counted(state.epoch - 1, "epoch")
+    context.log(f"  fitted over the whole length in {epochs}: log-likelihood {reached:.1f} nat per sequence")
     return state
 
 
@@ -158,7 +160,7 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> EMState | None:
         own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)
         if ahead(state.top, np.asarray(own.loglik)) <= 0:
             return None
-        context.log("  friction as declared is the likelier start over the first horizon, and is fitted from")
+        context.log("  friction as declared is the likelier start over the first horizon: the fit begins there")
         return fit(state, context.data, before.smoother, fresh.m_step)
     except FitError:
         return None

@@ -263,7 +263,7 @@ def _quantiles(ax: Axes, errors: _Errors) -> None:
         p = np.unique(np.concatenate([p, 1 - p]))
         expected, got = scipy.stats.norm.ppf(p), np.quantile(x, p)
         dotted(ax, expected, got, colour, label)
-        most = max(most, float(np.max(np.abs(got[np.abs(expected) < 3.2]))))
+        most = max(most, float(np.max(np.abs(got))))
     ax.plot([-4, 4], [-4, 4], color=ZERO, lw=0.9, ls=(0, (4, 2)), label="a right model", zorder=0)
     most = min(most, 12.0) * 1.05
     ax.set(xlim=(-4, 4), ylim=(-most, most))

@@ -29,7 +29,7 @@ MEANINGS = {
     "eddy_brake": "A brake that works at some angles, as by a magnet.",
     "joint_flexibility": "The transmission between motor and joint gives elastically.",
     "motor_back_emf": "The torque of the motor falls with its speed.",
-    "unknown_function": "A force that no effect of the catalogue has, as a function of these signals.",
+    "unknown_function": "A force as a function of these signals, outside the vocabulary of effects.",
 }
 WORDS = {
     "torsional_spring": {"k": "stiffness", "theta0": "rest position"},

@@ -229,17 +229,23 @@ def test_the_feed_forward_torque_gives_its_acceleration(tmp_path):
     np.testing.assert_allclose(model.rate(a([*q, *v]), u, jnp.zeros(2))[2:4], wanted, rtol=1e-9)
 
 
+@pytest.mark.parametrize("servo", ["", 'kind = "voltage"\nk = 0.3\nR = 2.0', 'kind = "position"\nkp = 9.0'])
 @pytest.mark.parametrize("file", ["branch.xml", "arm.urdf"])
-def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file):
+def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file, servo):
     path = Path(__file__).parent / "machines" / file
     machine = read_machine(path)
     (tmp_path / file).write_text(path.read_text())
     text = RIG.replace("two.xml", file).replace('["rail", "pole"]', f'["{machine.joints[0].name}"]')
-    (tmp_path / "rig.toml").write_text(text.replace('columns = ["push", "turn"]', 'columns = ["u"]\njoints = [1]'))
+    inputs = f'columns = ["u"]\njoints = [1]\n{servo}'
+    (tmp_path / "rig.toml").write_text(text.replace('columns = ["push", "turn"]', inputs))
     rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
     logs = Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
     fitted = begin(rig, logs, key=jax.random.key(0))
-    write_urdf(fitted, tmp_path / "out.urdf")
+    named = [line for line in write_urdf(fitted, tmp_path / "out.urdf") if "servo of u" in line]
+    assert len(named) == bool(servo)
+    if servo:
+        with pytest.raises(ExportError, match="for; write --urdf or --c instead"):
+            write_mjcf(fitted, tmp_path / "out.xml")
     again, model = read_machine(tmp_path / "out.urdf"), mujoco.MjModel.from_xml_path(str(tmp_path / "out.urdf"))
     rubs = [[(joint.damping, joint.dry) for joint in one.joints] for one in (machine, again)]
     np.testing.assert_allclose(*rubs, atol=1e-9)

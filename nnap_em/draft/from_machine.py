@@ -12,7 +12,10 @@ from ..data.dataset import DataError
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
 from ..data.rig import SystemSpec, toml_text
 from ..data.servo import TORQUE
+from ..machines.locked import Part
 from ..machines.mjcf import read_machine
+from ..machines.source import parse
+from ..machines.urdf import stuck
 from ..recordings.files import reader
 from ..recordings.recording import Address, Topic
 from .from_log import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
@@ -24,8 +27,10 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
 
     Raises DataError where the log cannot be read or no joint of the machine is in it, MachineError for `model`.
     """
-    machine = read_machine(model)
     topics = reader(path).topics(path)
+    words = {word for _, field in _fields(topics) for word in re.split(r"[][]", field)}
+    held = stuck(parse(model), words)
+    machine = read_machine(model, Part(locked=held))
     columns, inputs = _joints(machine, topics), _inputs(machine, topics)
     if not columns:
         names = ", ".join(joint.name for joint in machine.joints)
@@ -38,7 +43,7 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
     everything = columns | {column: at for column, (at, _) in inputs.items()}
     table = _table(path, everything)
     lines = [
-        *_model(machine, os.path.relpath(model, home)),
+        *_model(machine, os.path.relpath(model, home), held),
         *_driven(machine, {column: joint for column, (_, joint) in inputs.items()}),
         *sampling(table, [meaning("time")] if "time" in table else []),
         *measurement(table, named, spec, lambda name: machine_unit(text, name)),
@@ -139,8 +144,11 @@ def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.nda
     return ({} if time is None else {"time": time}) | {name: table[at.path] for name, at in columns.items()}
 
 
-def _model(machine: Machine, file: str) -> Iterator[str]:
+def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[str]:
     yield from ("[model]", 'type = "mjcf"', f"file = {toml_text(file)}    # MJCF or URDF")
+    if held:
+        values = ", ".join(f"{toml_text(name)} = {value:g}" for name, value in held.items())
+        yield f"locked = {{ {values} }}    # rad or m; held, as they move no mass or follow another"
     yield 'friction = "unknown"    # learned in every joint; "none": damping and frictionloss of the file'
     yield from (
         "",
@@ -151,7 +159,10 @@ def _model(machine: Machine, file: str) -> Iterator[str]:
             yield f"# {body.name}.mass = {{ std = {0.1 * body.mass:.2g} }}    # kg; {body.mass:.4g} in the file"
     for joint in machine.joints:
         unit = "kg" if joint.slide else "kg m^2"
-        size = f"{joint.armature:.4g} in the file" if joint.armature else "0 in the file: inertia of the rotor, geared"
+        geared = "geared" if joint.reduction == 1 else f"times {joint.reduction:g}^2"
+        size = (
+            f"{joint.armature:.4g} in the file" if joint.armature else f"0 in the file: inertia of the rotor, {geared}"
+        )
         yield f"# {joint.name}.armature = {{ std = {joint.armature or 0.01:.2g} }}    # {unit}; {size}"
 
 

@@ -1,6 +1,7 @@
 """A part of a machine: joints that are held at a value, their bodies joined to those that carry them."""
 
 from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,43 @@ from ..data.machine import Body, Joint, Machine, Rotation, Vector
 
 NOTHING = 1e-13
 """Mass [kg] and inertia [kg m^2] that count as none: a hundred times the least that MuJoCo's compiler accepts."""
+
+
+class Part(NamedTuple):
+    """The joints of a file that move, and the values at which others are held."""
+
+    joints: tuple[str, ...] | None = None
+    """The joints that move; none given: all that are not held."""
+    locked: Mapping[str, float] = MappingProxyType({})
+    """Values of joints that are held [rad or m]."""
+
+    @property
+    def whole(self) -> bool:
+        """True where every joint of the file moves."""
+        return self.joints is None and not self.locked
+
+    def holds(self, joint: str) -> bool:
+        """True for a joint that is held, at a value or where the file has it."""
+        return joint in self.locked or (self.joints is not None and joint not in self.joints)
+
+
+def holding(*joints: str) -> str:
+    """The line of rig.toml that holds joints."""
+    return f"[model] locked = {{ {', '.join(f'{joint} = 0.0' for joint in joints)} }}"
+
+
+class Follows(NamedTuple):
+    """The joint that another follows, and the coefficients of the polynomial by which it does."""
+
+    joint: str
+    law: tuple[float, ...]
+    zero: float = 0.0
+    """Coordinate of the follower at which the polynomial counts from 0, and that of the leader."""
+    of: float = 0.0
+
+    def value(self, leader: float) -> float:
+        """Coordinate of the follower."""
+        return self.zero + sum(c * (leader - self.of) ** k for k, c in enumerate(self.law))
 
 
 class Pose(NamedTuple):

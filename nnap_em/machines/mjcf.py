@@ -5,39 +5,18 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any
 
 import numpy as np
 
 from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site
-from ..data.rig import RigError, RigWarning, nearest
+from ..data.rig import RigWarning, nearest
 from ..data.servo import TORQUE
-from .locked import NOTHING, groups, lock, matrix, vector
+from .locked import NOTHING, Follows, Part, groups, holding, lock, matrix, vector
+from .source import MachineError, in_own_lines, included, parse, refuse, text
+from .urdf import Gear, bare, mimics, refuse_urdf, transmissions
 
 _FREE, _BALL, _SLIDE, _HINGE = range(4)
-
-
-class MachineError(RigError):
-    """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
-
-
-class Part(NamedTuple):
-    """The joints of a file that move, and the values at which others are held."""
-
-    joints: tuple[str, ...] | None = None
-    """The joints that move; none given: all that are not held."""
-    locked: Mapping[str, float] = MappingProxyType({})
-    """Values of joints that are held [rad or m]."""
-
-    @property
-    def whole(self) -> bool:
-        """True where every joint of the file moves."""
-        return self.joints is None and not self.locked
-
-    def holds(self, joint: str) -> bool:
-        """True for a joint that is held, at a value or where the file has it."""
-        return joint in self.locked or (self.joints is not None and joint not in self.joints)
 
 
 _WHOLE = Part()
@@ -49,14 +28,15 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
     Joints that are held without a value stand where the file has them, or where the joint that they follow puts them.
     Raises MachineError at what has no place in a model of a tree with a fixed base.
     """
-    root = _parse(path)
-    follows = _mimics(root) if root.tag == "robot" else {}
+    root = parse(path)
+    follows = mimics(root)
+    gears = transmissions(path, root) if root.tag == "robot" else {}
     model = _compiled(path, root, part)
     _refuse_unknown(path, model, part)
     _refuse_all(path, model, part)
     bodies = _bodies(model)
     numbers = [j for j in range(model.njnt) if int(model.jnt_type[j]) in (_SLIDE, _HINGE)]
-    joints = tuple(_joint(model, j) for j in numbers)
+    joints = tuple(_joint(model, j, gears) for j in numbers)
     driven = [motor for motor in _motors(model, part) if motor.joint in numbers]
     machine = Machine(
         file=path.name,
@@ -83,9 +63,7 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
     return machine
 
 
-def _part(
-    path: Path, machine: Machine, part: Part, follows: Mapping[str, "Follows"], joined: Collection[int]
-) -> Machine:
+def _part(path: Path, machine: Machine, part: Part, follows: Mapping[str, Follows], joined: Collection[int]) -> Machine:
     """The machine with its other joints held; warns of bodies without mass that join another."""
     values = {joint.name: part.locked.get(joint.name, joint.zero) for joint in machine.joints if part.holds(joint.name)}
     for _ in follows:  # a joint may follow one that follows another
@@ -103,14 +81,9 @@ def _part(
         group_bodies = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
         if sum(body.mass for body in group_bodies) <= NOTHING:
             joint = next(joint.name for joint in machine.joints if joint.body == i)
-            hint = f"give it an <inertial>, or hold its joint: {_line(joint)}"
+            hint = f"give it an <inertial>, or hold its joint: {holding(joint)}"
             refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", hint)
     return machine
-
-
-def _line(*joints: str) -> str:
-    """The line of rig.toml that holds joints."""
-    return f"[model] locked = {{ {', '.join(f'{joint} = 0.0' for joint in joints)} }}"
 
 
 def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
@@ -123,11 +96,6 @@ def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
     for j, name in enumerate(names):
         if name in part.locked and int(model.jnt_type[j]) not in (_SLIDE, _HINGE):
             refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
-
-
-def refuse(path: Path, problem: str, hint: str) -> NoReturn:
-    """Raise MachineError."""
-    raise MachineError(f"{path}: {problem}; {hint}")
 
 
 def _mujoco() -> Any:
@@ -144,19 +112,6 @@ def _flag(name: str) -> int:
     return int(getattr(_mujoco().mjtDisableBit, name))
 
 
-def _parse(path: Path) -> ET.Element:
-    """The root of the file, by which MJCF and URDF are distinguished."""
-    try:
-        root = ET.parse(path).getroot()
-    except OSError as error:
-        refuse(path, f"cannot be read ({error.strerror})", "file = names an MJCF or URDF file beside rig.toml")
-    except ET.ParseError as error:
-        refuse(path, f"not XML ({error})", "give the MJCF or URDF file as it was written, whole")
-    if root.tag not in ("mujoco", "robot"):
-        refuse(path, f"its root element is <{root.tag}>", "give MJCF (<mujoco>) or URDF (<robot>); expand xacro first")
-    return root
-
-
 def _build(spec: Any, part: Part) -> Any:
     """MuJoCo's model of a file; that of a part may have bodies without mass, on joints that are held."""
     if not part.whole:
@@ -168,22 +123,27 @@ def _build(spec: Any, part: Part) -> Any:
 
 def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
     """MuJoCo's model; where only meshes or textures are missing, without the shapes of bodies that have an inertial."""
-    mujoco = _mujoco()
+    mujoco, message = _mujoco(), ""
     if root.tag == "robot":
-        _refuse_urdf(path, root, part)
-    try:
-        if root.tag == "robot":
-            return _build(mujoco.MjSpec.from_string(_bare_urdf(root)), part)
-        return _build(mujoco.MjSpec.from_file(str(path)), part)
-    except ValueError as error:
-        message = " ".join(str(error).split())
-    if root.tag == "mujoco" and re.search(r"opening file|resource|not found|reading file", message, re.I):
-        tree = _included(path, root)
-        _strip(path, tree)
+        refuse_urdf(path, root, part)
+        root = bare(root)
+    else:
         try:
-            return _build(mujoco.MjSpec.from_string(ET.tostring(tree, encoding="unicode")), part)
+            return _build(mujoco.MjSpec.from_file(str(path)), part)
         except ValueError as error:
             message = " ".join(str(error).split())
+        root = included(path, root)
+    missing = re.search(r"opening file|resource|not found|reading file", message, re.I)
+    if missing:
+        _strip(path, root)
+    try:
+        model = _build(mujoco.MjSpec.from_string(text(root)), part)
+        if missing or not message:
+            return model
+    except ValueError as error:
+        again = " ".join(str(error).split())
+        if missing or not message or re.sub(r"line \d+", "", again) == re.sub(r"line \d+", "", message):
+            message = in_own_lines(again, root)  # MuJoCo counts no lines of included files
     refuse(path, f"MuJoCo's compiler refuses it: {message}", _hint(message))
 
 
@@ -201,33 +161,6 @@ def _hint(message: str) -> str:
     return next(matching, "correct the file; MuJoCo's viewer shows the same error")
 
 
-# --- files whose meshes are elsewhere
-
-
-class Follows(NamedTuple):
-    """The joint that another follows, and the coefficients of the polynomial by which it does."""
-
-    joint: str
-    law: tuple[float, ...]
-    zero: float = 0.0
-    """Coordinate of the follower at which the polynomial counts from 0, and that of the leader."""
-    of: float = 0.0
-
-    def value(self, leader: float) -> float:
-        """Coordinate of the follower."""
-        return self.zero + sum(c * (leader - self.of) ** k for k, c in enumerate(self.law))
-
-
-def _mimics(root: ET.Element) -> dict[str, Follows]:
-    """The joints of a URDF file that mimic another."""
-    out = {}
-    for joint in root.findall("joint"):
-        if (mimic := joint.find("mimic")) is not None:
-            law = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
-            out[str(joint.get("name"))] = Follows(str(mimic.get("joint")), law)
-    return out
-
-
 def _couplings(model: Any) -> dict[str, Follows]:
     """The joints of an MJCF file that an equality constraint couples to another."""
     kind, out = int(_mujoco().mjtEq.mjEQ_JOINT), {}
@@ -238,87 +171,6 @@ def _couplings(model: Any) -> dict[str, Follows]:
             law = tuple(float(c) for c in model.eq_data[i][:5])
             out[model.joint(first).name] = Follows(model.joint(second).name, law, *zeros)
     return out
-
-
-def _refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
-    """Refusals where the message of MuJoCo is unclear, or where it has none."""
-    links = {str(link.get("name")): link for link in root.findall("link")}
-    parents: dict[str, str] = {}
-    for joint in root.findall("joint"):
-        name, kind = joint.get("name"), joint.get("type")
-        parent, child = (_link(joint, end) for end in ("parent", "child"))
-        for end in (parent, child):
-            if end not in links:
-                refuse(path, f"joint {name!r} names a link {end!r} that is not there", "add it, or correct its name")
-        if child in parents:
-            refuse(path, f"link {child!r} hangs on two joints", "a machine here is a tree: cut the loop at one of them")
-        parents[child] = parent
-        held = part.holds(str(name))
-        if kind == "planar" or (kind == "floating" and not held):
-            refuse(path, f"joint {name!r} is {kind}", "fix the base, or model the joint as slides and hinges")
-        if (mimic := joint.find("mimic")) is not None:
-            leader = str(mimic.get("joint"))
-            if not (held and part.holds(leader)):
-                hint = f"free it of the other: couplings are no tree; or hold both: {_line(leader, str(name))}"
-                refuse(path, f"joint {name!r} mimics another", hint)
-            joint.remove(mimic)
-        if kind != "fixed" and not held and links[child].find("inertial") is None and not _carries(child, root):
-            hint = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
-            refuse(path, f"link {child!r} moves and has no <inertial>", hint)
-    if parents and not set(links) - set(parents):
-        refuse(path, "its links form a ring", "a machine here is a tree: one link has no parent")
-    for name in parents:
-        seen, at = {name}, name
-        while at in parents:
-            at = parents[at]
-            if at in seen:
-                refuse(path, f"link {name!r} is its own ancestor", "a machine here is a tree: cut the ring at a joint")
-            seen.add(at)
-
-
-def _link(joint: ET.Element, end: str) -> str:
-    """The link at an end of a joint."""
-    element = joint.find(end)
-    return "" if element is None else str(element.get("link"))
-
-
-def _carries(link: str, root: ET.Element) -> bool:
-    """True if a link without mass carries one that has, fixed to it."""
-    for joint in root.findall("joint"):
-        if joint.get("type") == "fixed" and _link(joint, "parent") == link:
-            name = _link(joint, "child")
-            child = next(one for one in root.findall("link") if one.get("name") == name)
-            if child.find("inertial") is not None or _carries(name, root):
-                return True
-    return False
-
-
-def _bare_urdf(root: ET.Element) -> str:
-    """Root of the file without shapes: they weigh nothing here, and their files are elsewhere."""
-    for link in root.findall("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
-            link.remove(shape)
-    return ET.tostring(root, encoding="unicode")
-
-
-def _included(path: Path, node: ET.Element) -> ET.Element:
-    """The whole file, with what it includes in its place."""
-    for child in list(node):
-        if child.tag == "include":
-            place, inner = list(node).index(child), path.parent / str(child.get("file"))
-            node.remove(child)
-            for k, part in enumerate(_included(path, _parse_part(inner))):
-                node.insert(place + k, part)
-        else:
-            _included(path, child)
-    return node
-
-
-def _parse_part(path: Path) -> ET.Element:
-    try:
-        return ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as error:
-        refuse(path, f"cannot be included ({error})", "put the included file where the main file looks for it")
 
 
 def _strip(path: Path, root: ET.Element) -> None:
@@ -377,7 +229,7 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
     if closed := list(_closed(model, held)):
         lines = list(dict.fromkeys(name for names in closed for name in names))
         hint = "a loop or coupling is no tree: take <equality> out"
-        hint += f", or hold the joints that it closes: {_line(*lines)}" if lines else ""
+        hint += f", or hold the joints that it closes: {holding(*lines)}" if lines else ""
         yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
     loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
     if loose:
@@ -513,8 +365,9 @@ def _inertia(model: Any, i: int) -> Rotation:
     return matrix(0.5 * (whole + whole.T))
 
 
-def _joint(model: Any, j: int) -> Joint:
+def _joint(model: Any, j: int, gears: Mapping[str, Gear]) -> Joint:
     dof, place = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
+    gear = gears.get(model.joint(j).name, Gear())
     return Joint(
         name=model.joint(j).name,
         body=int(model.jnt_bodyid[j]) - 1,
@@ -524,10 +377,11 @@ def _joint(model: Any, j: int) -> Joint:
         zero=float(model.qpos0[place]),
         stiffness=float(np.ravel(model.jnt_stiffness[j])[0]),
         rest=float(model.qpos_spring[place]),
-        armature=float(model.dof_armature[dof]),
+        armature=float(model.dof_armature[dof]) + gear.inertia,
         damping=float(np.ravel(model.dof_damping[dof])[0]),
         dry=float(model.dof_frictionloss[dof]),
         range=(float(model.jnt_range[j][0]), float(model.jnt_range[j][1])) if model.jnt_limited[j] else None,
+        reduction=gear.reduction,
     )
 
 

@@ -38,7 +38,9 @@ def export(fitted: Identified, out: Path) -> str:
     Raises ExportError, before anything is written, where the inputs are commands of servos.
     """
     if fitted.model.servos:
-        raise ExportError("its inputs are commands of servos, which have no exported form yet; use nnap-em predict")
+        raise ExportError(
+            "its inputs are commands of servos, which have no exported form yet; use nnap-em predict, --urdf or --c"
+        )
     try:
         code, reason = predictor(fitted), ""
     except ExportError as error:

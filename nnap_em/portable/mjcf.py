@@ -65,6 +65,10 @@ def write_model(
 ) -> list[str]:
     """`write_mjcf` for a model and friction near those of a fit."""
     system = as_it_is(fitted, model)
+    if model.servos:
+        raise ExportError(
+            "its inputs are commands of servos, which MJCF here has no form for; write --urdf or --c instead"
+        )
     content, unplaced = placed(content_of(fitted, model, system, forms), model.effects)
     content = with_dips(content)
     if alone and unplaced:
@@ -108,8 +112,6 @@ def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
     if not isinstance(system, Tree):
         reason = f"the machine {fitted.rig.system!r} is built in, and has no file to be written back to"
         raise ExportError(f'{reason}; declare it by type = "mjcf" and its file')
-    if model.servos:
-        raise ExportError("its inputs are commands of servos, which are not written yet; write --urdf or --c instead")
     true = hooks.machine(model.effects, system, jnp.zeros(()))
     assert isinstance(true, Tree)
     return true

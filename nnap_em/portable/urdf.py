@@ -9,6 +9,7 @@ import numpy as np
 from .. import __version__
 from ..data.machine import Joint
 from ..fit.identify import Identified
+from ..model.servo import Servo
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .content import Content, Drive, JointContent
@@ -30,7 +31,8 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
     content, _ = placed(content_of(fitted, fitted.model, system, forms), fitted.model.effects)
-    left = [named(effect) for effect in fitted.model.effects if effect.name not in HELD]
+    left = [_of_servo(servo) for servo in fitted.model.servos or () if servo.feeds_back]
+    left += [named(effect) for effect in fitted.model.effects if effect.name not in HELD]
     for joint, form in zip(system.machine.joints, forms, strict=True):
         form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > SHARE
         left += [f"friction of {joint.name} beside Coulomb and viscous"] if form_misses else []
@@ -48,6 +50,11 @@ def write_urdf(fitted: Identified, out: Path) -> list[str]:
     ET.indent(root)
     replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
     return left
+
+
+def _of_servo(servo: Servo) -> str:
+    numbers = ", ".join(f"{key} = {float(value):.4g}" for key, value in servo.values.items())
+    return f"the {servo.kind} servo of {servo.column}: {numbers}"
 
 
 def _base(system: Tree) -> str:

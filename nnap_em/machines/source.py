@@ -1,0 +1,110 @@
+"""The XML of a machine file: every element with its place in the user's own file, which messages name."""
+
+import re
+from pathlib import Path
+from typing import NoReturn
+from xml.etree import ElementTree as ET
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from ..data.rig import RigError
+
+XACRO = "xacro:"
+"""Prefix of what the macro language xacro replaces; so are numbers in `${...}` and `$(...)`."""
+_INERT = ("visual", "collision", "gazebo", "ros2_control")
+"""Elements of which no number is read, so that a macro in there is no obstacle."""
+
+
+class MachineError(RigError):
+    """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
+
+
+def refuse(path: Path, problem: str, hint: str, at: ET.Element | None = None) -> NoReturn:
+    """Raise MachineError; `at` is the element of the file that the problem is about."""
+    raise MachineError(f"{path}: {f'{place(at)}: ' if at is not None else ''}{problem}; {hint}")
+
+
+class _Element(ET.Element):
+    place: str = ""
+    """Line of its tag, and the file where that is an included one."""
+
+
+def place(element: ET.Element) -> str:
+    """Place of an element that `parse` or `included` has read, as "line 33"."""
+    return element.place if isinstance(element, _Element) else ""
+
+
+def parse(path: Path) -> ET.Element:
+    """The root of the file, by which MJCF and URDF are distinguished."""
+    try:
+        root = _read(path, "")
+    except OSError as error:
+        refuse(path, f"cannot be read ({error.strerror})", "file = names an MJCF or URDF file beside rig.toml")
+    except expat.ExpatError as error:
+        refuse(path, f"not XML ({error})", "give the MJCF or URDF file as it was written, whole")
+    if (macro := _macro(root)) is not None:
+        what, element = macro
+        suffix = ".xml" if root.tag == "mujoco" else ".urdf"
+        hint = f"expand it first, with xacro {path.name} > expanded{suffix}, and give that file"
+        refuse(path, f"{what} is xacro", hint, element)
+    if root.tag not in ("mujoco", "robot"):
+        refuse(path, f"its root element is <{root.tag}>", "give MJCF (<mujoco>) or URDF (<robot>)")
+    return root
+
+
+def _read(path: Path, file: str) -> _Element:
+    """The tree of a file; prefixes of names stay as they are written."""
+    builder, parser = ET.TreeBuilder(element_factory=_Element), expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        builder.start(tag, attributes).place = f"line {parser.CurrentLineNumber}{file}"  # pyright: ignore[reportAttributeAccessIssue]
+
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(path.read_bytes(), True)
+    return builder.close()  # pyright: ignore[reportReturnType]
+
+
+def _macro(element: ET.Element) -> tuple[str, ET.Element] | None:
+    """The first macro of a file that is not expanded, and its element."""
+    names = (element.tag, *element.attrib)
+    if any(name.startswith(XACRO) for name in names):
+        return f"<{next(name for name in names if name.startswith(XACRO))}>", element
+    for value in (*element.attrib.values(), element.text or ""):
+        if found := re.search(r"\$[{(].*?[})]", value):
+            return f"the value {found[0]!r}", element
+    inner = (_macro(child) for child in element if child.tag not in _INERT)
+    return next((macro for macro in inner if macro is not None), None)
+
+
+def included(path: Path, node: ET.Element) -> ET.Element:
+    """The whole file, with what it includes in its place."""
+    for child in list(node):
+        if child.tag == "include":
+            at, inner = list(node).index(child), path.parent / str(child.get("file"))
+            node.remove(child)
+            try:
+                parts = _read(inner, f" of {child.get('file')}")
+            except (OSError, expat.ExpatError) as error:
+                refuse(inner, f"cannot be included ({error})", "put the included file where the main file looks for it")
+            for k, part in enumerate(included(path, parts)):
+                node.insert(at + k, part)
+        else:
+            included(path, child)
+    return node
+
+
+def text(root: ET.Element) -> str:
+    """The elements as XML, every one beginning a line of its own."""
+    attributes = "".join(f" {name}={quoteattr(value)}" for name, value in root.attrib.items())
+    return f"<{root.tag}{attributes}>\n{''.join(map(text, root))}</{root.tag}>"
+
+
+def in_own_lines(message: str, root: ET.Element) -> str:
+    """A message of MuJoCo about `text(root)`, with places in the user's own files, by line or by name."""
+    elements = list(root.iter())
+    if found := re.search(r"\bline (\d+)", message):
+        return message.replace(found[0], place(elements[int(found[1]) - 1]))
+    named = re.search(r"Element name '([^']+)'", message)
+    places = (place(element) for element in elements if named and element.get("name") == named[1])
+    return next((message.replace(named[0], f"{named[0]}, {at}") for at in places if named), message)

@@ -348,6 +348,23 @@ def test_a_step_of_a_whole_body_ends_at_one_that_can_be(tmp_path, seed):
     assert all(near.reached_from(before).values[name] == near.values[name] for name in WHOLE)
 
 
+def test_no_armature_goes_below_0(tmp_path):
+    """Neither in a step nor by the rounding of its prior; other numbers have no bound of their own."""
+    uncertain = "[model.uncertain]\nlink2.mass = {std = 0.1}\njoint1.armature = {std = 0.07}\njoint2.armature = {std=1}"
+    rig = read_rig(_rig(tmp_path, arm(2), model=uncertain), specs)
+    t, shape = 0.01 * np.arange(50.0)[None], np.ones((1, 50, 2))
+    logs = Dataset(t, 0 * shape, np.sin(3 * t)[..., None], np.ones((1, 50), bool))
+    problem = build(rig, logs, key=jax.random.key(0))
+    np.testing.assert_allclose(problem.mstep.least, [-np.inf, -0.05 / 0.07, -0.025])
+    weights = problem.mstep.weights(problem.model)
+    w = weights.read(problem.model)
+    for share in (1.0, 1 + 1e-15, 3.0):
+        values = weights.write(problem.model, w.at[-2:].set(share * problem.mstep.least[-2:])).system.values
+        assert [float(values[f"joint{i}.armature"]) for i in (1, 2)] == [0.0, 0.0]
+    up = weights.write(problem.model, w.at[-3:].set(0.5)).system.values
+    assert [float(up[name]) for name in rig.parameters] == pytest.approx([2.55, 0.05 + 0.035, 0.025 + 0.5])
+
+
 def test_a_step_of_a_pseudo_inertia_is_itself_to_first_order():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(4, 4))

@@ -322,6 +322,20 @@ def test_fit_of_parameters_alone_is_ridge_regression():
     assert float(written.system.m) == pytest.approx(1.2 + 0.1 * float(w[0]), rel=1e-14)
 
 
+@pytest.mark.parametrize("least", [-jnp.inf, -2.0, -0.3, 0.0], ids=str)
+def test_fit_with_a_bound_is_the_optimum_among_what_is_possible(least):
+    """The second parameter is where the first lets it: a step cut off at the bound would leave it elsewhere."""
+    prior = ParameterPrior(("a", "b"), jnp.zeros(2), jnp.ones(2))
+    weights = Weights(prior, jnp.asarray([[-1.0, 1.0]]), 1.0, jnp.zeros(0), jnp.ones(1), least=jnp.asarray([least]))
+    normal, score = np.array([[51.0, 40.0], [40.0, 61.0]]), np.array([-70.0, 10.0])  # with the prior's own 1
+    information = jnp.zeros((4, 4)).at[2:, 2:].set(normal - np.eye(2))
+    w = weights.fit(NO_FRICTION, jnp.zeros(2), jnp.asarray([0.0, 0.0, *score]), information, 200)
+    free = np.linalg.solve(normal, score)  # -3.09, 2.19
+    bound = np.array([least, (score[1] - normal[0, 1] * least) / normal[1, 1]])
+    np.testing.assert_allclose(w, bound if least > free[0] else free, atol=np.sqrt(2 * 1e-3 / 20))
+    assert w[0] >= least
+
+
 def test_sequences_that_are_not_used_have_no_weight(slides):
     """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
     model, data, posterior, each = slides

@@ -187,7 +187,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         jnp.asarray([rig.parameters[n].std for n in free]),
     )
     estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
-    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, shape=model.log_q)
+    least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
+    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, shape=model.log_q, least=least)
     return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
 
 

@@ -28,7 +28,7 @@ from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
 from .prior import ParameterPrior
 from .quadratic import Local, Quadratic, quadratic
-from .weights import Weights
+from .weights import Weights, bounds
 
 
 class MStepInfo(NamedTuple):
@@ -171,11 +171,13 @@ class ScoringMStep(AbstractMStep):
     """
     shape: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
+    least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    """`Weights.least`, of the declared parameters."""
 
     def weights(self, model) -> Weights:
         """Estimated vector: weights of the network and parameters."""
         nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
-        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough)
+        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough, self.least)
 
     def early(self) -> "ScoringMStep":
         """The rule with the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the
@@ -219,7 +221,7 @@ class ScoringMStep(AbstractMStep):
         """
         pad = BLOCK * max(1, -(-self.prior.size // BLOCK)) - self.prior.size
         prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
-        rule = eqx.tree_at(lambda r: r.prior, self, prior)
+        rule = eqx.tree_at(lambda r: (r.prior, r.least), self, (prior, bounds(self.least, prior.size)))
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))

@@ -21,6 +21,8 @@ class Weights(eqx.Module):
     """Prior standard deviation [N m] of an offset, the even part of a friction map that all nodes share."""
     rough: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
     """Standard deviation of the even part at every node alone, in those of the offset."""
+    least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    """Smallest possible values of the first parameters, in units of their prior."""
 
     def read(self, model) -> Float[Array, " weight"]:
         """Those of a model, as one vector."""
@@ -80,6 +82,8 @@ class Weights(eqx.Module):
     ) -> Float[Array, " weight"]:
         """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3].
 
+        A parameter at its smallest value stays there while the likelihood falls inwards [Bertsekas 1982, SIAM J.
+        Control Optim. 20(2)].
         A step solves (A'A + D) step = gradient with A = root J, I = root' root, by the Woodbury identity: there are
         fewer nodes than weights.
         """
@@ -91,6 +95,8 @@ class Weights(eqx.Module):
         information = information + symmetry
         values, vectors = jnp.linalg.eigh(information)
         root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
+        least = jnp.full_like(w0, -jnp.inf)
+        least = least.at[w0.shape[0] - self.prior.size :].set(bounds(self.least, self.prior.size))
 
         def loss(w):
             d = self.phi(unknown, w) - phi0
@@ -106,8 +112,10 @@ class Weights(eqx.Module):
             gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
             a = root @ jac
             d = precision + damping * (precision + jnp.sum(a * a, axis=0))
+            d = jnp.where((w <= least) & (gradient > 0), jnp.inf, d)
             inner = jax.scipy.linalg.cho_factor(jnp.eye(a.shape[0], dtype=a.dtype) + (a / d[None]) @ a.T)
-            trial = w - (gradient - a.T @ jax.scipy.linalg.cho_solve(inner, a @ (gradient / d))) / d
+            step = (gradient - a.T @ jax.scipy.linalg.cho_solve(inner, a @ (gradient / d))) / d
+            trial = jnp.maximum(w - step, least)
             new = loss(trial)
             better = new < value
             gain = jnp.where(better, 0.7 * gain + 0.3 * (value - new), gain)
@@ -117,3 +125,8 @@ class Weights(eqx.Module):
         one = jnp.ones((), w0.dtype)
         w, *_ = jax.lax.while_loop(going, body, (w0, loss(w0), 1e-3 * one, jnp.zeros((), int), one))
         return w
+
+
+def bounds(least: Float[Array, " bounded"], size: int) -> Float[Array, " param"]:
+    """Smallest values of `size` parameters, of which the first have the bounds `least`."""
+    return jnp.concatenate([least, jnp.full(size, -jnp.inf, least.dtype)])[:size]

@@ -1,6 +1,7 @@
 """Interface of a machine: names, mass matrix and bias force."""
 
 import dataclasses
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -61,6 +62,10 @@ class AbstractSystem(eqx.Module):
     def with_parameters(self, values: Mapping[str, Array]) -> "AbstractSystem":
         """The machine with other values of some parameters."""
         return dataclasses.replace(self, **values)
+
+    def least(self, name: str) -> float:
+        """Smallest value that a parameter may be estimated to have."""
+        return -math.inf
 
     def reached_from(self, before: Any) -> "AbstractSystem":
         """This machine, or if a step of a fit from `before` led to one that cannot be, one on the way that can."""

@@ -1,5 +1,6 @@
 """A machine from its owner's file: any tree of hinges and slides on a fixed base."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -63,8 +64,12 @@ class Tree(AbstractSystem):
     def with_parameters(self, values: Mapping[str, Array]):
         return replace(self, values={**self.values, **values})
 
+    def least(self, name):
+        return 0.0 if name.endswith(".armature") else -math.inf
+
     def reached_from(self, before: "Tree"):
-        return replace(self, values=kept_physical(self.machine, before.values, self.values))
+        values = kept_physical(self.machine, before.values, self.values)
+        return replace(self, values={name: jnp.maximum(value, self.least(name)) for name, value in values.items()})
 
     @property
     def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -203,7 +203,11 @@ def test_identify_writes_whole_results(bench, fit):
     np.testing.assert_allclose(visited["velocity"], curve["velocity"][[0, -1]], rtol=1e-9)
     np.testing.assert_allclose(visited["load"], np.percentile(pushes, [0.5, 99.5]), rtol=1e-6)
     assert report["versions"]["jax"] == jax.__version__
-    assert report["verdict"] == f"Fitted the friction of 1 joint to 4 sequences in {EPOCHS} epochs."
+    rise = report["log_likelihood"][-1] - report["log_likelihood"][-3]
+    assert report["verdict"] == f"Fitted the friction of 1 joint to 4 sequences; {report['stopped']}."
+    assert report["stopped"].startswith(
+        f"stopped after {EPOCHS} epochs while the log-likelihood still rose by {rise:.2g}"
+    )
     html = (fit / "report.html").read_text()
     assert "Identification of simulated slide" in html
     assert report["friction_law"][0]["text"] in html

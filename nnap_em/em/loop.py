@@ -220,6 +220,24 @@ def fit(
     return state
 
 
+RISE = 0.1
+"""Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]: twice the change that
+`fit` takes for none."""
+
+
+def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
+    """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest.
+
+    Infinite where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
+    """
+    whole = [value for epoch, value in enumerate(state.loglik) if schedule.horizon(epoch, longest) == longest]
+    if len(whole) < 3:
+        return math.inf
+    least = RISE if math.isinf(state.ess) else max(RISE, float(np.max(-np.diff(whole))))
+    rise = float(max(whole[-2:]) - max(whole[:-2]))
+    return rise if rise >= least else 0.0
+
+
 def _judge(state: EMState, proposal: AbstractModel, hessian, loglik, used) -> EMState:
     """Accept the model that was tried, or go back to the best one and try a shorter way from there.
 

@@ -15,7 +15,7 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state
+from ..em.loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
 from ..em.mstep import ScoringMStep, kept
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
@@ -47,6 +47,8 @@ class Identified(NamedTuple):
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
     memory: str = ""
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
+    rise: float = 0.0
+    """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
 
     @property
     def unsaid(self) -> float:
@@ -134,7 +136,8 @@ def identify(
         fitted = fitted._replace(
             state=remembered.state, m_step=remembered.m_step, memory="\n".join(remembered.sentences)
         )
-    return finished(fitted, data)
+    rise = unsettled(fitted.state, schedule, int(np.max(np.sum(np.asarray(data.valid), axis=1))))
+    return finished(fitted._replace(rise=rise), data)
 
 
 PARTS = 2

@@ -40,7 +40,7 @@ KIND = Kind(
 )
 
 
-LATER = ("/discrepancy", "/m_step/rough", "/m_step/least", "/memory")
+LATER = ("/discrepancy", "/m_step/rough", "/m_step/least", "/memory", "/rise")
 """Numbers that files from before they were kept do not have: as a new fit begins with."""
 
 

@@ -64,6 +64,7 @@ def write_identification(
         "error": error,
         "noise": noise(fitted),
         "parameters": parameters(fitted),
+        "stopped": _stopped_early(fitted),
         "friction_law": laws,
         "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
         "contacts": [bristle.document() for bristle in bristles],
@@ -85,7 +86,17 @@ def _verdict(fitted: Identified, sequences: int, diverged: int) -> str:
     friction = [f"the friction of {counted(dof, 'joint')}"] * fitted.rig.friction
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
-    return f"Fitted {estimated} to {used} in {counted(fitted.state.epoch, 'epoch')}."
+    early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
+    return f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
+
+
+def _stopped_early(fitted: Identified) -> str:
+    """Sentence about a fit that its number of epochs ended; empty for one that came to rest."""
+    if not fitted.rise:
+        return ""
+    how = f"while the log-likelihood still rose by {fitted.rise:.2g} nat a sequence"
+    how = how if math.isfinite(fitted.rise) else "that mostly saw the beginning of the sequences"
+    return f"stopped after {counted(fitted.state.epoch, 'epoch')} {how}: give it more with --epochs"
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
@@ -93,6 +104,8 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         log(law["text"])
     for text in document["friction_memory"]:
         log(text)
+    if document["stopped"]:
+        log(document["stopped"])
     if document["left_out"]:
         log(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}

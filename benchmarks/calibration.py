@@ -61,9 +61,9 @@ def slide_bench(sequences: int = 8, steps: int = 150) -> Bench:
 
 
 @eqx.filter_jit
-def _log_pull(weights, unknown, middle, symmetry, w):
+def _log_pull(weights, unknown, middle, w):
     phi = weights.phi(unknown, middle + w)
-    return -0.5 * phi @ symmetry @ phi
+    return -0.5 * phi @ weights.symmetry(unknown, middle + w) @ phi
 
 
 def prior_draw(start: Identified, key, moves: int = 200):
@@ -72,10 +72,10 @@ def prior_draw(start: Identified, key, moves: int = 200):
     Its Gaussian part is that of the weights, its likelihood the pull towards odd symmetry.
     """
     weights, unknown = start.m_step.weights(start.model), start.model.unknown
-    middle, symmetry = weights.middle(), weights.symmetry()
+    middle = weights.middle()
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
 
-    log_pull = partial(_log_pull, weights, unknown, middle, symmetry)
+    log_pull = partial(_log_pull, weights, unknown, middle)
     std = 1 / np.sqrt(np.asarray(weights.precision(middle)))
     draw = lambda: rng.normal(size=middle.shape) * std  # noqa: E731
     state = draw()

@@ -15,9 +15,9 @@ from nnap_em.em.local import local, locals_along, readings_along, readings_at
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import Quadratic, quadratic, spread
-from nnap_em.em.weights import Weights
+from nnap_em.em.weights import AT_REST, COULOMB, Weights
 from nnap_em.model.base import prepare
-from nnap_em.model.friction import FrictionNetwork, NoFriction
+from nnap_em.model.friction import FixedFriction, FrictionNetwork, NoFriction
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
@@ -269,6 +269,8 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
     phi0 = weights.phi(model.unknown, w0)
     score = information @ (target - phi0)
     w = weights.fit(model.unknown, w0, score, information, 500)
+    odd = np.abs(phi0[:21] - phi0[:21][::-1])
+    spread = jnp.asarray(0.3**2 * (1.0 + np.diag(np.minimum(1.0, odd / np.median(odd)) ** 2 + AT_REST**2)))
 
     @jax.jit
     def loss(w):
@@ -277,35 +279,59 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
         even = 0.5 * (phi[:21] + phi[:21][::-1])
         d = phi - target
         ridge = jnp.sum((w[:-1] - middle) ** 2) + w[-1] ** 2
-        asymmetry = jnp.sum(even**2) - jnp.sum(even) ** 2 / 22.0
-        return 0.5 * d @ information @ d + 0.5 * ridge + 0.5 * asymmetry / 0.3**2
+        asymmetry = even @ jnp.linalg.solve(spread, even)
+        return 0.5 * d @ information @ d + 0.5 * ridge + 0.5 * asymmetry
 
     better = minimize(loss, w, jac=jax.grad(loss), method="BFGS", options={"maxiter": 2000})
     assert float(loss(w0)) - float(loss(w)) > 1e3
     # the loop ends when its smoothed gain is below 1e-3 nats a step; what is left must not matter (a nat = 1 std)
     assert float(loss(w)) - better.fun < 0.1
     gradient = jax.grad(loss)(w)
-    hessian, _ = weights.hessian(model.unknown, w, information + weights.symmetry())
+    jac = weights.jacobian(model.unknown, w)
+    hessian = jac.T @ (information + weights.symmetry(model.unknown, w0)) @ jac + np.diag(weights.precision(w))
     assert 0.5 * float(gradient @ jnp.linalg.solve(hessian, gradient)) < 0.01  # Newton decrement [nats]
 
 
-def test_the_symmetry_prior_is_that_of_an_offset_and_a_number_at_every_node():
+def test_the_symmetry_prior_is_that_of_an_offset_and_a_number_at_every_node_that_vanishes_at_rest():
     nodes, rng = jnp.linspace(-2.0, 2.0, 11)[None], np.random.default_rng(0)
-    precision = Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3]), jnp.asarray(2.0)).symmetry()[:11, :11]
+    law = FixedFriction(lambda v: -jnp.clip(v, -0.8, 0.8), jnp.ones(1))  # half of the nodes are at its level
+    prior = Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3]), jnp.asarray(2.0))
+    precision = prior.symmetry(law, jnp.zeros(1))[:11, :11]
     odd, half = rng.normal(size=11), rng.normal(size=11)
-    np.testing.assert_allclose(precision @ (odd - odd[::-1]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(precision @ (odd - odd[::-1]), 0.0, atol=1e-9)
     even = half + half[::-1]
-    covariance = 0.3**2 * (1.0 + 2.0**2 * np.eye(11))
-    assert even @ precision @ even == pytest.approx(even @ np.linalg.solve(covariance, even), rel=1e-12)
+    share = np.minimum(1.0, np.abs(np.asarray(nodes[0])) / 0.8)
+    covariance = 0.3**2 * (1.0 + 2.0**2 * np.diag(share**2 + AT_REST**2))
+    assert even @ precision @ even == pytest.approx(even @ np.linalg.solve(covariance, even), rel=1e-9)
+
+
+def test_a_coarse_prior_lets_viscous_coulomb_and_constant_friction_be_and_holds_the_rest():
+    nodes = jnp.linspace(-2.0, 2.0, 11)[None]
+    law = FixedFriction(lambda v: -jnp.sign(v), jnp.ones(1))
+    free, held = (
+        Weights(MASS, nodes, 1.0, jnp.zeros(0), jnp.asarray([0.3]), jnp.asarray(2.0), departure).symmetry(
+            law, jnp.zeros(1)
+        )[:11, :11]
+        for departure in (jnp.asarray(np.inf), jnp.asarray(0.1))
+    )
+    v = np.asarray(nodes[0])
+    engineer = 0.3 * v + 2.0 * np.tanh(v / (COULOMB * 2.0)) - 0.7
+    np.testing.assert_allclose((held - free) @ engineer, 0.0, atol=1e-8)
+    bump = np.exp(-((v - 1.2) ** 2)) - np.exp(-((v + 1.2) ** 2))
+    base = np.linalg.qr(np.stack([v, np.sign(v), np.ones(11)], axis=1))[0]
+    beside = bump - base @ (base.T @ bump)
+    assert bump @ (held - free) @ bump == pytest.approx(beside @ beside / 0.03**2, rel=1e-6)
+
 
 
 def test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows():
     model = _slide(FrictionNetwork(jnp.asarray([6.0]), jnp.asarray([1.0]), key=jax.random.key(3)))
     rule = ScoringMStep(MASS, model.unknown.weights(), (True, True), (True, True), shape=model.log_q)
-    peak = jnp.zeros(42).at[20].set(1.0)  # at rest; the last of all is the mass
-    early, late = (float(peak @ r.weights(model).symmetry() @ peak) for r in (rule.early(), rule))
-    assert early == pytest.approx((1 - 1 / 42) / 0.1**2)
-    assert late == pytest.approx(early / 41, rel=0.05)
+    law = FixedFriction(lambda v: -jnp.clip(v, -0.01, 0.01), jnp.ones(1))
+    bump = jnp.zeros(42).at[jnp.asarray([5, 35])].set(1.0)  # at high speed; the last of all is the mass
+    early, late = (float(bump @ r.weights(model).symmetry(law, jnp.zeros(1)) @ bump) for r in (rule.early(), rule))
+    assert early == pytest.approx((2 - 4 / 42) / 0.1**2, rel=0.01)
+    assert late == pytest.approx(early / 41, rel=0.06)
 
 
 def test_fit_of_parameters_alone_is_ridge_regression():

@@ -219,7 +219,7 @@ def parser() -> argparse.ArgumentParser:
         )
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
-    identify.add_argument("--epochs", type=_count, default=20, metavar="N", help="at most so many in all (20)")
+    identify.add_argument("--epochs", type=_count, default=40, metavar="N", help="at most so many in all (40)")
     diagnose.add_argument(
         "--minutes", type=_minutes, metavar="M", help="answer after about M minutes with what is found by then"
     )

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..numerics.digits import counted
 
@@ -56,9 +56,9 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     )
 
 
-def horizon(data: Dataset, samples: int) -> Dataset:
-    """The first `samples` samples of every sequence; the rest stays as padding, so that shapes do not change."""
-    seen = np.arange(data.t.shape[-1]) < samples
+def horizon(data: Dataset, samples: int, after: Int[np.ndarray, " seq"] | int = 0) -> Dataset:
+    """The first `samples` samples of every sequence, and `after` more; the rest stays as padding: no shape changes."""
+    seen = np.arange(data.t.shape[-1]) < samples + np.expand_dims(after, -1)
     return data._replace(valid=data.valid & np.broadcast_to(seen, data.valid.shape))
 
 

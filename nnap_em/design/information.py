@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,16 +35,8 @@ class Fit(NamedTuple):
 def known(fitted: Identified) -> Fit:
     """Knowledge after a fit."""
     weights = fitted.m_step.weights(fitted.model)
-    cov, before = _covariances(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian)
+    cov, before = map(jnp.linalg.inv, (fitted.state.hessian, weights.prior_precision(fitted.model.unknown)))
     return Fit(fitted.model, fitted.m_step.prior, weights.nodes, cov, before)
-
-
-@eqx.filter_jit
-def _covariances(weights, unknown, w, hessian) -> tuple[Float[Array, "phi phi"], Float[Array, "phi phi"]]:
-    before, jac = weights.hessian(unknown, w, weights.symmetry())
-    halves = (jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(h), jac.T, lower=True) for h in (hessian, before))
-    after, prior = (half.T @ half for half in halves)
-    return after, prior
 
 
 def information(

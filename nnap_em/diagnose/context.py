@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset, horizon
-from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, start_state
+from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import kept
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
@@ -116,7 +116,7 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
     growing = math.ceil(math.log(longest / schedule.first) / math.log(1.6)) if longest > schedule.first else 0
 
     def run(model: StateSpaceModel) -> EMState:
-        begun = start_state(model, hypothesis.m_step, key=before.state.key)._replace(epoch=1)
+        begun = later_state(model, hypothesis.m_step, key=before.state.key)
         return fit(begun, context.data, before.smoother, hypothesis.m_step, epochs=growing + 8, schedule=schedule)
 
     def looser(model: StateSpaceModel) -> StateSpaceModel:
@@ -178,7 +178,7 @@ def _predicting(context: SearchContext, hypothesis: Hypothesis, state: EMState) 
     before, after = (errors(followed(f.model, f.m_step.prior, f.path, context.data), JUDGED) for f in (a, b))
     if ratio(before, after, one & other) <= 1:
         return state
-    begun = start_state(hypothesis.model, hypothesis.m_step, key=state.key)._replace(epoch=1)
+    begun = later_state(hypothesis.model, hypothesis.m_step, key=state.key)
     schedule = Schedule(first=context.longest)
     return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)
 

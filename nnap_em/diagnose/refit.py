@@ -35,7 +35,7 @@ class Trial(NamedTuple):
     m_step: ScoringMStep
     path: Gaussian
     loglik: Float[np.ndarray, " seq"]
-    hessian: Float[Array, "weight weight"]
+    hessian: Float[Array, "phi phi"]
     """Posterior precision of network weights and parameters."""
     along: Followed | None = None
     """The model along its paths, where multi-step errors finished it."""

@@ -12,7 +12,7 @@ from ..data.dataset import DataError
 from ..data.formats import csv_fields, header_hint, place, refuse
 from ..data.rig import SystemSpec, toml_text
 from ..data.units import parameter_unit
-from ..em.build import reading_noise
+from ..em.readings import reading_noise
 
 _NAMES = {  # what people call a column, its number apart
     "time": re.compile(r"(time|t|timestamp|clock)()$"),

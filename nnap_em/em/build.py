@@ -12,13 +12,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..data.rig import Rig, RigError
 from ..model.friction import FrictionNetwork, NoFriction
-from ..model.state_space import SUBSTEPS, StateSpaceModel
+from ..model.state_space import MOST_STEPS, SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
-from .mstep import ScoringMStep
+from .mstep import COARSE, ScoringMStep
 from .prior import ParameterPrior
-from .servos import LAG, MOST_STEPS, build_servos, steps_of_sample, torque_along
+from .readings import RESTS, at_rest, differences, reading_noise
+from .servos import LAG, build_servos, steps_of_sample, torque_along
 
 NO_MACHINE = "the declared masses and inertias make no machine"
 
@@ -60,21 +61,6 @@ def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array,
     return jax.vmap(system.mass)(q)
 
 
-def _differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
-    for _ in range(order):
-        signal = signal[:, lag:] - signal[:, :-lag]
-    return signal[np.isfinite(signal)]
-
-
-def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
-    """Standard deviation of white noise on a smooth signal, from its third differences (var = 20 sigma^2).
-
-    [Gasser, Sroka & Jennen-Steinmetz 1986, Biometrika 73(3), for the idea] The median makes it blind to jumps.
-    """
-    d = _differences(signal, 3, 1)
-    return float(np.median(np.abs(d)) / 0.6745 / np.sqrt(20.0)) if d.size else 0.0
-
-
 def loads(system: AbstractSystem) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
     """Inertia of every joint at zero, and gravity with the first at a quarter turn [kg m^2 and N m, or kg and N]."""
     inertia, gravity = map(np.asarray, _loads(system))
@@ -100,11 +86,11 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
         position, rate = system.coordinates[joint], system.rates[joint]
         if rate in rig.measured:
             signal = y[..., rig.measured.index(rate)]
-            v, a = signal[np.isfinite(signal)], _differences(signal, 1, LAG) / (LAG * rig.dt)
+            v, a = signal[np.isfinite(signal)], differences(signal, 1, LAG) / (LAG * rig.dt)
         elif position in rig.measured:
             signal = y[..., rig.measured.index(position)]
-            v = _differences(signal, 1, LAG) / (LAG * rig.dt)
-            a = _differences(signal, 2, LAG) / (LAG * rig.dt) ** 2
+            v = differences(signal, 1, LAG) / (LAG * rig.dt)
+            a = differences(signal, 2, LAG) / (LAG * rig.dt) ** 2
         else:
             continue
         speed[joint] = np.max(np.abs(v), initial=0.0)
@@ -188,7 +174,10 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     )
     estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
     least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
-    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, shape=model.log_q, least=least)
+    y = np.asarray(data.y)
+    rests = max((at_rest(y[..., i]) for i, name in enumerate(rig.measured) if name in system.coordinates), default=0.0)
+    coarse = COARSE if rests > RESTS else math.inf
+    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, coarse=coarse, shape=model.log_q, least=least)
     return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
 
 

@@ -22,6 +22,7 @@ from ..numerics.parallel import each, turns
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, kept
+from .readings import onset
 
 
 class EMState(NamedTuple):
@@ -34,8 +35,8 @@ class EMState(NamedTuple):
     """The likeliest model so far at the present horizon."""
     proposal: AbstractModel
     """Model that the M-step proposes from `best`."""
-    hessian: Float[Array, "weight weight"]
-    """Posterior precision of the M-step's weights at `best`."""
+    hessian: Float[Array, "phi phi"]
+    """Posterior precision of phi at `best`: of the torques at the M-step's nodes, and of the parameters."""
     top: Float[np.ndarray, " seq"]
     """Log-likelihood of every sequence under `best`; -inf before there is one, NaN where a sequence is left out."""
     stride: float
@@ -45,6 +46,10 @@ class EMState(NamedTuple):
     """Mean log-likelihood of the sequences used, of every epoch so far."""
     ess: float
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
+    stage: int = 0
+    """Place in `AbstractMStep.stages` of the rule in use."""
+    since: int = 0
+    """Epoch from which on it is."""
 
 
 class FitError(RuntimeError):
@@ -175,7 +180,18 @@ def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArra
     )
 
 
+def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
+    """The state of a model that was fitted before: its noise is settled, and the M-step free."""
+    return start_state(model, m_step, key=key)._replace(epoch=1, stage=len(m_step.stages()) - 1)
+
+
 SCHEDULE = Schedule()
+EPOCHS = 40
+"""Epochs of a fit at most."""
+REST = 0.05
+"""Change of the log-likelihood, twice running, at which EM is at rest [nat a sequence]."""
+COARSE = 0.5
+"""The same before the M-step is released: likelihoods are compared no more exactly."""
 
 
 def fit(
@@ -184,27 +200,39 @@ def fit(
     smoother: AbstractSmoother,
     m_step: AbstractMStep,
     *,
-    epochs: int = 20,
+    epochs: int = EPOCHS,
     schedule: Schedule = SCHEDULE,
-    tolerance: float = 0.05,
+    tolerance: float = REST,
     watch: Callable[[EMState, int, Bool[np.ndarray, " seq"]], None] = lambda state, seen, used: None,
 ) -> EMState:
     """EM from `state` until `epochs` are done or the likelihood rests.
 
     It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
-    nats twice running, or when a model on which sequences diverge was refused twice running.
+    nats twice running, or when a model on which sequences diverge was refused twice running. Before the last stage of
+    the M-step the next one then begins, from the likeliest model. Horizons are counted from shortly before the first
+    motion of each sequence.
     Raises FitError when no sequence can be followed.
     """
-    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    longest, still = int(np.max(np.sum(np.asarray(data.valid), axis=1))), onset(np.asarray(data.y))
+    stages = m_step.stages()
+    last = len(stages) - 1
     if state.epoch == 0:
-        model = _settle_noise(state.model, horizon(data, schedule.first), smoother, state.key)
+        model = _settle_noise(state.model, horizon(data, schedule.first, still), smoother, state.key)
         state = state._replace(model=model, best=model)
-    while state.epoch < epochs and not _rests(state, schedule, longest, tolerance):
+    while state.epoch < epochs:
         seen = schedule.horizon(state.epoch, longest)
-        key = jax.random.fold_in(state.key, state.epoch)
-        rule = m_step.early() if seen < longest else m_step
+        if _rests(state, schedule, longest, tolerance if state.stage == last else COARSE):
+            if state.stage == last:
+                break
+            state = _released(state)
+        elif seen > schedule.horizon(max(state.epoch - 1, 0), longest):
+            state = _afresh(state) if state.stride < 1 else state._replace(top=np.full(state.top.size, -np.inf))
+        if seen == longest and state.stage < min(1, last):
+            state = _released(state)
+        rule, key = stages[state.stage], jax.random.fold_in(state.key, state.epoch)
+        rule = rule.early() if seen < longest else rule
         proposal, info, loglik, ess = em_step(
-            state.model, horizon(data, seen), smoother, rule, key, growing=seen < longest
+            state.model, horizon(data, seen, still), smoother, rule, key, growing=seen < longest
         )
         used = np.asarray(info.used)
         if not used.any():
@@ -212,17 +240,25 @@ def fit(
                 f"epoch {state.epoch + 1}: all {used.size} sequences diverge within the first {seen} samples; "
                 "check units, signs and the start prior, or declare a wider one"
             )
-        if state.epoch and seen > schedule.horizon(state.epoch - 1, longest):
-            state = state._replace(top=np.full(used.size, -np.inf), stride=1.0)
         state = _judge(state, proposal, info.hessian, np.asarray(loglik), used)
         state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         watch(state, seen, used)
     return state
 
 
-RISE = 0.1
-"""Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]: twice the change that
-`fit` takes for none."""
+def _afresh(state: EMState) -> EMState:
+    """From the likeliest model on, and compared with nothing before."""
+    return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
+
+
+def _released(state: EMState) -> EMState:
+    """The next stage of the M-step, with a model that is integrated as finely as friction has become steep."""
+    best = state.best.resolved()
+    return _afresh(state._replace(best=best, proposal=best, stage=state.stage + 1))
+
+
+RISE = 2 * REST
+"""Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]."""
 
 
 def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
@@ -268,7 +304,7 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
 
 
 def _rests(state: EMState, schedule: Schedule, longest: int, tolerance: float) -> bool:
-    if state.epoch < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
+    if state.epoch - state.since < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
         return False
     if state.stride < 0.2 and math.isinf(state.ess):  # a sampled likelihood may fall by chance
         return True

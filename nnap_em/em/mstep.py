@@ -10,6 +10,7 @@ vector phi in which the likelihood is quadratic; the network is then fitted to t
 Levenberg-Marquardt.
 """
 
+import math
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
@@ -34,8 +35,8 @@ from .weights import Weights, bounds
 class MStepInfo(NamedTuple):
     """Results of an M-step for diagnosis and reuse."""
 
-    hessian: Float[Array, "weight weight"]
-    """Posterior precision of the weights, at those of the model that was given (zero for M-steps that know none)."""
+    hessian: Float[Array, "phi phi"]
+    """Posterior precision of phi, at the model that was given (zero for M-steps that know none)."""
     used: Bool[Array, " seq"]
     """Sequences that took part."""
 
@@ -74,8 +75,12 @@ class AbstractMStep(eqx.Module):
     def early(self) -> "AbstractMStep":
         """The rule while the horizon still grows."""
 
+    def stages(self) -> "tuple[AbstractMStep, ...]":
+        """Rules in the order of their use, the last this one: the first while the horizon grows."""
+        return (self,)
+
     @abstractmethod
-    def no_hessian(self, model) -> Float[Array, "weight weight"]:
+    def no_hessian(self, model) -> Float[Array, "phi phi"]:
         """`MStepInfo.hessian` before the first epoch."""
 
 
@@ -127,8 +132,8 @@ def _shaken(linear: Local, log_q: Float[Array, " state"], log_r: Float[Array, " 
 @eqx.filter_jit
 def _narrowed(core: Core, hessian, pad: int):
     """The prior without the last `pad` parameters."""
-    size = core.w.shape[0] - pad
-    return core._replace(w=core.w[:size]), hessian[:size, :size]
+    size = hessian.shape[0] - pad
+    return core._replace(w=core.w[: core.w.shape[0] - pad]), hessian[:size, :size]
 
 
 @eqx.filter_jit
@@ -139,10 +144,29 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
     first = jax.tree.map(pick, first)
-    w = weights.fit(core.unknown, core.w, total.score, total.information, rule.iterations)
-    hessian, _ = weights.hessian(core.unknown, core.w, total.information + weights.symmetry())
+    near = jnp.repeat((STEP * core.unknown.scale) ** -2.0, weights.nodes.shape[1])
+    near = jnp.diag(jnp.concatenate([near, jnp.zeros(weights.prior.size, near.dtype)]))
+    w = weights.fit(core.unknown, core.w, total.score, total.information + near, rule.iterations)
+    hessian = _definite(total.information + weights.prior_precision(core.unknown))
     log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
     return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
+
+
+def _definite(precision: Float[Array, "phi phi"]) -> Float[Array, "phi phi"]:
+    """A sum of squares that rounding has not made indefinite."""
+    return precision + 100 * jnp.finfo(precision.dtype).eps * jnp.diag(jnp.diag(precision))
+
+
+STEP = 1.0
+"""Standard deviation of the change of a node's torque in one M-step [scales of the map, a tenth of typical torques].
+
+At rest only the slope of the map is determined, and a step by it alone would make friction a peak of 100 times its
+size, which no later step leaves. No fixed point moves.
+"""
+COARSE = 0.1
+"""`ScoringMStep.coarse` of logs that rest [standard deviations of an offset of friction]."""
+RELEASES = (1.0, 10.0, 100.0)
+"""Widths while the horizon grows, and then until the likelihood rests with each, in `ScoringMStep.coarse`."""
 
 
 class ScoringMStep(AbstractMStep):
@@ -169,6 +193,10 @@ class ScoringMStep(AbstractMStep):
 
     A peak at rest, beside which there are few readings, would be learned from the first half second and not left again.
     """
+    departure: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
+    """`Weights.departure`: free."""
+    coarse: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
+    """The same while the horizon grows; finite where logs rest, which then do not determine more."""
     shape: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
@@ -177,7 +205,7 @@ class ScoringMStep(AbstractMStep):
     def weights(self, model) -> Weights:
         """Estimated vector: weights of the network and parameters."""
         nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
-        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough, self.least)
+        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough, self.departure, self.least)
 
     def early(self) -> "ScoringMStep":
         """The rule with the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the
@@ -185,10 +213,18 @@ class ScoringMStep(AbstractMStep):
         """
         return eqx.tree_at(lambda m: (m.tie, m.rough), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
 
-    def no_hessian(self, model) -> Float[Array, "weight weight"]:
-        """Zero precision of the network's weights and the parameters."""
-        w = self.weights(model).read(model)
-        return jnp.zeros((w.shape[0], w.shape[0]), w.dtype)
+    def stages(self) -> tuple["ScoringMStep", ...]:
+        """Where it begins `coarse`: friction near a viscous, a Coulomb and a constant part, released in steps."""
+        if not math.isfinite(float(self.coarse)):
+            return (self,)
+        widths = (self.coarse * factor for factor in RELEASES)
+        return (*(eqx.tree_at(lambda m: m.departure, self, width) for width in widths), self)
+
+    def no_hessian(self, model) -> Float[Array, "phi phi"]:
+        """Zero precision of the torques at the nodes and the parameters."""
+        weights = self.weights(model)
+        size = weights.nodes.size + weights.prior.size
+        return jnp.zeros((size, size), weights.nodes.dtype)
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         """One step of Fisher scoring."""
@@ -214,7 +250,7 @@ class ScoringMStep(AbstractMStep):
         posterior: Posterior,
         read: Float[Array, "seq time node obs"],
         used: Bool[Array, " seq"],
-    ) -> tuple[Core, Float[Array, "weight weight"], Bool[Array, " seq"]]:
+    ) -> tuple[Core, Float[Array, "phi phi"], Bool[Array, " seq"]]:
         """The step itself: one program for models of every structure; parameters are nameless here.
 
         With it the posterior precision where it began, and which of the sequences `used` could be.

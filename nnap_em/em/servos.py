@@ -13,9 +13,9 @@ from ..model import hooks
 from ..model.servo import Servo, unlimited
 from ..systems import AbstractSystem
 
-STIFF, MOST_STEPS = 0.5, 64
+STIFF = 0.5
 """Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
-bears 2.8, and the most steps of a sample."""
+bears 2.8."""
 
 LAG = 5
 """Rows over which differences are taken."""

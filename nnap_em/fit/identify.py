@@ -15,7 +15,7 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
+from ..em.loop import EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
 from ..em.mstep import ScoringMStep, kept
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
@@ -115,7 +115,7 @@ def identify(
     *,
     key: PRNGKeyArray,
     smoother: MakeSmoother | None = None,
-    epochs: int = 20,
+    epochs: int = EPOCHS,
     schedule: Schedule = SCHEDULE,
     start: Identified | None = None,
     watch: Watch = lambda state, seen, used: None,
@@ -173,20 +173,14 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
-    """Deviations of node torques [N m] and parameters from the mode, drawn from the Laplace posterior.
-
-    Linearised in the network's weights, which are hardly determined one by one while the torque is
-    [Immer, Korzepa & Bauer 2021, AISTATS].
-    """
-    weights = fitted.m_step.weights(fitted.model)
-    return _drawn(weights, fitted.model.unknown, weights.read(fitted.model), fitted.state.hessian, count, key)
+    """Deviations of node torques [N m] and parameters from the mode, drawn from their posterior (Laplace)."""
+    return _drawn(fitted.state.hessian, count, key)
 
 
 @eqx.filter_jit
-def _drawn(weights: Weights, unknown, w, hessian, count: int, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
-    jac = weights.jacobian(unknown, w)
-    unit = jax.random.normal(key, (jac.shape[1], count), jac.dtype)
-    return (jac @ jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian).T, unit, lower=False)).T
+def _drawn(precision: Float[Array, "phi phi"], count: int, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    unit = jax.random.normal(key, (precision.shape[0], count), precision.dtype)
+    return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(precision).T, unit, lower=False).T
 
 
 def nodes_between(
@@ -198,7 +192,7 @@ def nodes_between(
 
 
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
-    """Friction in steady sliding at `velocity` [rad/s], its covariance linearised in the weights (Laplace).
+    """Friction in steady sliding at `velocity` [rad/s], and its covariance (Laplace).
 
     It is the learned map, and below the knee of a contact with memory, where the map is a straight line, the contact's.
     """
@@ -212,22 +206,28 @@ def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> Fr
 
 
 @eqx.filter_jit
-def _friction(weights: Weights, unknown, w, hessian, velocity, contacts: StateSpaceModel | None):
-    """Torque at `velocity`, and its covariance; with the effects of `contacts`."""
-    at_velocity = eqx.tree_at(lambda weights: weights.nodes, weights, velocity)
-    jac = at_velocity.jacobian(unknown, w)[: velocity.size]
-    torque = at_velocity.phi(unknown, w)[: velocity.size]
+def _friction(weights: Weights, unknown, w, precision, velocity, contacts: StateSpaceModel | None):
+    """Torque at `velocity`, and its covariance: that of the nodes beside it; with the effects of `contacts`."""
+    torque = jax.vmap(unknown.with_weights(w[: w.shape[0] - weights.prior.size]))(velocity.T).T
+    dof, count = weights.nodes.shape
+    between = jax.vmap(lambda nodes, v: jax.vmap(lambda e: jnp.interp(v, nodes, e))(jnp.eye(count, dtype=v.dtype)).T)
+    jac = jnp.zeros((*velocity.shape, precision.shape[0]), velocity.dtype)
+    for j, share in enumerate(between(weights.nodes, velocity)):
+        jac = jac.at[j, :, j * count : (j + 1) * count].set(share)
     if contacts is not None and contacts.effects:
-        parameters = slice(w.shape[0] - weights.prior.size, None)
+        parameters = slice(dof * count, None)
 
         def sliding(z):
             effects = weights.prior.write(contacts, z).effects
-            return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T.ravel()
+            return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T
 
-        torque, jac = torque + sliding(w[parameters]), jac.at[:, parameters].add(jax.jacfwd(sliding)(w[parameters]))
-    half = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(hessian), jac.T, lower=True).T
-    half = half.reshape(*velocity.shape, -1)
-    return torque.reshape(velocity.shape), jnp.einsum("jaw,jbw->jab", half, half)
+        z = w[w.shape[0] - weights.prior.size :]
+        torque, jac = torque + sliding(z), jac.at[..., parameters].add(jax.jacfwd(sliding)(z))
+    half = jax.scipy.linalg.solve_triangular(
+        jnp.linalg.cholesky(precision), jac.reshape(-1, jac.shape[-1]).T, lower=True
+    )
+    half = half.T.reshape(*velocity.shape, -1)
+    return torque, jnp.einsum("jaw,jbw->jab", half, half)
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..effects import fields
 from ..em.local import locals_along
-from ..em.loop import EMState, FitError, Schedule, e_step, fit, start_state
+from ..em.loop import EMState, FitError, Schedule, e_step, fit, later_state
 from ..em.mstep import ScoringMStep, kept
 from ..em.prior import ParameterPrior
 from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
@@ -218,8 +218,7 @@ def screen(
     scores, informations = map(np.asarray, each(_score, common, (linear, path)))
     used = used & np.isfinite(scores).all(axis=1) & np.isfinite(informations).all(axis=(1, 2))
     score, information = scores[used].sum(axis=0), informations[used].sum(axis=0)
-    prior, jac = map(np.asarray, weights.hessian(faint.unknown, weights.read(faint), weights.symmetry()))
-    precision, score = prior + jac.T @ information @ jac, jac.T @ score
+    precision = np.asarray(weights.prior_precision(faint.unknown)) + information
     nuisance, levels = slice(0, len(score) - len(joints)), slice(len(score) - len(joints), len(score))
     precision[levels, levels] -= np.eye(len(joints))  # a level is free
     both = np.linalg.solve(
@@ -304,9 +303,9 @@ def _with(
 ) -> _Fit | None:
     """EM from a fit on, over whole sequences, with a contact more; None where it diverges."""
     model, rule = with_contacts(straight_at_rest(fitted.model, [bristle]), fitted.rule, [bristle])
-    begin, before = start_state(model, rule, key=jax.random.fold_in(fitted.state.key, 1)), fitted.state.epoch
+    begin, before = later_state(model, rule, key=jax.random.fold_in(fitted.state.key, 1)), fitted.state.epoch
     blank = np.full(len(data.t), -np.inf)
-    begin = begin._replace(epoch=1, top=blank, loglik=blank[:1])  # past the first epoch, the noise settled
+    begin = begin._replace(top=blank, loglik=blank[:1])
 
     def later(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
         watch(state._replace(epoch=before + state.epoch - 1), seen, used)

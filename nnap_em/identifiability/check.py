@@ -13,13 +13,14 @@ from ..data.dataset import Array, Dataset, horizon
 from ..data.logs import Logs
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
-from ..em.build import LAG, NO_MACHINE, Scales, measure_scales, reading_noise
+from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
+from ..em.readings import reading_noise
 from ..em.scale import not_identifiable
-from ..em.servos import MOST_STEPS, build_servos, steps_of_sample
+from ..em.servos import build_servos, steps_of_sample
 from ..fit.identify import begin
 from ..model.base import prepare
 from ..model.friction import NoFriction
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import MOST_STEPS, StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother

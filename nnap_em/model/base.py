@@ -33,6 +33,10 @@ class AbstractModel(eqx.Module):
     def emission(self, x: Float[Array, " state"], u: Any) -> Float[Array, " obs"]:
         """Mean of the reading; `u` is a row of `inputs`."""
 
+    def resolved(self) -> "AbstractModel":
+        """This model, integrated as finely as what it has learned requires."""
+        return self
+
     def inputs(self, seq: Dataset) -> Any:
         """External inputs in every row: an array, or a structure of arrays, with leading axis time."""
         return jnp.asarray(seq.u)

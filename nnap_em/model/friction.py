@@ -105,6 +105,12 @@ class FrictionNetwork(AbstractJointMap):
         return self.knee[:, None] * jnp.sinh(top[:, None] * line)
 
     @eqx.filter_jit
+    def steepest(self) -> Float[Array, " dof"]:
+        """Largest slope of every joint [N m s/rad]."""
+        slope = lambda v: jax.jvp(self.torque, (v,), (jnp.ones_like(v),))[1]  # noqa: E731
+        return jnp.max(jnp.abs(jax.vmap(slope)(self.nodes(201).T)), axis=0)
+
+    @eqx.filter_jit
     def weights(self) -> Float[Array, " weight"]:
         """All network weights as one vector."""
         return ravel_pytree(eqx.filter(self.mlp, eqx.is_inexact_array))[0]
@@ -136,6 +142,10 @@ class FixedFriction(eqx.Module):
     def nodes(self, count: int) -> Float[Array, "dof 2"]:
         """Two velocities; any would do."""
         return jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
+
+    def steepest(self) -> Float[Array, " dof"]:
+        """None is learned."""
+        return jnp.zeros_like(self.scale)
 
     def weights(self) -> Float[Array, " 0"]:
         """None."""

@@ -225,8 +225,7 @@ def _row(model: StateSpaceModel, columns: Float[Array, " input"]) -> Inputs:
 
 def _spread(fitted: Identified, weights: Weights) -> Float[np.ndarray, "phi rank"]:
     """Factor of the covariance that `phi_samples` draws from, without what is no more than rounding."""
-    jac = np.asarray(weights.jacobian(fitted.model.unknown, weights.read(fitted.model)))
-    half = np.linalg.solve(np.linalg.cholesky(np.asarray(fitted.state.hessian)), jac.T).T
+    half = np.linalg.inv(np.linalg.cholesky(np.asarray(fitted.state.hessian))).T
     left, size, _ = np.linalg.svd(half, full_matrices=False)
     large = size > 1e-6 * np.max(size, initial=1e-300)
     return left[:, large] * size[large]

@@ -31,7 +31,7 @@ SMALLEST, LARGEST, SIZES = 1e-3, 1e5, 49
 class Stated(NamedTuple):
     """Reported uncertainty of a fit."""
 
-    hessian: Float[Array, "weight weight"]
+    hessian: Float[Array, "phi phi"]
     """Posterior precision of the M-step's weights."""
     discrepancy: float
     """Size of the forces that no part of the model describes, in the units of `discrepancy_columns`."""
@@ -57,7 +57,7 @@ def widened(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
-    hessian: Float[Array, "weight weight"],
+    hessian: Float[Array, "phi phi"],
     *,
     key: PRNGKeyArray,
 ) -> Stated:
@@ -76,14 +76,13 @@ def widened(
     other = discrepancy_columns(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
     predictions = open_loop(along, weights, lambda indices: [jax.tree.map(lambda a: a[indices], other)])
-    prior, jac = map(np.asarray, weights.hessian(model.unknown, weights.read(model), weights.symmetry()))
-    errors, scores = _rows(predictions, weighed(predictions, used), len(jac))
-    estimated = errors.own @ jac
-    information = prior + estimated.T @ (errors.weight[:, None] * estimated)
-    scores = (scores[used] - scores[used].mean(axis=0)) @ jac
+    prior = np.asarray(weights.prior_precision(model.unknown))
+    errors, scores = _rows(predictions, weighed(predictions, used), len(prior))
+    information = prior + errors.own.T @ (errors.weight[:, None] * errors.own)
+    scores = scores[used] - scores[used].mean(axis=0)
     count = len(scores)
-    force = size(errors._replace(own=estimated), information)
-    shared = force * estimated.T @ (errors.weight[:, None] * errors.other)
+    force = size(errors, information)
+    shared = force * errors.own.T @ (errors.weight[:, None] * errors.other)
     sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
     strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'

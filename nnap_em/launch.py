@@ -127,6 +127,7 @@ def main() -> None:
     threads = max(1, cores() // local)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in `cli`: the processes load JAX before that
     waits = ("xla_cpu_collective_call_terminate_timeout_seconds", "xla_cpu_collective_timeout_seconds")
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *(f"--{name}={PATIENCE}" for name in waits)])
     children = []

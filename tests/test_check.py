@@ -1,6 +1,7 @@
 """The check before a fit: closed forms where there are any, and data sets that are bad in one known way."""
 
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
+from nnap_em.identifiability import check as check_module
 from nnap_em.identifiability.check import CheckResult, check, gramian, torques, undetermined
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems import specs
@@ -244,17 +246,38 @@ def _heavier(folder: Path) -> None:
     (folder / "rig.toml").write_text(rig.replace("m = 1.0 ", "m = 1e6 "))
 
 
-def test_the_acrobot_with_a_hidden_joint_passes():
-    """The paper's experiment: joint 1 tells all four states."""
+def _acrobot() -> tuple[Rig, Logs]:
+    """The paper's experiment, of which joint 1 is read."""
     model, sweep = examples["acrobot"]()
     data = sweep_experiment(model, sweep, 4, 150, key=jax.random.key(0)).data
     parameters = {n: Declared(float(getattr(model.system, n)), 0.0) for n in ("m1", "m2", "l1", "l2", "lc1", "lc2")}
     parameters |= {n: Declared(float(getattr(model.system, n)), 0.0) for n in ("I1", "I2", "g")}
     measured = tuple(("theta1", "theta2", "dtheta1", "dtheta2")[i] for i in model.measured)
     rig = Rig("a", "acrobot", parameters, True, ("u",), (2,), 0.01, "sequence", measured, {}, {})
-    data = Dataset(*(np.asarray(part) for part in data))
-    report = _report(Logs(tuple("abcd"), data, ("u", *measured)), rig)
+    return rig, Logs(tuple("abcd"), Dataset(*(np.asarray(part) for part in data)), ("u", *measured))
+
+
+def test_logs_that_the_model_cannot_follow_are_an_error_and_no_warning_of_numpy(monkeypatch):
+    rig, logs = _acrobot()
+    lost = [np.full((4, 101, *shape), np.nan) for shape in ((4,), (4, 4), (len(rig.measured), 4), (4, 4))]
+    monkeypatch.setattr(check_module, "each", lambda *_, **__: lost)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = _report(logs, replace(rig, memory=True))
+    assert report["states"][0] == (
+        "error",
+        "the declared model cannot follow the logs; look at units, signs and parameters",
+    )
+    unread = "joint 2 (never seen, by the declared model): no velocity, as no sequence can be followed"
+    assert report["motion"][1] == ("error", unread)
+    assert report["motion"][0][1].startswith("joint 1: ")
+
+
+def test_the_acrobot_with_a_hidden_joint_passes():
+    """Joint 1 tells all four states."""
+    rig, logs = _acrobot()
+    report = _report(logs, rig)
     assert "error" not in {mark for answers in report.values() for mark, _ in answers}
     assert "4 of 4 directions" in report["states"][0][1]
     assert any("joint 2 (never seen, by the declared model)" in text for _, text in report["motion"])
-    assert jnp.isfinite(data.y).all()
+    assert jnp.isfinite(logs.data.y).all()

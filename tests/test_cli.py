@@ -18,7 +18,7 @@ import pytest
 from mcap.reader import make_reader
 
 import nnap_em
-from nnap_em.commands import cli
+from nnap_em.commands import cli, common
 from nnap_em.commands import diagnose as diagnose_command
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands import smooth as smooth_command
@@ -90,7 +90,7 @@ def fit(bench) -> Path:
 def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys
-from nnap_em.commands import cli
+from nnap_em.commands import cli, common
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])
@@ -614,3 +614,26 @@ def test_the_model_file_tells_how_it_came_to_be(bench, fit):
     assert stored.notes["settings"] == {"smoother": "cubature", "particles": None, "seed": 0}
     assert [epoch["epoch"] for epoch in stored.notes["epochs"]] == list(range(1, EPOCHS + 1))
     assert stored.fitted.rig == read_rig(bench / "rig.toml", specs)
+
+
+def test_programs_are_kept_apart_by_processor(tmp_path):
+    """By its features, as Linux lists them on x86 and ARM; the speed of the moment is none."""
+
+    def processor(text: str) -> str:
+        (tmp_path / "cpuinfo").write_text(text)
+        return common._processor(tmp_path / "cpuinfo")
+
+    narrow, wide = "model name : a\nflags : fpu avx2\n", "model name : a\nflags : fpu avx2 avx512f\n"
+    assert processor(narrow) != processor(wide)
+    assert processor("cpu MHz : 2000\n" + narrow) == processor("cpu MHz : 3000\n" + narrow + wide)
+    assert processor("Features : fp asimd\n") != processor("Features : fp asimd sve\n")
+    assert processor("no such line") == common._processor(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("chosen", [None, "0"])
+def test_log_lines_of_xla_are_off_unless_the_user_wants_them(tmp_path, monkeypatch, chosen):
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen)
+    assert _run("check", tmp_path / "nothing") == 2
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == (chosen or "3")

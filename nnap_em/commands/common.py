@@ -2,7 +2,9 @@
 
 import argparse
 import dataclasses
+import hashlib
 import os
+import platform
 import shlex
 import tempfile
 import warnings
@@ -70,7 +72,7 @@ def set_up() -> None:
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "nnap_em" / "jax"
+    folder = Path(home) / "nnap_em" / "jax" / _processor()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -79,6 +81,15 @@ def set_up() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
         use_cache(Cache(folder / TRACED))
+
+
+def _processor(about: Path = Path("/proc/cpuinfo")) -> str:
+    """Digest of the features of the processor: a program of another one may end with an illegal instruction here."""
+    try:
+        features = next(line for line in about.read_text().splitlines() if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        features = platform.processor() or platform.machine()
+    return hashlib.sha256(features.encode()).hexdigest()[:16]
 
 
 @contextmanager

@@ -98,6 +98,12 @@ def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tu
     return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
 
 
+def _std(values: np.ndarray) -> float:
+    """Standard deviation of the finite values; 0 of none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.std()) if finite.size else 0.0
+
+
 def _mark(warning: object, bad: object = False) -> str:
     return ERROR if bad else WARNING if warning else OK
 
@@ -160,7 +166,7 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
     for i, name in enumerate(rig.measured):
         unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
-        seen, spread = reading_noise(signal), float(np.nanstd(signal))
+        seen, spread = reading_noise(signal), _std(signal)
         declared = rig.noise_std.get(name)
         noisy = max(seen, declared or 0.0) > 0.3 * spread
         alone = name not in model.system.sensors  # of three axes one may sense nothing
@@ -278,9 +284,12 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
     for joint in range(dof):
         name, unit = model.system.rates[joint], model.system.unit(model.system.rates[joint])
         v, seen = _velocity(rig, model, data, along, joint)
-        low, high = np.nanpercentile(v, [1, 99])
-        top = max(-low, high)
         inner = v[np.isfinite(v)]
+        if not inner.size:
+            yield CheckResult(ERROR, "motion", f"joint {joint + 1}{seen}: no velocity, as no sequence can be followed")
+            continue
+        low, high = np.percentile(inner, [1, 99])
+        top = max(-low, high)
         noise = rig.noise_std.get(name, 0.0) if name in rig.measured else 0.0
         if top <= 3 * noise or top < 1e-9:
             yield CheckResult(
@@ -308,6 +317,8 @@ def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales
     system = model.system
     for joint, name in enumerate(system.coordinates):
         v, hidden = _velocity(rig, model, data, along, joint)
+        if not np.isfinite(v).any():
+            continue
         q = np.asarray(data.y)[..., rig.measured.index(name)] if name in rig.measured else along.x[..., joint]
         low, high = np.nanpercentile(q, [1, 99])
         top = float(np.nanpercentile(np.abs(v), 99))
@@ -361,7 +372,7 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     names = model.system.coordinates + model.system.rates
     dof, rows = len(model.system.coordinates), max(2, round(_WIDTH / model.dt))
     x = along.x.reshape(-1, len(names))
-    scale = np.maximum(np.nanstd(x, axis=0), 1e-12)
+    scale = np.maximum([_std(one) for one in x.T], 1e-12)
     noise = np.exp(0.5 * np.asarray(model.log_r))
     grams = []
     for i in range(len(along.x)):

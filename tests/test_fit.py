@@ -240,7 +240,7 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     monkeypatch.setattr(stated, "followed", lambda *_: None)
     monkeypatch.setattr(stated, "open_loop", lambda *_: prediction)
     monkeypatch.setattr(stated, "size", lambda *_: force)
-    hessian = jnp.full((1, 1), 1.0 + likelihood)
+    hessian = RULE.weights(MODEL).prior_precision(MODEL.unknown).at[-1, -1].add(likelihood)
     precision, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     assert size == force
     weight = multistep.weighed(prediction, every)
@@ -248,8 +248,8 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     disagree = np.sum((scores - scores.mean()) ** 2) * 4 / 3
     shared = force**2 * (1 + 4) * (slope * weight.sum()) ** 2
     spread = (disagree + shared) / (1.0 + slope**2 * weight.sum()) ** 2
-    assert float(precision[0, 0]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
-    assert 1.0 <= float(precision[0, 0]) <= 1.0 + likelihood + 1e-9
+    assert float(precision[-1, -1]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
+    assert 1.0 <= float(precision[-1, -1]) <= 1.0 + likelihood + 1e-9
 
 
 def _left(rng, tau: float) -> stated.Errors:

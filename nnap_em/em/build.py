@@ -18,7 +18,7 @@ from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
 from .mstep import COARSE, ScoringMStep
 from .prior import ParameterPrior
-from .readings import RESTS, at_rest, differences, reading_noise
+from .readings import RESTS, at_rest, reading_noise
 from .servos import LAG, build_servos, steps_of_sample, torque_along
 
 NO_MACHINE = "the declared masses and inertias make no machine"
@@ -59,6 +59,13 @@ def build_system(rig: Rig) -> AbstractSystem:
 @eqx.filter_jit
 def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof dof"]:
     return jax.vmap(system.mass)(q)
+
+
+def differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
+    """Differences over `lag` rows, taken `order` times, of all sequences."""
+    for _ in range(order):
+        signal = signal[:, lag:] - signal[:, :-lag]
+    return signal[np.isfinite(signal)]
 
 
 def loads(system: AbstractSystem) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:

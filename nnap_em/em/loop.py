@@ -247,7 +247,7 @@ def fit(
 
 
 def _afresh(state: EMState) -> EMState:
-    """From the likeliest model on, and compared with nothing before."""
+    """The state that goes on from the likeliest model, compared with nothing before."""
     return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
 
 

@@ -214,7 +214,7 @@ class ScoringMStep(AbstractMStep):
         return eqx.tree_at(lambda m: (m.tie, m.rough), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
 
     def stages(self) -> tuple["ScoringMStep", ...]:
-        """Where it begins `coarse`: friction near a viscous, a Coulomb and a constant part, released in steps."""
+        """Friction near a viscous, a Coulomb and a constant part, and released in steps, if it begins `coarse`."""
         if not math.isfinite(float(self.coarse)):
             return (self,)
         widths = (self.coarse * factor for factor in RELEASES)

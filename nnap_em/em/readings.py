@@ -5,14 +5,6 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-
-def differences(signal: Float[np.ndarray, "seq time"], order: int, lag: int) -> Float[np.ndarray, " difference"]:
-    """Differences over `lag` rows, taken `order` times, of all sequences; those with a missing sample are left out."""
-    for _ in range(order):
-        signal = signal[:, lag:] - signal[:, :-lag]
-    return signal[np.isfinite(signal)]
-
-
 REPEATS, CODE = 0.02, 0.02
 """Share of equal neighbours from which on readings are counted as codes, and the quantile of the other changes that is
 the step between two codes: the smallest, but for a share of rounding."""
@@ -22,7 +14,7 @@ MULTIPLE = 0.05
 
 def resolution(signal: Float[np.ndarray, "seq time"]) -> float:
     """Step between the codes of a reading that repeats them; 0 where neighbours hardly ever are equal."""
-    change = np.abs(differences(signal, 1, 1))
+    change = np.abs(np.concatenate([np.diff(y[np.isfinite(y)]) for y in signal]))
     moved = change[change > 0]
     if not 0 < moved.size < (1 - REPEATS) * change.size:
         return 0.0
@@ -34,13 +26,15 @@ def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
     """Standard deviation of white noise on a smooth signal, from its third differences (var = 20 sigma^2).
 
     [Gasser, Sroka & Jennen-Steinmetz 1986, Biometrika 73(3), for the idea] The median makes it blind to jumps. Four
-    equal readings are one code of a sensor at rest and say nothing of its noise, which is at least that of rounding to
+    equal readings are one code of a sensor at rest, and no sample of its noise, which is at least that of rounding to
     its codes, step / sqrt(12).
     """
-    steps = np.diff(signal, axis=-1)
-    still = (steps[:, 2:] == 0) & (steps[:, 1:-1] == 0) & (steps[:, :-2] == 0)
-    d = np.diff(steps, 2, axis=-1)[~still]
-    d = d[np.isfinite(d)]
+    third = []
+    for y in signal:  # missing samples are bridged: held readings may be none in adjacent rows
+        steps = np.diff(y[np.isfinite(y)])
+        still = (steps[2:] == 0) & (steps[1:-1] == 0) & (steps[:-2] == 0)
+        third.append(np.diff(steps, 2)[~still])
+    d = np.concatenate(third)
     smooth = float(np.median(np.abs(d)) / 0.6745 / np.sqrt(20.0)) if d.size else 0.0
     return max(smooth, resolution(signal) / math.sqrt(12))
 
@@ -54,14 +48,19 @@ for the purpose rest in 0 to 0.2 of the rows, those that stick in 0.5 to 0.8."""
 
 
 def _moves(signal: Float[np.ndarray, "seq time"]) -> Bool[np.ndarray, "seq row"]:
-    """Motion from each row to `OVER` later; NaN is none."""
-    return np.abs(signal[:, OVER:] - signal[:, :-OVER]) > MOVES * reading_noise(signal)
+    """Motion from each row to `OVER` later, missing samples bridged."""
+    rows, noise = np.arange(signal.shape[1]), reading_noise(signal)
+    whole = np.zeros_like(signal)
+    for y, known, bridged in zip(signal, np.isfinite(signal), whole, strict=True):
+        if known.any():
+            bridged[:] = np.interp(rows, rows[known], y[known])
+    return np.abs(whole[:, OVER:] - whole[:, :-OVER]) > MOVES * noise
 
 
 def at_rest(signal: Float[np.ndarray, "seq time"]) -> float:
     """Share of the readings of a position at rest."""
-    known = np.isfinite(signal[:, OVER:] - signal[:, :-OVER])
-    return float(np.mean(~_moves(signal)[known])) if known.any() else 0.0
+    inside = np.isfinite(signal[:, :-OVER])
+    return float(np.mean(~_moves(signal)[inside])) if inside.any() else 0.0
 
 
 def onset(y: Float[np.ndarray, "seq time obs"]) -> Int[np.ndarray, " seq"]:

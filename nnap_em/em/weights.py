@@ -85,8 +85,8 @@ class Weights(eqx.Module):
         """
         size, count, dtype = self.centre.shape[0], self.nodes.shape[1], self.centre.dtype
         moved = jax.random.normal(jax.random.key(0), (DRAWS, size), dtype) / jnp.sqrt(jnp.asarray(self.ridge, dtype))
-        torque = jax.vmap(lambda w: jax.vmap(unknown.with_weights(w))(self.nodes.T).T)(self.centre + moved)
-        torque = torque - jnp.mean(torque, axis=0)
+        torque = jax.vmap(lambda w: jax.vmap(unknown.with_weights(w))(self.nodes.T).T)(self.centre[None] + moved)
+        torque = torque - jnp.mean(torque, axis=0, keepdims=True)
         cov = jnp.einsum("sja,sjb->jab", torque, torque) / DRAWS
         cov = cov + ((GRAIN * unknown.scale) ** 2)[:, None, None] * jnp.eye(count, dtype=dtype)[None]
         w = jnp.concatenate([unknown.weights(), jnp.zeros(self.prior.size, dtype)])

@@ -169,7 +169,7 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     ),
     "column twice": (lambda s: s.replace("dtheta1", "theta1"), "column 'theta1'", "2 times", "keep one"),
     "semicolons": (lambda s: s.replace(",", ";").replace(".", ","), "line 1", "missing", "not ';'"),
-    "tabs": (lambda s: s.replace(",", "\t"), "line 1", "missing", "by ',' (not '\\t')"),
+    "tabs": (lambda s: s.replace(",", "\t"), "line 1", "missing", "by ',' (not '\\t')", "or `nnap-em import` it"),
     "decimal commas": (lambda s: s.replace(".", ","), "line 3", "found 8 fields under 4 names", "decimals with '.'"),
     "text": (with_field(12, "u", "n/a"), "line 12, column 'u'", "'n/a'", "write a number"),
     "text in a reading": (
@@ -231,7 +231,7 @@ LOGS = {  # name: (the change of train/01.csv, then the words of the message: pl
     ),
     "a picture": (lambda _: bytes(range(256)) * 9, "line", "not UTF-8", "plain UTF-8"),
     "zero bytes": (with_field(9, "u", "\0\0"), "line 9, column 'u'", "\\x00", "write a number"),
-    "thousands": (with_field(9, "u", '"1,000.5"'), "line 9", "5 fields under 4 names", "decimals with '.'"),
+    "thousands": (with_field(9, "u", '"1,000.5"'), "line 9, column 'u'", "'1,000.5'", "write a number"),
     "underscore": (with_field(9, "u", "1_0"), "line 9, column 'u'", "'1_0'", "write a number"),
     "hexadecimal": (with_field(9, "u", "0x1p-3"), "line 9, column 'u'", "'0x1p-3'", "write a number"),
     "formula": (with_field(9, "theta1", "#REF!"), "line 9, column 'theta1'", "'#REF!'", "leave the field empty"),

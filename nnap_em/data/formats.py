@@ -1,8 +1,10 @@
 """One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with a hint."""
 
+import csv
+import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,7 +16,9 @@ from jaxtyping import Float, Real
 from ..numerics.digits import counted
 from ..storage.files import replace_text
 from .dataset import Array, DataError
+from .mat_structs import mat_columns
 from .rig import nearest
+from .units import TIME
 
 LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
 
@@ -43,13 +47,13 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
 
     Raises DataError that names the row and the column.
     """
-    _check_size(path)
+    check_size(path)
     return _readers[path.suffix.lower()](path, required, gaps)
 
 
 def column_names(path: Path) -> list[str]:
     """The names of the columns of a log, in the order of the file."""
-    _check_size(path)
+    check_size(path)
     return _namers[path.suffix.lower()](path)
 
 
@@ -89,6 +93,23 @@ def header_hint(path: Path) -> str | None:
     return _header_hint(_text(path)) if path.suffix.lower() == ".csv" else None
 
 
+def untimed(path: Path, names: Sequence[str]) -> str | None:
+    """The hint where a column may be meant as the times; None where a table has no such column at all."""
+    like = [name for name in names if TIME.match(name) or difflib.get_close_matches("time", [name.casefold()])]
+    return header_hint(path) or (f"name it 'time' [s], if {like[0]!r} is that" if like else None)
+
+
+def split(line: str, separator: str = ",") -> list[str]:
+    """The fields of a line, which may stand in quotes; without separator they are separated by blanks."""
+    if not separator:
+        return line.split()
+    fields = line.split(separator)
+    if '"' in line:
+        with suppress(csv.Error):  # a field of 128 kB
+            fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [field.strip() for field in fields]
+
+
 def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
     """The names in the header of a CSV file, and the fields of every row under it."""
     text = _text(path)
@@ -109,12 +130,11 @@ def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> F
 
 def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
     """The same of a Parquet file, where null and NaN are missing samples."""
-    file = _parquet_file(path)
-    names = file.schema_arrow.names
-    _check_names(path, names, required, gaps)
+    names = _parquet_columns(path)
+    _check_names(path, list(names), required, gaps)
     with _damaged(path, "Parquet"):
-        table = file.read(columns=[*required, *gaps])
-        columns = {name: table[name].to_numpy() for name in (*required, *gaps)}
+        table = _parquet_file(path).read(columns=list(dict.fromkeys(names[name][0] for name in (*required, *gaps))))
+        columns = {name: _entry(table[names[name][0]], names[name][1]) for name in (*required, *gaps)}
     return _stack(path, columns, gaps)
 
 
@@ -129,16 +149,28 @@ _readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": 
 
 
 def _mat_columns(path: Path) -> dict[str, Any]:
-    """The vectors of a MAT file, or those of the one struct in it."""
+    """The columns of a MAT file: its vectors, those of a struct alone, and those of structs that recorders write."""
     with _damaged(path, "MAT"):
         try:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
-    columns = {name: value for name, value in content.items() if not name.startswith("__")}
-    if len(columns) == 1 and (only := next(iter(columns.values()))).dtype.names:
-        columns = {name: np.asarray(only[name].item()) for name in only.dtype.names}
-    return columns
+    variables = {name: np.asarray(value) for name, value in content.items() if not name.startswith("__")}
+    out: dict[str, Any] = {}
+    for name, column in mat_columns(path, variables):
+        if name in out and not np.array_equal(out[name], column):
+            hint = "save signals of one sample time, with different names, to a file"
+            refuse(path, f"column {name!r}", "stands there twice with different numbers", hint)
+        out |= _entries(name, np.asarray(column))
+    return out
+
+
+def _entries(name: str, column: np.ndarray) -> dict[str, np.ndarray]:
+    """A vector; the columns of a matrix, `yout[0]` and so on, which is longer than wide."""
+    if column.ndim != 2 or column.dtype.kind not in "iuf":
+        return {name: column}
+    columns = column.T if column.shape[0] > column.shape[1] else column
+    return {f"{name}[{i}]": each for i, each in enumerate(columns)}
 
 
 def _parquet_file(path: Path) -> Any:
@@ -151,9 +183,31 @@ def _parquet_file(path: Path) -> Any:
         return parquet.ParquetFile(path)
 
 
+def _parquet_columns(path: Path) -> dict[str, tuple[str, int | None]]:
+    """The columns by their names; where a row holds a list, one for each entry of the first."""
+    file, out = _parquet_file(path), {}
+    with _damaged(path, "Parquet"):
+        for field in file.schema_arrow:
+            if "list" not in str(field.type):
+                out[field.name] = (field.name, None)
+                continue
+            first = next(file.iter_batches(1, columns=[field.name]))[0][0].as_py() or ()
+            out |= {f"{field.name}[{i}]": (field.name, i) for i in range(len(first))}
+    return out
+
+
+def _entry(column: Any, index: int | None) -> np.ndarray:
+    """One column, or one entry of the list in each of its rows."""
+    if index is None:
+        return column.to_numpy()
+    from pyarrow import compute
+
+    return compute.call_function("list_element", [column, index]).to_numpy()
+
+
 _namers: dict[str, Callable[[Path], list[str]]] = {
     ".csv": lambda path: _header(_text(path)),
-    ".parquet": lambda path: list(_parquet_file(path).schema_arrow.names),
+    ".parquet": lambda path: list(_parquet_columns(path)),
     ".mat": lambda path: list(_mat_columns(path)),
 }
 
@@ -176,7 +230,8 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
 
-def _check_size(path: Path) -> None:
+def check_size(path: Path) -> None:
+    """Raise DataError where a file cannot be read, or is too large to be one sequence."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -190,11 +245,18 @@ def _unreadable(path: Path, error: OSError) -> DataError:
     return DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights")
 
 
-def _text(path: Path) -> str:
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The first bytes of a file, or all."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with path.open("rb") as file:
+            return file.read(most)
     except OSError as error:
         raise _unreadable(path, error) from None
+
+
+def _text(path: Path) -> str:
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise DataError(f"{path}: line {line}: not UTF-8; save the file as plain UTF-8 text") from None
@@ -204,7 +266,7 @@ def _text(path: Path) -> str:
 
 
 def _header(text: str) -> list[str]:
-    return [name.strip().strip('"').strip() for name in text.split("\n", 1)[0].split(",")]
+    return split(text.split("\n", 1)[0])
 
 
 def _ends(text: str) -> tuple[str, str]:
@@ -242,8 +304,8 @@ def _rows(path: Path, text: str) -> list[list[str]]:
         refuse(
             path, f"line {len(lines)}", f"found {counted(len(lines) - 1, 'row')}", "write a header and 2 rows or more"
         )
-    rows = [line.split(",") for line in lines[1:]]
-    names = lines[0].count(",") + 1
+    rows = [split(line) if '"' in line else line.split(",") for line in lines[1:]]
+    names = len(split(lines[0]))
     for number, row in enumerate(rows, 2):
         if len(row) != names:
             hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
@@ -267,10 +329,10 @@ def _check_names(
     for name in every:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            other = "; or correct [input] columns in rig.toml" if name in required and name != "time" else ""
-            refuse(
-                path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) + other if spare else alone)
-            )
+            other = "or correct [input] columns in rig.toml" if name in required else ""
+            other = "or `nnap-em import` it: it reads other names, separators and clocks" if name == "time" else other
+            mend = hint or (nearest(name, spare) if spare else alone)
+            refuse(path, f"{line}column {name!r}", "missing", f"{mend}; {other}" if other and (spare or hint) else mend)
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 

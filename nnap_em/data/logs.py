@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from ..numerics.digits import counted
 from .constant import FULL
 from .dataset import DataError, Dataset, pad
-from .formats import log_files, place, read_table, refuse
+from .formats import column_names, log_files, place, read_table, refuse, untimed
 from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
@@ -156,7 +156,13 @@ class _Sequence(NamedTuple):
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    table = read_table(path, ("time", *rig.logged_inputs), rig.measured)
+    names = column_names(path)
+    clock = ("time",) if "time" in names or untimed(path, names) else ()
+    table = read_table(path, (*clock, *rig.logged_inputs), rig.measured)
+    if not clock:
+        problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
+        warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)
+        table = np.column_stack([rig.dt * np.arange(len(table)), table])
     _check_scales(path, table, rig)
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
 

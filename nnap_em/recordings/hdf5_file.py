@@ -1,6 +1,5 @@
 """HDF5 files: a group with a time axis is a topic, its data sets are the fields."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,12 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
+from ..data.units import TIME, UNITS
 from .clock import rising
 from .objects import MOST
 from .recording import EXTRA, Recording, Topic, Track, refuse
 
-TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
-UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9}
 MARKS = ("axis", "kind", "role", "standard_name")
 """Attributes that mark a data set as the time."""
 _BLOCK = 2**18

@@ -16,7 +16,7 @@ from .columns import declared_at, resolve
 from .declared import Plan
 from .delays import Delay, delay, pairs
 from .files import reader
-from .recording import Address, Recording, Topic, Track, refuse
+from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
 from .segments import LEAST, Gap, Segment, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .signals import SLOW, Signal, averaged, held, interpolated
 
@@ -93,11 +93,18 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
     for at in every.values():
         fields.setdefault(at.topic, []).append(at.path)
     recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()})
+    recording = recording._replace(tracks={topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     signals = {name: _signal(recording, name, at, clocks[at.topic]) for name, at in every.items()}
     facts = tuple(_facts(topic, recording, addresses, origin, plan, rig.dt) for topic in topics)
     return _gridded(recording, origin, rig, states, plan, addresses, signals, facts)
+
+
+def _timed(track: Track, dt: float) -> Track:
+    """A table without times, its rows `dt` apart, as the rig declares."""
+    note = f"no times in the table: rows are taken as dt = {dt:g} s apart"
+    return track if track.clock != UNTIMED else track._replace(t=np.round(track.t * dt).astype(np.int64), notes=(note,))
 
 
 def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"]) -> Signal:

@@ -7,6 +7,13 @@ _UNITS = {  # of parameters and states, by their names
     r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
     r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
 }  # fmt: skip
+TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
+"""Names of a column of times, and its unit."""
+UNITS = {
+    "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "microseconds": 1e-6,
+    "ns": 1e-9, "nanoseconds": 1e-9, "days": 86400.0,
+}  # fmt: skip
+"""Seconds in the units of times."""
 
 
 def parameter_unit(name: str) -> str:
@@ -20,9 +27,10 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
     return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
 
 
-def thousandfold(ratio: float) -> bool:
-    """True where one of two intervals that should be the same is in ms, the other in s."""
-    return 0.99 < ratio / 1000 < 1.01 or 0.99 < ratio * 1000 < 1.01
+def unit_between(ratio: float) -> str:
+    """Unit of one of two intervals that should be the same, of which the other is in s; empty where there is none."""
+    units = ("ms", "us", "ns", "days")
+    return next((unit for unit in units for x in (ratio, 1 / ratio) if 0.99 < x * UNITS[unit] < 1.01), "")
 
 
 def joint_called(coordinates: Sequence[str], joint: int) -> str:

@@ -3,11 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from ..data.formats import column_names, header_hint, read_table
-from .clock import rising
-from .hdf5_file import TIME, UNITS
+from ..data.formats import column_names, header_hint, read_log
+from ..data.units import TIME
+from .clock import nanoseconds, rising
 from .recording import Recording, Topic, Track, refuse
 
 
@@ -21,11 +19,11 @@ def topics(path: Path) -> tuple[Topic, ...]:
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     name = _clock(path, column_names(path))
-    table = read_table(path, (name,), fields[""])
-    scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
-    t = np.round(table[:, 0] * scale * 1e9).astype(np.int64)
+    table = read_log(path, name, fields[""])
+    match = TIME.match(name)
+    t = nanoseconds(path, f"column {name!r}", table[:, 0], (match and match[1]) or "")
     clock = rising(path, f"column {name!r}", t, name)
-    values = {column: table[clock.used, i] for i, column in enumerate(fields[""], 1)}
+    values = {column: clock.take(table[:, i]) for i, column in enumerate(fields[""], 1)}
     return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
 
 

@@ -380,6 +380,8 @@ CHANGE = {  # times and values of commands, and whether each holds until the nex
     "a slow stream": (0.98 * _SLOW, _SLOW, False),
     "irregular": (np.cumsum(rng.exponential(0.05, 300)), rng.normal(size=300), True),
     "jitter": (T + 0.4 * DT * rng.uniform(-1, 1, T.size), np.cos(T), False),
+    "two rates": (np.r_[0.04 * np.arange(200), 12 + DT * np.arange(150)], rng.normal(size=350), False),
+    "three rates": (np.cumsum(np.repeat([0.04, 0.01, 0.2], 100)), rng.normal(size=300), False),
     "half lost": (T[rng.uniform(size=T.size) < 0.5], rng.normal(size=1000), False),
     "stands still in one silence": (_LOST[0], np.cos(T), False),
     "in two": (_LOST[1], np.cos(T), True),

@@ -19,10 +19,10 @@ FEW = 10
 """Intervals between commands from which on they may have a rate."""
 SET_POINT = 0.5
 """Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream."""
-REGULAR = 0.4
-"""Share of intervals within half of their lower quartile from which on commands have a rate.
+REGULAR = 0.45
+"""Share of intervals near their median, or near the one before, from which on commands have a rate.
 
-With half the messages lost it is 0.5, for times by chance 0.22.
+With half the messages lost it is 0.5 or more, for times by chance 0.35.
 """
 CHANCE = 0.01
 """Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
@@ -67,8 +67,9 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     steps = np.diff(signal.t)
     if steps.size < FEW or signal.interval >= SET_POINT:
         return True
-    usual = np.quantile(steps, 0.25)
-    if np.mean((steps >= 0.5 * usual) & (steps <= 1.5 * usual)) < REGULAR:
+    usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
+    alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes
+    if max(usual, alike) < REGULAR:
         return True
     silent = steps > longest_silence(signal, dt, None)
     if not silent.any():

@@ -13,7 +13,7 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
 from nnap_em.recordings.delays import Pair, delay
-from nnap_em.recordings.segments import cut
+from nnap_em.recordings.segments import Segment, cut
 from nnap_em.recordings.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.systems import specs
 
@@ -195,11 +195,9 @@ def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
 
 
 def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
-    valid = np.ones(1000, bool)
-    valid[400:410] = False
-    pieces = cut(valid, 50, 150)
-    assert [(p.first, p.end) for p in pieces] == [
-        (0, 133), (133, 267), (267, 400), (410, 558), (558, 705), (705, 852), (852, 1000)
+    pieces = cut([Segment(0.0, 400), Segment(4.1, 590)], DT, 50, 150)
+    assert [(round(p.start / DT), p.rows) for p in pieces] == [
+        (0, 133), (133, 134), (267, 133), (410, 148), (558, 147), (705, 147), (852, 148)
     ]  # fmt: skip
 
 

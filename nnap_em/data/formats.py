@@ -5,6 +5,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,7 +21,8 @@ from .mat_structs import mat_columns
 from .rig import nearest
 from .units import TIME
 
-LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
+LARGEST = 256 * 2**20  # bytes of the file of one sequence: some million rows
+BLOCK = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
 
 
 def has_logs(folder: Path) -> bool:
@@ -51,9 +53,13 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
     return _readers[path.suffix.lower()](path, required, gaps)
 
 
+def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+    """The same of a log of any size, whose times may be dates [s since 1970]."""
+    return _readers[path.suffix.lower()](path, required, gaps, dates=True)
+
+
 def column_names(path: Path) -> list[str]:
     """The names of the columns of a log, in the order of the file."""
-    check_size(path)
     return _namers[path.suffix.lower()](path)
 
 
@@ -112,37 +118,54 @@ def split(line: str, separator: str = ",") -> list[str]:
 
 def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
     """The names in the header of a CSV file, and the fields of every row under it."""
-    text = _text(path)
-    return _header(text), _rows(path, text)
+    names = split(_first_line(path))
+    return names, [row for first, lines in _blocks(path) for row in _fields(path, names, first, lines)]
 
 
-def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_csv(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The columns `required`, then `gaps`, of a CSV file with a header, in file units; NaN = empty field (`gaps` only).
 
-    Raises DataError that names the line and the column.
+    `dates`: texts of `required` may be dates of ISO 8601.  Raises DataError that names the line and the column.
     """
-    text = _text(path)
-    names = _header(text)
-    _check_names(path, names, required, gaps, "line 1, ", _header_hint(text))
-    columns = list(zip(*_rows(path, text), strict=True))
-    return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
+    names = split(_first_line(path))
+    every = (*required, *gaps)
+    if not set(every) <= set(names) or len(set(names)) < len(names):
+        _check_names(path, names, required, gaps, "line 1, ", header_hint(path))
+    places = [names.index(name) for name in every]
+    table = np.empty((_lines(path), len(every)), order="F")
+    end, lines = 0, []
+    for end, lines in _blocks(path):
+        block = table[end : end + len(lines)]
+        if (plain := _plain(lines, len(names))) is not None:
+            block[:] = plain[:, places]
+            continue
+        columns = list(zip(*_fields(path, names, end, lines), strict=True))
+        for k, name in enumerate(every):
+            block[:, k] = _numbers(path, name, columns[places[k]], name in gaps, end, dates and name in required)
+    return table[: end + len(lines)]
 
 
-def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_parquet(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The same of a Parquet file, where null and NaN are missing samples."""
     names = _parquet_columns(path)
     _check_names(path, list(names), required, gaps)
     with _damaged(path, "Parquet"):
         table = _parquet_file(path).read(columns=list(dict.fromkeys(names[name][0] for name in (*required, *gaps))))
         columns = {name: _entry(table[names[name][0]], names[name][1]) for name in (*required, *gaps)}
-    return _stack(path, columns, gaps)
+    return _stack(path, columns, gaps, dates)
 
 
-def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_mat(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
     columns = _mat_columns(path)
     _check_names(path, list(columns), required, gaps)
-    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps)
+    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps, dates)
 
 
 _readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
@@ -206,7 +229,7 @@ def _entry(column: Any, index: int | None) -> np.ndarray:
 
 
 _namers: dict[str, Callable[[Path], list[str]]] = {
-    ".csv": lambda path: _header(_text(path)),
+    ".csv": lambda path: split(_first_line(path)),
     ".parquet": lambda path: list(_parquet_columns(path)),
     ".mat": lambda path: list(_mat_columns(path)),
 }
@@ -265,8 +288,20 @@ def _text(path: Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _header(text: str) -> list[str]:
-    return split(text.split("\n", 1)[0])
+def _first_line(path: Path) -> str:
+    """The first line of a text file; DataError where it cannot be read."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            line = file.readline()
+    except (OSError, UnicodeDecodeError):
+        line = ""
+    return line.rstrip("\n") if line.strip() else _text(path).split("\n", 1)[0]
+
+
+def _lines(path: Path) -> int:
+    """Number of lines of a text file at most."""
+    with path.open("rb") as file:
+        return 1 + sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: file.read(BLOCK), b""))
 
 
 def _ends(text: str) -> tuple[str, str]:
@@ -297,22 +332,48 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _rows(path: Path, text: str) -> list[list[str]]:
-    """The fields of every row under the header, as many as it has names."""
-    lines = text.rstrip().split("\n")
-    if len(lines) < 3:
-        refuse(
-            path, f"line {len(lines)}", f"found {counted(len(lines) - 1, 'row')}", "write a header and 2 rows or more"
-        )
-    rows = [split(line) if '"' in line else line.split(",") for line in lines[1:]]
-    names = len(split(lines[0]))
-    for number, row in enumerate(rows, 2):
-        if len(row) != names:
+def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The lines under the header in blocks, each with the number of its first, from 0; without blank ones at the end.
+
+    Two rows at least, or a DataError.
+    """
+    count, lines = 0, []
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            file.readline()
+            while block := file.readlines(BLOCK):
+                lines += block
+                blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
+                lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]
+                if lines:
+                    yield count, lines
+                count, lines = count + len(lines), rest
+    except UnicodeDecodeError:
+        _text(path)
+    if count < 2:
+        refuse(path, f"line {count + 1}", f"found {counted(count, 'row')}", "write a header and 2 rows or more")
+
+
+def _plain(lines: Sequence[str], columns: int) -> Float[np.ndarray, "row column"] | None:
+    """All fields of the lines at full speed; None where one is no finite number, or they are not so many in each."""
+    try:
+        table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return table if table.shape == (len(lines), columns) and np.isfinite(table).all() else None
+
+
+def _fields(path: Path, names: Sequence[str], first: int, lines: Sequence[str]) -> list[list[str]]:
+    """The fields of lines, as many as there are names; the first line is row `first`."""
+    rows = [split(line) for line in lines]
+    for number, row in enumerate(rows, first + 2):
+        if len(row) != len(names):
             hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
-            problem = f"found {counted(len(row), 'field')} under {counted(names, 'name')}"
-            refuse(path, f"line {number}", problem, _separator_hint(text) or hint)
-    if not any(map(_is_number, rows[0])):
-        refuse(path, "line 2", f"holds no number, found {lines[1]!r}", _header_hint(text) or "remove the row of units")
+            problem = f"found {counted(len(row), 'field')} under {counted(len(names), 'name')}"
+            refuse(path, f"line {number}", problem, _separator_hint(_text(path)) or hint)
+    if first == 0 and not any(map(_is_number, rows[0])):
+        problem = f"holds no number, found {','.join(rows[0])!r}"
+        refuse(path, "line 2", problem, header_hint(path) or "remove the row of units")
     return rows
 
 
@@ -337,8 +398,10 @@ def _check_names(
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
 
-def _numbers(path: Path, name: str, texts: Sequence[str], gaps: bool) -> Float[np.ndarray, " time"]:
-    """The numbers of one column at full speed; where that fails, field by field to find the mistake."""
+def _numbers(
+    path: Path, name: str, texts: Sequence[str], gaps: bool, first: int, dates: bool
+) -> Float[np.ndarray, " time"]:
+    """The numbers of one column at full speed; where that fails, field by field to find the mistake or the date."""
     try:
         values = np.array([float(text) if text else math.nan for text in texts])
         plain = np.isfinite(values).all() if not gaps else not np.isinf(values).any()
@@ -346,17 +409,33 @@ def _numbers(path: Path, name: str, texts: Sequence[str], gaps: bool) -> Float[n
             return values
     except ValueError:
         pass
-    return np.array([_number(path, name, row, text.strip(), gaps) for row, text in enumerate(texts)])
+    return np.array([_number(path, name, row, text.strip(), gaps, dates) for row, text in enumerate(texts, first)])
 
 
-def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
+def _number(path: Path, name: str, row: int, text: str, gaps: bool, dates: bool) -> float:
     try:
         value = float(text.replace("_", "?") or "nan")
     except ValueError:
-        value = math.inf
+        value = seconds(text) if dates else math.inf
     if math.isinf(value) or (math.isnan(value) and not gaps):
         _no_number(path, name, row, repr(text), math.isnan(value), gaps)
     return value
+
+
+def seconds(text: str) -> float:
+    """Seconds since 1970 of a date and a time of ISO 8601, UTC where it names no zone; infinite for another text."""
+    try:
+        moment = datetime.fromisoformat(text.strip().strip('"').replace("/", "-"))
+    except ValueError:
+        return math.inf
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def dated(values: np.ndarray) -> Float[np.ndarray, " time"]:
+    """Seconds since 1970 of dates or of their texts; infinite for another text."""
+    if values.dtype.kind in "Mm":
+        return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) * 1e-9
+    return np.array([seconds(text.decode() if isinstance(text, bytes) else str(text)) for text in values.tolist()])
 
 
 def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
@@ -364,13 +443,17 @@ def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: 
     refuse(path, place(path, name, row), f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
-def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+def _stack(
+    path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool
+) -> Float[np.ndarray, "time column"]:
     """Columns of numbers side by side, checked as those of a CSV file are."""
     rows = np.size(next(iter(columns.values())))
     if rows < 2:
         refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
     out = []
     for name, values in columns.items():
+        if dates and name not in gaps and values.dtype.kind in "MmOSU":
+            values = dated(values)
         if values.dtype.kind not in "iuf":
             refuse(path, f"column {name!r}", f"holds {values.dtype}, no numbers", "store it as 64-bit floating point")
         if values.shape != (rows,):

@@ -21,7 +21,10 @@ TIME = re.compile(
     re.IGNORECASE,
 )
 """Names of a column of times, and its unit."""
-UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9}
+UNITS = {
+    "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "µs": 1e-6,
+    "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "days": 86400.0,
+}  # fmt: skip
 """Seconds in the units of times."""
 _UNIT = re.compile(rf"(.+?)(?:[ _,]*[\[(]|[ _,]+)({'|'.join(SIZES)})[\])]?$", re.IGNORECASE)
 _BRACKETS = re.compile(rf"(.+?)[ _,]*[\[(]({'|'.join(SIZES)})[\])]$", re.IGNORECASE)
@@ -44,9 +47,10 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
     return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
 
 
-def thousandfold(ratio: float) -> bool:
-    """True where one of two intervals that should be the same is in ms, the other in s."""
-    return 0.99 < ratio / 1000 < 1.01 or 0.99 < ratio * 1000 < 1.01
+def unit_between(ratio: float) -> str:
+    """Unit of one of two intervals that should be the same, of which the other is in s; empty where there is none."""
+    units = ("ms", "us", "ns", "days")
+    return next((unit for unit in units for x in (ratio, 1 / ratio) if 0.99 < x * UNITS[unit] < 1.01), "")
 
 
 def joint_called(coordinates: Sequence[str], joint: int) -> str:

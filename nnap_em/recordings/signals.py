@@ -23,7 +23,7 @@ class Signal:
     @cached_property
     def interval(self) -> float:
         """Median time from one value to the next [s]."""
-        return float(np.median(np.diff(self.t))) if self.t.size > 1 else np.inf
+        return float(np.median(np.diff(self.t), overwrite_input=True)) if self.t.size > 1 else np.inf
 
 
 def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
@@ -57,13 +57,17 @@ def interpolated(
     exact = np.minimum(np.abs(x - t[right]), np.abs(x - t[right - 1])) <= slack
     known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((width <= reach) | exact)
     if signal.interval > SLOW * dt:
-        nearest = np.round((t - at[0]) / dt).astype(int)
-        hit = np.zeros(at.size, bool)
-        hit[nearest[(nearest >= 0) & (nearest < at.size)]] = True
-        known &= hit
+        known &= np.searchsorted(t, at + dt / 2) > np.searchsorted(t, at - dt / 2)
     share = (x - t[right - 1]) / width
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
     return np.where(known, y, np.nan), known
+
+
+def between(signal: Signal, start: float, end: float) -> Signal:
+    """The part of a signal with its values from start to end [s]."""
+    first, last = np.searchsorted(signal.t, (start, end))
+    part = slice(max(int(first) - 1, 0), int(last) + 1)
+    return Signal(signal.topic, signal.t[part], signal.y[part])
 
 
 def integrals(signal: Signal, at: Float[np.ndarray, " x"], times: int, *, steps: bool) -> Float[np.ndarray, " x"]:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.formats import column_names, read_table, refuse, untimed
-from ..data.units import TIME, UNITS
-from .clock import rising
+from ..data.formats import column_names, read_log, refuse, untimed
+from ..data.units import TIME
+from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
 EPISODE = re.compile(r"episode(_index|_id)?", re.IGNORECASE)
@@ -30,14 +30,14 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     names = column_names(path)
     name, episode = _clock(path, names), [each for each in names if EPISODE.fullmatch(each)][:1]
-    table = read_table(path, (*((name,) if name else ()), *episode), fields[""])
+    table = read_log(path, (*((name,) if name else ()), *episode), fields[""])
     values = dict(zip(fields[""], table[:, table.shape[1] - len(fields[""]) :].T, strict=True))
     if name is None:
         return Recording(path, {"": Track(SECOND * np.arange(len(table)), values, UNTIMED, ())})
-    scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
-    t = np.round(table[:, 0] * scale * SECOND).astype(np.int64)
-    clock = rising(path, f"column {name!r}", _in_a_row(t, table[:, 1]) if episode else t, name)
-    values = {column: y[clock.used] for column, y in values.items()}
+    match, where = TIME.match(name), f"column {name!r}"
+    t = nanoseconds(path, where, table[:, 0], ((match and match[1]) or "").lower())
+    clock = rising(path, where, _in_a_row(t, table[:, 1]) if episode else t, name)
+    values = {column: clock.take(y) for column, y in values.items()}
     return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
 
 

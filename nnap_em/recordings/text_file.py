@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.formats import check_size, read_bytes, refuse, split
-from ..data.units import SIZES, TIME, UNITS
+from ..data.formats import check_size, read_bytes, refuse, seconds, split
+from ..data.units import SIZES, TIME
 from ..numerics.digits import counted
-from .clock import rising
+from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
 HEAD, LINES = 2**18, 200
@@ -86,7 +86,7 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
             tracks[topic] = Track(SECOND * np.arange(len(values[names[0]])), values, UNTIMED, ())
         else:
             clock = rising(path, f"column {block.clock!r}", block.t, block.clock)
-            tracks[topic] = Track(clock.t, {n: y[clock.used] for n, y in values.items()}, clock.name, clock.notes)
+            tracks[topic] = Track(clock.t, {n: clock.take(y) for n, y in values.items()}, clock.name, clock.notes)
     return Recording(path, tracks)
 
 
@@ -146,7 +146,7 @@ def _header(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -
     times = [i for i, name in enumerate(names) if TIME.match(name)]
     match = TIME.match(names[times[0]]) if times else None
     clocks = tuple(i for i in times if names[i] == names[times[0]])
-    return Layout(marks, len(head), names, clocks, ((match and match[1]) or "s").lower())
+    return Layout(marks, len(head), names, clocks, ((match and match[1]) or "").lower())
 
 
 DIALECTS = (_twincat, _labview, _header)
@@ -233,11 +233,13 @@ def _nanoseconds(path: Path, name: str, cells: Cells, unit: str, decimal: str) -
     """The times; ticks in whole numbers, of which floating point holds 16 digits."""
     if empty := [line for line, text in cells if not text]:
         refuse(path, f"line {empty[0]}, column {name!r}", "holds no time", "write it, or cut the row")
+    if cells and not math.isinf(seconds(cells[0][1])):
+        cells, unit = [(line, str(seconds(text))) for line, text in cells], "s"
     t = _floats(path, name, cells, decimal)
     if unit == "ticks":
         whole = [int(text) if text.isdecimal() else int(x) for (_, text), x in zip(cells, t, strict=True)]
         return np.array([100 * (ticks - TICKS_1970) for ticks in whole])
-    return np.round(t * UNITS[unit] * SECOND).astype(np.int64)
+    return nanoseconds(path, f"column {name!r}", t, unit)
 
 
 def _floats(path: Path, name: str, cells: Cells, decimal: str) -> Float[np.ndarray, " row"]:

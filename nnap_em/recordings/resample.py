@@ -1,7 +1,7 @@
 """One log on the grid of its rig: columns, sequences, and an account of what was done."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +13,10 @@ from ..data.rig import Rig, nearest
 from ..data.units import thousandfold
 from ..numerics.digits import counted
 from .columns import declared_at, resolve
-from .declared import Plan
+from .declared import LONGEST, Plan
 from .delays import Delay, delay, pairs
 from .files import reader
+from .readings import as_taken
 from .recording import Address, Recording, Topic, Track, refuse
 from .segments import LEAST, Gap, Segment, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
 from .signals import SLOW, Signal, averaged, held, interpolated
@@ -75,11 +76,22 @@ class Resampled(NamedTuple):
     notes: tuple[str, ...]
 
 
-def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Resampled:
+def resample(
+    path: Path,
+    rig: Rig,
+    states: Sequence[str],
+    plan: Plan,
+    shifts: Mapping[str, float],
+    unwrap: Collection[str] = (),
+) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 
+    The columns to `unwrap` lose the jumps of their counters.
     Raises DataError where a column cannot be had.
     """
+    for name in unwrap:
+        if name not in (known := (*rig.logged_inputs, *rig.measured)):
+            raise DataError(f"{path}: --unwrap {name}: no column of this rig; {nearest(name, known)}")
     source = reader(path)
     topics = source.topics(path)
     addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
@@ -97,6 +109,8 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     signals = {name: _signal(recording, name, at, clocks[at.topic]) for name, at in every.items()}
     facts = tuple(_facts(topic, recording, addresses, origin, plan, rig.dt) for topic in topics)
+    signals, notes = as_taken(signals, rig, unwrap)
+    recording = recording._replace(notes=(*recording.notes, *notes))
     return _gridded(recording, origin, rig, states, plan, addresses, signals, facts)
 
 
@@ -132,12 +146,10 @@ def _gridded(
     longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
     present = _present(inputs, readings, at, rig.dt, longest)
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
+    longest_part = max(round((plan.longest or LONGEST) / rig.dt), 2 if plan.longest else 10 * LEAST)
     columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
     columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
-    segments = [
-        _checked(segment, columns, rig.measured)
-        for segment in cut(present, shortest, max(round(plan.longest / rig.dt), 2))
-    ]
+    segments = [_checked(segment, columns, rig.measured) for segment in cut(present, shortest, longest_part)]
     used = [segment for segment in segments if not segment.why]
     if not used:
         most = max((segment.end - segment.first for segment in segments), default=0)

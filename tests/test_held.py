@@ -52,6 +52,11 @@ def test_an_encoder_holds_nothing(signal, step):
     assert hold([_encoder(signal, step)]) == 1.0
 
 
+def test_missing_samples_are_no_hold():
+    assert hold([np.where(np.random.default_rng(1).random(T.size) < 0.6, np.nan, ANGLE)]) == 1.0
+    assert hold([np.where(np.arange(T.size) % 4, np.nan, ANGLE)]) == 1.0
+
+
 def test_a_rest_of_a_held_sensor_keeps_its_share_of_readings():
     y, _ = _held(_encoder(STOP), [5])
     left = np.setdiff1d(np.arange(y.size), repeats(y, hold([y])))

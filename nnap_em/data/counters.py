@@ -115,7 +115,10 @@ def _sign(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
     far = np.where(np.abs(x[at]) > np.abs(x[at - 1]), x[at], x[at - 1])
     step = (np.abs(before) + np.abs(after)) / (2 * _FIT)
     beyond = np.maximum(step - np.abs(x[at] + x[at - 1] - far), 0.0) * np.sign(after * far)
-    size = _simplest(float(np.median((np.abs(far) - beyond)[turned])), float(np.median(step[turned])), x)
+    size = float(np.median((np.abs(far) - beyond)[turned]))
+    if size < reach / 3:  # it is half the range at least
+        return None
+    size = _simplest(size, float(np.median(step[turned])), x)
     sign = np.abs(x - np.copysign(size, far[0])) < np.abs(x)
     z = np.where(sign, np.copysign(size, x) - x, x)
     return (size, sign.astype(int), True) if _sure(int(turned.sum()), size, x) and _smooth(z, t, size) else None
@@ -182,8 +185,8 @@ def _measured(
         rows = slice(max(i - _FIT, 0), i + _FIT)
         base = np.vander((t[rows] - t[i]) / (t[rows][-1] - t[rows][0]), 4)
         sizes.append(-np.linalg.lstsq(np.column_stack([base, turns[rows]]), x[rows], rcond=None)[0][-1])
-    size = float(np.median(sizes))
-    size = size if abs(size - rough) < _SMOOTH * rough else rough
+    if not sizes or abs((size := float(np.median(sizes))) - rough) >= _SMOOTH * rough:
+        return rough
     return _simplest(size, 12 * noise(x + size * turns) / math.sqrt(len(sizes)), x)
 
 

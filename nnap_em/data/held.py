@@ -9,8 +9,8 @@ from .constant import runs
 
 HELD = 1.5
 """Mean rows of a reading from which on the repeats are taken as missing: below, most rows hold one of their own."""
-_QUANTA = 2.5  # steps of the sensor: a reading that has moved on by more would have changed every row
-_CHANGES = 20  # of a moving signal, from which on the rows between them show a hold
+_QUANTA = 3.5  # steps of the sensor: a reading that has moved on by more would have changed every row
+_CHANGES = 8  # of a moving signal, from which on the rows between them show a hold
 _JITTER = 0.3  # share of the rows by which a hold varies; one at least
 _REGULAR = 0.9  # share of the holds that keep to it
 
@@ -37,15 +37,15 @@ def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
 
 def repeats(y: Float[np.ndarray, " time"], rows: float) -> Int[np.ndarray, " row"]:
     """Rows that hold a reading over again, where each stands in so many; equal readings at rest are as many as fit."""
-    first, end = np.array(runs(y), int).reshape(-1, 2).T
+    k = np.flatnonzero(np.isfinite(y))
+    first, end = np.array(runs(y[k]), int).reshape(-1, 2).T
     count = np.maximum(np.round((end - first) / rows), 1).astype(int)
     part = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     new = np.repeat(first, count) + np.round(part * np.repeat((end - first) / count, count)).astype(int)
-    return np.setdiff1d(np.flatnonzero(np.isfinite(y)), new)
+    return np.delete(k, new)
 
 
 def _changes(y: Float[np.ndarray, " time"]) -> tuple[Int[np.ndarray, " change"], Float[np.ndarray, " change"]]:
-    """Rows of new readings, and how far they are from the last."""
-    k = np.flatnonzero(np.isfinite(y))
-    size = np.abs(np.diff(y[k]))
-    return k[1:][size > 0], size[size > 0]
+    """Numbers of the readings that are new, and how far they are from the last."""
+    size = np.abs(np.diff(y[np.isfinite(y)]))
+    return np.flatnonzero(size), size[size > 0]

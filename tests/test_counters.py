@@ -62,15 +62,21 @@ def test_a_jump_in_a_gap_is_found(lost):
     assert np.ptp(error) < 1e-3
 
 
+BOUNCES = np.sign(np.sin(4 * T)) * (1 - 0.1 * (4 * T / np.pi % 1))
 MACHINES = {
     "smooth": (ANGLE, {"angle": True}),
     "noise": (NOISE, {"angle": True}),
-    "encoder between two steps": (np.round(0.5 + 0.3 * NOISE), {"angle": True}),
+    "encoder between two steps": (np.round(0.3 + 0.4 * np.sin(5 * T)), {"angle": True}),
+    "encoder among three steps": (np.round(0.8 * NOISE), {}),
     "coarse encoder": (np.round(2 * ANGLE), {}),
     "spike": (ANGLE + 50 * (T[200] == T), {"angle": True}),
     "dropouts": (np.where(np.abs(NOISE) > 2.2, 0.0, ANGLE + 20), {}),
     "table of four stations": (90 * np.floor(T) % 360 + 0.1 * NOISE, {}),
-    "bounces": (np.sign(np.sin(4 * T)) * (1 - 0.1 * (4 * T / np.pi % 1)), {"rate": True}),
+    "a jump inside the range": (np.where(T < 3, T, T - 2.6), {}),
+    "table of two stations": (np.floor(T) % 2 + 0.01 * NOISE, {}),
+    "bounces": (BOUNCES, {"rate": True}),
+    "bounces of an axis": (BOUNCES, {}),
+    "bounces that speed up": (np.sign(np.sin(4 * T)) * (1 + 0.1 * (4 * T / np.pi % 1)), {}),
     "kicks of a coasting cart": (2.0 - T % 1, {"rate": True}),
     "a kick at rest": (np.where(T < 2.9, 0.3 * np.exp(-T) - 0.018, 0.98 * np.exp(2.9 - T)), {"rate": True}),
     "too fast for its rows": (np.sin(250 * T), {"angle": True}),

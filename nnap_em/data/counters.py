@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from .spikes import LONGEST, noise
 
 _JUMP = 0.4  # share of the range of the readings: sign and magnitude jump by half of theirs
-_RANGE = (0.9, 1.6)  # size of a jump over the range: a counter may not have reached its ends
+_WHOLE = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
 _SMOOTH = 0.2  # of the size: steps that deviate by less from those around, once unwrapped
 _FEW = 0.01  # share of the steps that may deviate by more: impacts, spikes
 _SPANS = (5, 20, 80)  # readings on either side of a jump that show the motion: slow ones need many
@@ -86,9 +86,10 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
     """A counter that goes on at the other end of its range."""
     miss = np.abs(_miss(x, t))
     size = float(np.median(miss[jumps])) if (jumps := miss > _JUMP * reach).any() else 0.0
-    if not _RANGE[0] * reach <= size <= _RANGE[1] * reach:
+    if size < _WHOLE * reach:
         return None
-    size = _measured(x, t, _turns(x, t, max(size, reach)), max(size, reach))
+    size = max(size, reach)
+    size = _measured(x, t, _turns(x, t, size), size)
     turns = _turns(x, t, size)
     z, at = x + size * turns, np.flatnonzero(np.diff(turns)) + 1
     if not at.size or not _smooth(z, t, size):

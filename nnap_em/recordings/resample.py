@@ -1,7 +1,7 @@
 """One log on the grid of its rig: columns, sequences, and an account of what was done."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +14,10 @@ from ..data.units import unit_between
 from ..numerics.digits import counted
 from .columns import declared_at, resolve
 from .common_clock import on_one_clock
-from .declared import Plan
+from .declared import LONGEST, Plan
 from .delays import Delay, delay, pairs
 from .files import reader
+from .readings import as_taken
 from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
 from .segments import (
     LEAST,
@@ -92,12 +93,23 @@ class Resampled(NamedTuple):
     notes: tuple[str, ...]
 
 
-def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Resampled:
+def resample(
+    path: Path,
+    rig: Rig,
+    states: Sequence[str],
+    plan: Plan,
+    shifts: Mapping[str, float],
+    unwrap: Collection[str] = (),
+) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 
+    The columns to `unwrap` lose the jumps of their counters.
     Raises DataError where a column cannot be had.
     """
-    return _gridded(_columns(path, rig, plan, shifts), rig, states, plan)
+    for name in unwrap:
+        if name not in (known := (*rig.logged_inputs, *rig.measured)):
+            raise DataError(f"{path}: --unwrap {name}: no column of this rig; {nearest(name, known)}")
+    return _gridded(_columns(path, rig, plan, shifts, unwrap), rig, states, plan)
 
 
 class _Columns(NamedTuple):
@@ -113,7 +125,7 @@ class _Columns(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float]) -> _Columns:
+def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str]) -> _Columns:
     source = reader(path)
     topics = source.topics(path)
     addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
@@ -133,13 +145,14 @@ def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float]) -> _
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     least = {name: 1 if name in rig.logged_inputs else 2 for name in every}
     signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in every.items()}
+    signals, notes = as_taken(signals, rig, unwrap)
     longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
     longest |= {name: math.inf for name in rig.logged_inputs if sent_on_change(signals[name], rig.dt)}
     facts = tuple(
         _facts(topic, recording.tracks.get(topic.name), clocks.get(topic.name), addresses, signals, longest)
         for topic in topics
     )
-    return _Columns(path, origin, addresses, signals, longest, facts, recording.notes)
+    return _Columns(path, origin, addresses, signals, longest, facts, (*recording.notes, *notes))
 
 
 def _timed(track: Track, dt: float) -> Track:
@@ -179,7 +192,8 @@ def _gridded(log: _Columns, rig: Rig, states: Sequence[str], plan: Plan) -> Resa
     _sparse(log.path, spans, fastest, dt)
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
-    segments = cut(pieces, dt, shortest, max(round(plan.longest / dt), 2))
+    most = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * LEAST)
+    segments = cut(pieces, dt, shortest, most)
     sequences = [_sequence(segment, rig, plan, signals) for segment in segments]
     if all(stretch.why for stretch, _ in sequences):
         most = max((piece.rows for piece in pieces), default=0)

@@ -12,7 +12,7 @@ import pytest
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import Logs
+from nnap_em.data.logs import HELD, Logs, Masked
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.identifiability import check as check_module
@@ -219,6 +219,51 @@ def test_slow_sampling_is_noticed(slide):
     report = _report(_logs(slow), _rig(dt=0.1))
     assert report["sampling"][0][0] == "warning"
     assert "sample faster" in report["sampling"][0][1]
+
+
+@pytest.mark.parametrize("slower", (100.0, 6000.0))
+def test_a_slow_machine_is_judged_as_a_quick_one(slide, slower):
+    """The same motion in so many times as long a unit of time, 1 s or 60 s a sample: nothing changes."""
+    slow = _changed(slide, t=lambda t: slower * t, u=lambda u: u / slower**2, y=lambda y: y / [1.0, slower])
+    noise = {"x": 1e-3, "dx": 5e-3 / slower}
+    quick_scales, scales = (
+        measure_scales(rig, build_system(rig), logs.data)
+        for rig, logs in ((_rig(), slide), (_rig(noise=noise, dt=0.01 * slower), slow))
+    )
+    np.testing.assert_allclose(scales.speed, quick_scales.speed / slower, rtol=1e-9)
+    np.testing.assert_allclose(scales.acceleration, quick_scales.acceleration / slower**2, rtol=1e-9)
+    report = _report(slow, _rig(noise=noise, dt=0.01 * slower), test=slow)
+    assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
+    assert "2 of 2 directions" in report["states"][0][1]
+
+
+def test_a_machine_at_one_speed_has_come_to_it_within_a_sequence(slide):
+    """Its acceleration is not that which noise shows, nor its speed per second."""
+    y = np.full((*slide.data.t.shape, 1), 3.0)
+    scales = measure_scales(_rig(("dx",)), build_system(_rig()), slide.data._replace(y=y))
+    np.testing.assert_allclose(scales.acceleration, 3.0 / (ROWS * 0.01))
+
+
+def test_long_sequences_are_to_be_cut(slide):
+    """At 10 ms, not at 1 s a row, where some seconds would be no sequence."""
+    data = Dataset(*(np.concatenate([part] * 12, axis=1) for part in slide.data))
+    data = data._replace(t=0.01 * np.arange(12 * ROWS) * np.ones((COUNT, 1)))
+    assert "cut them into sequences" in _report(_logs(data))["length"][0][1]
+    short = Dataset(*(part[:, :500] for part in data))
+    assert "cut them" not in _report(_logs(short), _rig(dt=1.0))["length"][0][1]
+
+
+def test_a_held_reading_is_said_and_its_repeats_are_no_lost_samples(slide):
+    """Each stands in 10 rows; 90 % of the samples missing would be an error."""
+    row = np.arange(ROWS) % 10 == 0
+    data = slide.data._replace(y=np.where(row[None, :, None], slide.data.y, np.nan))
+    masked = tuple(Masked(file, HELD, name, 2, 0.01, int(np.sum(~row))) for file in slide.files for name in ("x", "dx"))
+    report = _report(replace(slide, data=data, masked=masked))
+    assert report["missing"] == [("ok", f"{name}: 0 % of the samples are missing") for name in ("x", "dx")]
+    assert [mark for mark, _ in report["held"]] == ["warning", "warning"]
+    assert report["held"][0][1].startswith(f"x: each reading stands in 9.57 rows, in {COUNT} of {COUNT} files")
+    assert "rough" not in report
+    assert "error" not in {mark for answers in report.values() for mark, _ in answers}
 
 
 def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):

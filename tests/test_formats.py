@@ -118,7 +118,7 @@ MISTAKES = {  # name: (suffix, the bytes or the columns, then the words of the m
     ),
     "mat: column misspelt": (".mat", lambda c: {n.replace("dth", "d_th"): v for n, v in c.items()}, "did you mean"),
     "mat: another length": (".mat", _shorter, "column 'u'", "is 49, the first has 50 rows", "one length"),
-    "mat: a matrix": (".mat", lambda c: c | {"u": np.ones((50, 2))}, "column 'u'", "is 50 x 2", "one length"),
+    "mat: a matrix": (".mat", lambda c: c | {"u": np.ones((50, 2))}, "column 'u'", "missing", "u[0], u[1]"),
     "mat: complex": (".mat", lambda c: c | {"u": c["u"] + 1j}, "column 'u'", "holds complex128, no numbers"),
     "mat: text": (".mat", lambda c: c | {"u": "0.1"}, "column 'u'", "no numbers", "floating point"),
     "mat: cut short": (".mat", b"MATLAB 5.0 MAT-file, Platform" + 40 * b" ", "no MAT file, or damaged", "another copy"),

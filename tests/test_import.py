@@ -13,7 +13,7 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
 from nnap_em.recordings.delays import Pair, delay
-from nnap_em.recordings.segments import cut
+from nnap_em.recordings.segments import Segment, cut
 from nnap_em.recordings.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.systems import specs
 
@@ -195,12 +195,33 @@ def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
 
 
 def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
-    valid = np.ones(1000, bool)
-    valid[400:410] = False
-    pieces = cut(valid, 50, 150)
-    assert [(p.first, p.end) for p in pieces] == [
-        (0, 133), (133, 267), (267, 400), (410, 558), (558, 705), (705, 852), (852, 1000)
+    pieces = cut([Segment(0.0, 400), Segment(4.1, 590)], DT, 50, 150)
+    assert [(round(p.start / DT), p.rows) for p in pieces] == [
+        (0, 133), (133, 134), (267, 133), (410, 148), (558, 147), (705, 147), (852, 148)
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("dt, rows", [(0.01, [1750, 1750]), (1.0, [300]), (10.0, [400, 400])])
+def test_sequences_of_a_slow_machine_last_longer(tmp_path, dt, rows):
+    """Cut at 30 s, or at 500 rows: 30 s of one row a second would be too short for a fit."""
+    t = dt * np.arange(sum(rows))
+    columns = {"theta1": np.sin(t / dt / 30), "dtheta1": np.cos(t / dt / 30) / dt / 30, "u": np.cos(t / dt / 50)}
+    write_csv(tmp_path / "a.csv", {"time": t} | columns)
+    rig = _rig(tmp_path, text=RIG.replace("dt = 0.01", f"dt = {dt}"), columns="")
+    assert _import(tmp_path / "a.csv", "--rig", rig, "--out", tmp_path / "out", "--test", 0) == 0
+    assert [len(_table(path)) for path in sorted((tmp_path / "out/train").iterdir())] == rows
+
+
+def test_a_reading_that_stands_in_several_messages_is_one(tmp_path, capsys):
+    """Each stands in 4 messages, between two rows too: nothing is interpolated between a reading and itself."""
+    t = DT * np.arange(1000) + 0.003
+    log = _write(tmp_path / "a.mcap", t, t, np.cos(t), theta=lambda t: _theta(t[np.arange(t.size) // 4 * 4]))
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    assert "theta1: each reading stands in 4 messages: 750 repeats are left out" in capsys.readouterr().err
+    theta = _table(tmp_path / "out/train/000.csv")[:, 2]
+    read = np.flatnonzero(np.isfinite(theta))
+    assert (np.diff(read) == 4).all() and read.size >= 249
+    assert np.max(np.abs(theta[read] - _theta(t[read]))) < 1e-5  # 9 digits of a stamp in the file
 
 
 @pytest.mark.parametrize("test, parts", [(1, (3, 1)), (0.5, (2, 2)), (0, (4, 0)), (0.01, (3, 1))])

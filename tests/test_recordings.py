@@ -321,10 +321,10 @@ BAD = {  # the file, and words of the message
         lambda p: write_hdf5(p, {"js": {"time": T[::-1], "q": T}}),
         ["'/js/time'", "backwards at row 2"],
     ),
-    "CSV without time": ("a.csv", lambda p: write_csv(p, {"q": T}), ["no column of times (found q)", "'time'"]),
-    "CSV with semicolons": ("a.csv", lambda p: p.write_text("time;q\n0;1\n1;1\n"), ["(found time;q)", "(not ';')"]),
+    "CSV with another time": ("a.csv", lambda p: write_csv(p, {"tim": T, "q": T}), ["times (found tim, q)", "'time'"]),
     "no such file": ("b.mcap", lambda p: None, ["no such file"]),
-    "another kind": ("a.bag", lambda p: p.write_text("x"), ["logs end in .mcap, .h5", "rename"]),
+    "a folder": ("a.mcap", lambda p: p.mkdir(), ["is a folder", "give the log in it"]),
+    "another kind": ("a.dat", lambda p: p.write_text("x"), ["logs end in .mcap, .h5", "rename"]),
 }
 
 

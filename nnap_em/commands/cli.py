@@ -206,6 +206,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="TOPIC=S",
         help="add seconds to the times of a topic",
     )
+    importing.add_argument(
+        "--unwrap", action="append", default=[], metavar="COLUMN", help="take out the jumps of a counter"
+    )
 
     check = command("check", "say whether the logs can identify what is asked", _CHECK)
     identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)

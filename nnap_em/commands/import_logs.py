@@ -28,7 +28,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:
-            logs.append(resample(path, rig, build_system(rig).states, plan, shifts))
+            logs.append(resample(path, rig, build_system(rig).states, plan, shifts, args.unwrap))
             log(f"{path}: {_summary(logs[-1])}")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)

@@ -1,11 +1,15 @@
 """nnap-em init: a first rig.toml for a log."""
 
 import argparse
+from pathlib import Path
 
 from ..data.dataset import DataError
+from ..data.formats import column_names
 from ..draft.from_log import draft
 from ..draft.from_machine import draft_machine
 from ..draft.from_topics import draft_recorded
+from ..recordings.recording import last_word
+from ..recordings.text_file import foreign
 from ..storage.files import replace_text
 from ..storage.log import Log
 from ..systems import specs
@@ -20,9 +24,16 @@ def run(args: argparse.Namespace, log: Log) -> None:
     if args.model is not None:
         drafted = draft_machine(args.log, args.model, path.parent)
     else:
-        drafted = (draft if args.log.suffix.lower() == ".csv" else draft_recorded)(args.log, args.system, specs)
+        drafted = (draft if _ours(args.log) else draft_recorded)(args.log, args.system, specs)
     replace_text(path, drafted.text)
     for note in drafted.notes:
         log(f"in the log: {note}")
     missing = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in drafted.missing.items())
     log(f"wrote {path}" + (f"; fill in {missing}" if missing else ""))
+
+
+def _ours(path: Path) -> bool:
+    """True for a CSV file that may stand in train/ as it is, but for names and units."""
+    if path.suffix.lower() != ".csv" or not path.is_file() or foreign(path):
+        return False
+    return all(last_word(name) == name for name in column_names(path))

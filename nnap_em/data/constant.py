@@ -93,7 +93,7 @@ def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.nd
 
 def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
     """True where the reading after the run is far from it, beside the usual steps."""
-    step = np.abs(np.diff(y))
+    step = np.abs(np.diff(y[np.isfinite(y)]))
     usual = np.percentile(step[step > 0], 95) if (step > 0).any() else 0.0
     later = y[run.end : run.end + LONGEST + 1]
     later = later[np.isfinite(later)]
@@ -152,7 +152,7 @@ def _quantum(y: Float[np.ndarray, " time"]) -> float:
 
     A log that was resampled or filtered has steps as small as its digits; the sensor's are between its plateaus.
     """
-    step = np.abs(np.diff(y))
+    step = np.abs(np.diff(y[np.isfinite(y)]))
     least = float(np.min(step, where=step > 0, initial=math.inf))
     plateaus = [run for run in runs(y) if run.length >= 3]
     near = [(a, b) for a, b in pairwise(plateaus) if b.first - a.end <= 3]

@@ -1,8 +1,11 @@
 """One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with a hint."""
 
+import csv
+import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,9 +17,12 @@ from jaxtyping import Float, Real
 from ..numerics.digits import counted
 from ..storage.files import replace_text
 from .dataset import Array, DataError
+from .mat_structs import mat_columns
 from .rig import nearest
+from .units import TIME
 
-LARGEST = 256 * 2**20  # bytes of a file: some million rows, which take some 10 GB as text
+LARGEST = 256 * 2**20  # bytes of the file of one sequence: some million rows
+BLOCK = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
 
 
 def has_logs(folder: Path) -> bool:
@@ -43,13 +49,17 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
 
     Raises DataError that names the row and the column.
     """
-    _check_size(path)
+    check_size(path)
     return _readers[path.suffix.lower()](path, required, gaps)
+
+
+def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+    """The same of a log of any size, whose times may be dates [s since 1970]."""
+    return _readers[path.suffix.lower()](path, required, gaps, dates=True)
 
 
 def column_names(path: Path) -> list[str]:
     """The names of the columns of a log, in the order of the file."""
-    _check_size(path)
     return _namers[path.suffix.lower()](path)
 
 
@@ -89,56 +99,101 @@ def header_hint(path: Path) -> str | None:
     return _header_hint(_text(path)) if path.suffix.lower() == ".csv" else None
 
 
+def untimed(path: Path, names: Sequence[str]) -> str | None:
+    """The hint where a column may be meant as the times; None where a table has no such column at all."""
+    like = [name for name in names if TIME.match(name) or difflib.get_close_matches("time", [name.casefold()])]
+    return header_hint(path) or (f"name it 'time' [s], if {like[0]!r} is that" if like else None)
+
+
+def split(line: str, separator: str = ",") -> list[str]:
+    """The fields of a line, which may stand in quotes; without separator they are separated by blanks."""
+    if not separator:
+        return line.split()
+    fields = line.split(separator)
+    if '"' in line:
+        with suppress(csv.Error):  # a field of 128 kB
+            fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [field.strip() for field in fields]
+
+
 def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
     """The names in the header of a CSV file, and the fields of every row under it."""
-    text = _text(path)
-    return _header(text), _rows(path, text)
+    names = split(_first_line(path))
+    return names, [row for first, lines in _blocks(path) for row in _fields(path, names, first, lines)]
 
 
-def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_csv(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The columns `required`, then `gaps`, of a CSV file with a header, in file units; NaN = empty field (`gaps` only).
 
-    Raises DataError that names the line and the column.
+    `dates`: texts of `required` may be dates of ISO 8601.  Raises DataError that names the line and the column.
     """
-    text = _text(path)
-    names = _header(text)
-    _check_names(path, names, required, gaps, "line 1, ", _header_hint(text))
-    columns = list(zip(*_rows(path, text), strict=True))
-    return np.stack([_numbers(path, name, columns[names.index(name)], name in gaps) for name in (*required, *gaps)], -1)
+    names = split(_first_line(path))
+    every = (*required, *gaps)
+    if not set(every) <= set(names) or len(set(names)) < len(names):
+        _check_names(path, names, required, gaps, "line 1, ", header_hint(path))
+    places = [names.index(name) for name in every]
+    table = np.empty((_lines(path), len(every)), order="F")
+    end, lines = 0, []
+    for end, lines in _blocks(path):
+        block = table[end : end + len(lines)]
+        if (plain := _plain(lines, len(names))) is not None:
+            block[:] = plain[:, places]
+            continue
+        columns = list(zip(*_fields(path, names, end, lines), strict=True))
+        for k, name in enumerate(every):
+            block[:, k] = _numbers(path, name, columns[places[k]], name in gaps, end, dates and name in required)
+    return table[: end + len(lines)]
 
 
-def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_parquet(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The same of a Parquet file, where null and NaN are missing samples."""
-    file = _parquet_file(path)
-    names = file.schema_arrow.names
-    _check_names(path, names, required, gaps)
+    names = _parquet_columns(path)
+    _check_names(path, list(names), required, gaps)
     with _damaged(path, "Parquet"):
-        table = file.read(columns=[*required, *gaps])
-        columns = {name: table[name].to_numpy() for name in (*required, *gaps)}
-    return _stack(path, columns, gaps)
+        table = _parquet_file(path).read(columns=list(dict.fromkeys(names[name][0] for name in (*required, *gaps))))
+        columns = {name: _entry(table[names[name][0]], names[name][1]) for name in (*required, *gaps)}
+    return _stack(path, columns, gaps, dates)
 
 
-def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_mat(
+    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
+) -> Float[np.ndarray, "time column"]:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
     columns = _mat_columns(path)
     _check_names(path, list(columns), required, gaps)
-    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps)
+    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps, dates)
 
 
 _readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
 
 
 def _mat_columns(path: Path) -> dict[str, Any]:
-    """The vectors of a MAT file, or those of the one struct in it."""
+    """The columns of a MAT file: its vectors, those of a struct alone, and those of structs that recorders write."""
     with _damaged(path, "MAT"):
         try:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
-    columns = {name: value for name, value in content.items() if not name.startswith("__")}
-    if len(columns) == 1 and (only := next(iter(columns.values()))).dtype.names:
-        columns = {name: np.asarray(only[name].item()) for name in only.dtype.names}
-    return columns
+    variables = {name: np.asarray(value) for name, value in content.items() if not name.startswith("__")}
+    out: dict[str, Any] = {}
+    for name, column in mat_columns(path, variables):
+        if name in out and not np.array_equal(out[name], column):
+            hint = "save signals of one sample time, with different names, to a file"
+            refuse(path, f"column {name!r}", "stands there twice with different numbers", hint)
+        out |= _entries(name, np.asarray(column))
+    return out
+
+
+def _entries(name: str, column: np.ndarray) -> dict[str, np.ndarray]:
+    """A vector; the columns of a matrix, `yout[0]` and so on, which is longer than wide."""
+    if column.ndim != 2 or column.dtype.kind not in "iuf":
+        return {name: column}
+    columns = column.T if column.shape[0] > column.shape[1] else column
+    return {f"{name}[{i}]": each for i, each in enumerate(columns)}
 
 
 def _parquet_file(path: Path) -> Any:
@@ -151,9 +206,31 @@ def _parquet_file(path: Path) -> Any:
         return parquet.ParquetFile(path)
 
 
+def _parquet_columns(path: Path) -> dict[str, tuple[str, int | None]]:
+    """The columns by their names; where a row holds a list, one for each entry of the first."""
+    file, out = _parquet_file(path), {}
+    with _damaged(path, "Parquet"):
+        for field in file.schema_arrow:
+            if "list" not in str(field.type):
+                out[field.name] = (field.name, None)
+                continue
+            first = next(file.iter_batches(1, columns=[field.name]))[0][0].as_py() or ()
+            out |= {f"{field.name}[{i}]": (field.name, i) for i in range(len(first))}
+    return out
+
+
+def _entry(column: Any, index: int | None) -> np.ndarray:
+    """One column, or one entry of the list in each of its rows."""
+    if index is None:
+        return column.to_numpy()
+    from pyarrow import compute
+
+    return compute.call_function("list_element", [column, index]).to_numpy()
+
+
 _namers: dict[str, Callable[[Path], list[str]]] = {
-    ".csv": lambda path: _header(_text(path)),
-    ".parquet": lambda path: list(_parquet_file(path).schema_arrow.names),
+    ".csv": lambda path: split(_first_line(path)),
+    ".parquet": lambda path: list(_parquet_columns(path)),
     ".mat": lambda path: list(_mat_columns(path)),
 }
 
@@ -176,7 +253,8 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
 
-def _check_size(path: Path) -> None:
+def check_size(path: Path) -> None:
+    """Raise DataError where a file cannot be read, or is too large to be one sequence."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -190,11 +268,18 @@ def _unreadable(path: Path, error: OSError) -> DataError:
     return DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights")
 
 
-def _text(path: Path) -> str:
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The first bytes of a file, or all."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with path.open("rb") as file:
+            return file.read(most)
     except OSError as error:
         raise _unreadable(path, error) from None
+
+
+def _text(path: Path) -> str:
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise DataError(f"{path}: line {line}: not UTF-8; save the file as plain UTF-8 text") from None
@@ -203,8 +288,20 @@ def _text(path: Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _header(text: str) -> list[str]:
-    return [name.strip().strip('"').strip() for name in text.split("\n", 1)[0].split(",")]
+def _first_line(path: Path) -> str:
+    """The first line of a text file; DataError where it cannot be read."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            line = file.readline()
+    except (OSError, UnicodeDecodeError):
+        line = ""
+    return line.rstrip("\n") if line.strip() else _text(path).split("\n", 1)[0]
+
+
+def _lines(path: Path) -> int:
+    """Number of lines of a text file at most."""
+    with path.open("rb") as file:
+        return 1 + sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: file.read(BLOCK), b""))
 
 
 def _ends(text: str) -> tuple[str, str]:
@@ -235,22 +332,48 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _rows(path: Path, text: str) -> list[list[str]]:
-    """The fields of every row under the header, as many as it has names."""
-    lines = text.rstrip().split("\n")
-    if len(lines) < 3:
-        refuse(
-            path, f"line {len(lines)}", f"found {counted(len(lines) - 1, 'row')}", "write a header and 2 rows or more"
-        )
-    rows = [line.split(",") for line in lines[1:]]
-    names = lines[0].count(",") + 1
-    for number, row in enumerate(rows, 2):
-        if len(row) != names:
+def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The lines under the header in blocks, each with the number of its first, from 0; without blank ones at the end.
+
+    Two rows at least, or a DataError.
+    """
+    count, lines = 0, []
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            file.readline()
+            while block := file.readlines(BLOCK):
+                lines += block
+                blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
+                lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]
+                if lines:
+                    yield count, lines
+                count, lines = count + len(lines), rest
+    except UnicodeDecodeError:
+        _text(path)
+    if count < 2:
+        refuse(path, f"line {count + 1}", f"found {counted(count, 'row')}", "write a header and 2 rows or more")
+
+
+def _plain(lines: Sequence[str], columns: int) -> Float[np.ndarray, "row column"] | None:
+    """All fields of the lines at full speed; None where one is no finite number, or they are not so many in each."""
+    try:
+        table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return table if table.shape == (len(lines), columns) and np.isfinite(table).all() else None
+
+
+def _fields(path: Path, names: Sequence[str], first: int, lines: Sequence[str]) -> list[list[str]]:
+    """The fields of lines, as many as there are names; the first line is row `first`."""
+    rows = [split(line) for line in lines]
+    for number, row in enumerate(rows, first + 2):
+        if len(row) != len(names):
             hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
-            problem = f"found {counted(len(row), 'field')} under {counted(names, 'name')}"
-            refuse(path, f"line {number}", problem, _separator_hint(text) or hint)
-    if not any(map(_is_number, rows[0])):
-        refuse(path, "line 2", f"holds no number, found {lines[1]!r}", _header_hint(text) or "remove the row of units")
+            problem = f"found {counted(len(row), 'field')} under {counted(len(names), 'name')}"
+            refuse(path, f"line {number}", problem, _separator_hint(_text(path)) or hint)
+    if first == 0 and not any(map(_is_number, rows[0])):
+        problem = f"holds no number, found {','.join(rows[0])!r}"
+        refuse(path, "line 2", problem, header_hint(path) or "remove the row of units")
     return rows
 
 
@@ -267,16 +390,18 @@ def _check_names(
     for name in every:
         if name not in names:
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            other = "; or correct [input] columns in rig.toml" if name in required and name != "time" else ""
-            refuse(
-                path, f"{line}column {name!r}", "missing", hint or (nearest(name, spare) + other if spare else alone)
-            )
+            other = "or correct [input] columns in rig.toml" if name in required else ""
+            other = "or `nnap-em import` it: it reads other names, separators and clocks" if name == "time" else other
+            mend = hint or (nearest(name, spare) if spare else alone)
+            refuse(path, f"{line}column {name!r}", "missing", f"{mend}; {other}" if other and (spare or hint) else mend)
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
 
-def _numbers(path: Path, name: str, texts: Sequence[str], gaps: bool) -> Float[np.ndarray, " time"]:
-    """The numbers of one column at full speed; where that fails, field by field to find the mistake."""
+def _numbers(
+    path: Path, name: str, texts: Sequence[str], gaps: bool, first: int, dates: bool
+) -> Float[np.ndarray, " time"]:
+    """The numbers of one column at full speed; where that fails, field by field to find the mistake or the date."""
     try:
         values = np.array([float(text) if text else math.nan for text in texts])
         plain = np.isfinite(values).all() if not gaps else not np.isinf(values).any()
@@ -284,17 +409,33 @@ def _numbers(path: Path, name: str, texts: Sequence[str], gaps: bool) -> Float[n
             return values
     except ValueError:
         pass
-    return np.array([_number(path, name, row, text.strip(), gaps) for row, text in enumerate(texts)])
+    return np.array([_number(path, name, row, text.strip(), gaps, dates) for row, text in enumerate(texts, first)])
 
 
-def _number(path: Path, name: str, row: int, text: str, gaps: bool) -> float:
+def _number(path: Path, name: str, row: int, text: str, gaps: bool, dates: bool) -> float:
     try:
         value = float(text.replace("_", "?") or "nan")
     except ValueError:
-        value = math.inf
+        value = seconds(text) if dates else math.inf
     if math.isinf(value) or (math.isnan(value) and not gaps):
         _no_number(path, name, row, repr(text), math.isnan(value), gaps)
     return value
+
+
+def seconds(text: str) -> float:
+    """Seconds since 1970 of a date and a time of ISO 8601, UTC where it names no zone; infinite for another text."""
+    try:
+        moment = datetime.fromisoformat(text.strip().strip('"').replace("/", "-"))
+    except ValueError:
+        return math.inf
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def dated(values: np.ndarray) -> Float[np.ndarray, " time"]:
+    """Seconds since 1970 of dates or of their texts; infinite for another text."""
+    if values.dtype.kind in "Mm":
+        return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) * 1e-9
+    return np.array([seconds(text.decode() if isinstance(text, bytes) else str(text)) for text in values.tolist()])
 
 
 def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
@@ -302,13 +443,17 @@ def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: 
     refuse(path, place(path, name, row), f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
-def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+def _stack(
+    path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool
+) -> Float[np.ndarray, "time column"]:
     """Columns of numbers side by side, checked as those of a CSV file are."""
     rows = np.size(next(iter(columns.values())))
     if rows < 2:
         refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
     out = []
     for name, values in columns.items():
+        if dates and name not in gaps and values.dtype.kind in "MmOSU":
+            values = dated(values)
         if values.dtype.kind not in "iuf":
             refuse(path, f"column {name!r}", f"holds {values.dtype}, no numbers", "store it as 64-bit floating point")
         if values.shape != (rows,):

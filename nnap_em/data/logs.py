@@ -13,18 +13,22 @@ from jaxtyping import Float, Int
 from ..numerics.digits import counted
 from .constant import FULL
 from .dataset import DataError, Dataset, pad
-from .formats import log_files, place, read_table, refuse
+from .formats import column_names, log_files, place, read_table, refuse, untimed
+from .held import hold
+from .held import repeats as held_rows
 from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
-from .units import thousandfold
+from .units import unit_between
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
 INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
+HELD = "held"
 _REASONS = {
+    HELD: "equal to the one before, until the sensor takes its next",
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
     "late start": "one value over again until the sensor starts",
@@ -41,7 +45,7 @@ class Masked(NamedTuple):
 
     file: str
     kind: str
-    """`spike`, `stuck`, `late start`, `saturated`: readings; `gap`, `cut`: rows."""
+    """`spike`, `stuck`, `late start`, `saturated`, `held`: readings; `gap`, `cut`: rows."""
     column: str | None
     row: int
     """The first one in the file, counted from 1 under the header."""
@@ -73,13 +77,17 @@ class Logs:
 def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
     """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
-    Spikes, and what a stuck, late or saturated sensor reads, become missing samples, unless you `trust` the readings.
+    Spikes, what a stuck, late or saturated sensor reads, and all rows but the first in which a reading stands while the
+    machine moves, become missing samples, unless you `trust` the readings.
     Those later than `until` [s after the first row] are neither masked nor used: a prediction has no access to them.
     Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
     files = log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]
     early = [table.readings(rig, until) for table in tables]
+    if held := {} if trust else _held(early):
+        tables = [_once(table, held, rig) for table in tables]
+        early = [table.readings(rig, until) for table in tables]
     entries = [[] if trust else rough(readings, rig.dt) for readings in early]
     if limits := {limit for readings, each in zip(early, entries, strict=True) for limit in _limits(readings, each)}:
         entries = [rough(readings, rig.dt, limits) for readings in early]
@@ -135,10 +143,41 @@ class _Table(NamedTuple):
     """Rows of the uniform grid in which those of the file stand."""
     masked: list[Masked]
 
+    @property
+    def line(self) -> Int[np.ndarray, " time"]:
+        """Row of the file of each row of the table."""
+        return np.searchsorted(self.rows, np.arange(len(self.table)))
+
     def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
         """The columns of readings up to some seconds after the first row."""
         early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
         return dict(zip(rig.measured, self.table[early, 1 + len(rig.logged_inputs) :].T, strict=True))
+
+
+def _held(logs: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
+    """Columns whose readings stand in more rows than one, and in how many."""
+    rows = {name: hold([readings[name] for readings in logs]) for name in logs[0]}
+    return {name: each for name, each in rows.items() if each > 1}
+
+
+def _once(source: _Table, held: Mapping[str, float], rig: Rig) -> _Table:
+    """A file in which each reading stands in one row, the first that has it."""
+    table, masked = source.table.copy(), list(source.masked)
+    for name, rows in held.items():
+        column = table[:, 1 + len(rig.logged_inputs) + rig.measured.index(name)]
+        if (again := held_rows(column, rows)).size:
+            column[again] = np.nan
+            masked.append(_masked(source, HELD, name, again))
+    return source._replace(table=table, masked=masked)
+
+
+def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"]) -> Masked:
+    """Readings of a file that are not used, with a warning."""
+    line, t = int(source.line[rows[0]]), float(source.table[rows[0], 0])
+    problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), the first at {t:.6g} s"
+    hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
+    warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}; {hint}", DataWarning, 2)
+    return Masked(source.path.name, kind, column, line + 1, t, rows.size)
 
 
 def _limits(readings: Columns, entries: Sequence[Rough]) -> set[tuple[str, float]]:
@@ -156,7 +195,13 @@ class _Sequence(NamedTuple):
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    table = read_table(path, ("time", *rig.logged_inputs), rig.measured)
+    names = column_names(path)
+    clock = ("time",) if "time" in names or untimed(path, names) else ()
+    table = read_table(path, (*clock, *rig.logged_inputs), rig.measured)
+    if not clock:
+        problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
+        warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)
+        table = np.column_stack([rig.dt * np.arange(len(table)), table])
     _check_scales(path, table, rig)
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
 
@@ -177,10 +222,9 @@ def _check_scales(path: Path, table: Float[np.ndarray, "row column"], rig: Rig) 
 
 def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     """One file, checked against the rig, without what was found in it."""
-    path, table, masked = source.path, source.table, list(source.masked)
+    path, table, line = source.path, source.table, source.line
     first = 1 + len(rig.logged_inputs)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
-    line = np.searchsorted(source.rows, np.arange(len(t)))  # of each row of the table, in the file
     y = read.copy()
     for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
@@ -190,12 +234,7 @@ def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
         if finding.ruins:
             refuse(path, where, finding.problem, finding.hint)
         warnings.warn(f"{path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
-    for entry in entries:
-        k, count = int(entry.rows[0]), entry.rows.size
-        masked.append(Masked(path.name, entry.kind, entry.column, int(line[k]) + 1, float(t[k]), count))
-        problem = f"{counted(count, 'reading')} {_REASONS[entry.kind]} ({entry.kind}), the first at {t[k]:.6g} s"
-        hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-        warnings.warn(f"{path}: {place(path, entry.column, int(line[k]))}: {problem}; {hint}", DataWarning, 2)
+    masked = [*source.masked, *(_masked(source, entry.kind, entry.column, entry.rows) for entry in entries)]
     return _Sequence((t, u, y), (t, u, read), masked)
 
 
@@ -205,7 +244,8 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
         other = "correct [sampling] dt of rig.toml, or resample"
-        hint = "one of the two is in ms: write s" if thousandfold(float(typical)) else other
+        unit = unit_between(float(typical)) if typical > 0 else ""
+        hint = f"one of the two is in {unit}: write s" if unit else other
         refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE

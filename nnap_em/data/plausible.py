@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..numerics.digits import counted
+from .counters import counter
 from .units import parameter_unit
 
 Columns = Mapping[str, Float[np.ndarray, " time"]]
@@ -69,13 +71,14 @@ def implausible(
             return
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Implausible(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
+    for name, values in readings.items():
+        if unit(name) in ("rad", "m", "rad/s", "m/s"):
+            yield from _wrapped(name, values, unit(name))
     yield from _copies(inputs, readings)
     for name, rate in pairs if pairs is not None else [(name, f"d{name}") for name in readings]:
         if name in readings and rate in readings:
             yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
     for name, values in readings.items():
-        if unit(name) == "rad":
-            yield from _wrapped(name, values)
         rate = unit(name) == "rad/s"
         if (rate or unit(name) == "rad") and (speed := _speed(values, dt, rate)) > IMPLAUSIBLE:
             yield Implausible(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
@@ -176,17 +179,15 @@ def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray,
     return values[span:] - values[:-span]
 
 
-def _wrapped(name: str, theta: Float[np.ndarray, " time"]) -> Iterator[Implausible]:
-    """Jumps by a turn."""
-    rows = np.flatnonzero(np.isfinite(theta))
-    step = np.diff(theta[rows])
-    for turn, unit in ((2 * math.pi, ""), (360.0, " and convert degrees to rad")):
-        jumps = (np.abs(np.abs(step) - turn) < 0.15 * turn) & (np.diff(rows) <= 2)
-        if jumps.any() and np.median(np.abs(step)) < 0.1 * turn:
-            k, row = step[jumps][0], int(rows[1:][jumps][0])
-            hint = f"angles are continuous [rad]: unwrap the column (numpy.unwrap){unit}"
-            yield Implausible(True, name, row, f"jumps by {k:.4g} to {theta[row]:.6g}", hint)
-            return
+def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterator[Implausible]:
+    """Jumps of a counter that starts over."""
+    rate = unit.endswith("/s")
+    found = counter(values, np.arange(values.size, dtype=float), angle=unit == "rad", rate=rate)
+    if found is not None:
+        row, hint = int(found.rows[0]), f"take the jumps out: nnap-em import --unwrap {name}"
+        hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
+        problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
+        yield Implausible(True, name, row, problem, hint)
 
 
 def _speed(values: np.ndarray, dt: float, rate: bool) -> float:

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from ..data.dataset import DataError
 from ..data.formats import csv_fields, header_hint, place, refuse
 from ..data.rig import SystemSpec, toml_text
-from ..data.units import parameter_unit
+from ..data.units import SIZES, named_unit, parameter_unit
 from ..em.readings import reading_noise
 
 _NAMES = {  # what people call a column, its number apart
-    "time": re.compile(r"(time|t|timestamp|clock)()$"),
+    "time": re.compile(r"_*(time|t|timestamp|clock)()$"),
     "input": re.compile(r"(?:u|tau|torque|force|f|input|effort)_?(\d?)()$"),
     "dtheta": re.compile(r"(?:d_?theta|theta_?dot|dq|qd|qdot|omega|w|vel|velocity|speed)_?(\d?)()$"),
     "dtheta ": re.compile(r"(?:theta|q)_?(\d)_?dot()$"),
@@ -24,11 +24,6 @@ _NAMES = {  # what people call a column, its number apart
     "x": re.compile(r"(?:x|pos|position)()$"),
 }
 _EITHER = ("pos", "position", "vel", "velocity", "speed")  # of a joint with a number, of a slide without
-_UNITS = {  # unit by the end of a name, and its size in SI; none: SI
-    "deg/s": "rad/s", "deg": "rad", "rpm": "rad/s", "mm/s": "m/s", "mm": "m", "ms": "s", "us": "s", "mnm": "N m",
-    "nmm": "N m", "rad/s": "", "rad": "", "m/s": "", "nm": "", "n m": "", "n": "", "m": "", "s": "",
-}  # fmt: skip
-_UNIT = re.compile(rf"(.+?)[ _]*[ _(\[]({'|'.join(_UNITS)})[\])]?$")
 _PARAMETERS = {
     "m": "mass",
     "l": "length of the link",
@@ -122,16 +117,16 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
 
 def meaning(name: str) -> _Column:
     """Meaning of a column by its name."""
-    word, unit = name.strip().lower(), ""
-    if not any(pattern.match(word) for pattern in _NAMES.values()) and (match := _UNIT.match(word)):
-        word, unit = match[1], match[2]
+    word, unit = re.sub(r"^(lr|f|r)(?=[A-Z][a-z])", "", name.strip()).lower(), ""  # fAngle of a PLC: a REAL
+    if not any(pattern.match(word) for pattern in _NAMES.values()):
+        word, unit = named_unit(word)
     for kind, pattern in _NAMES.items():
         if match := pattern.match(word):
             number = int(match[1]) if match[1].isdigit() else None
             if "theta" in kind and number is None and word in _EITHER:
                 continue
             state = f"{kind.strip()}{1 if number is None else number}" if "theta" in kind else kind
-            return _Column(name, state, number, unit if _UNITS.get(unit) else "")
+            return _Column(name, state, number, unit if SIZES.get(unit, ("", 1.0))[1] != 1.0 else "")
     return _Column(name, "", None, "")
 
 
@@ -242,7 +237,7 @@ def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
         if state and column.kind != column.name and column.kind in names:
             continue
         hints = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
-        hints += [f"convert it from {column.unit} to {_UNITS[column.unit]}"] if column.unit else []
+        hints += [f"convert it from {column.unit} to {SIZES[column.unit][0]}"] if column.unit else []
         if hints:
             yield f"column {column.name!r}: {' and '.join(hints)}"
 
@@ -251,7 +246,7 @@ def _clock_notes(path: Path, table: Mapping[str, np.ndarray], columns: Sequence[
     """Absence, standstill or wrong unit of the time."""
     time = next((column for column in columns if column.kind == "time"), None)
     if time is None:
-        yield "no column 'time': add one [s]"
+        yield "no column 'time': add one [s], or write [sampling] dt"
         return
     steps = np.diff(table[time.name])
     if (stands := np.flatnonzero(steps <= 0)).size:

@@ -17,7 +17,8 @@ from ..machines.mjcf import read_machine
 from ..machines.source import parse
 from ..machines.urdf import stuck
 from ..recordings.files import reader
-from ..recordings.recording import Address, Topic
+from ..recordings.recording import Address, Topic, word_of
+from ..recordings.text_file import foreign
 from .from_log import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
 from .from_topics import COMMAND, columns_table, commands, others
 
@@ -63,7 +64,7 @@ def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
 
 def _fields(topics: Sequence[Topic]) -> list[tuple[Address, str]]:
     """Everything that is there, with its last word."""
-    return [(Address(t.name, field), field.rpartition(".")[2]) for t in topics for field in t.fields]
+    return [(Address(t.name, field, word_of(field)[1]), word_of(field)[0]) for t in topics for field in t.fields]
 
 
 def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
@@ -137,11 +138,11 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
 
 def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """Some of the log on uniform rows; of a CSV file its own."""
-    if path.suffix.lower() != ".csv":
+    if path.suffix.lower() != ".csv" or foreign(path):
         return columns_table(path, columns)
     table = numbers(path)
     time = next((table[name] for name in table if meaning(name).kind == "time"), None)
-    return ({} if time is None else {"time": time}) | {name: table[at.path] for name, at in columns.items()}
+    return ({} if time is None else {"time": time}) | {name: at.scale * table[at.path] for name, at in columns.items()}
 
 
 def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[str]:
@@ -193,7 +194,7 @@ def _servos(machine: Machine) -> Iterator[str]:
 
 def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
     """Addresses of columns that have another name in the log."""
-    lines = [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if str(at) != name]
+    lines = [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if at != Address("", name)]
     if lines:
         yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
         yield from (f"# not used: {each}" for each in others(topics, columns))

@@ -9,12 +9,14 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.rig import SystemSpec, toml_text
+from ..data.units import SIZES, named_unit
 from ..recordings.files import reader
-from ..recordings.recording import Address, Topic
+from ..recordings.recording import UNTIMED, Address, Topic, last_word, word_of
 from .from_log import Draft, drafted, meaning
 
 ROWS = 100_000
 """Rows of the log from which its interval and noise are estimated."""
+QUANTITY = re.compile(r"(position|velocity|effort)\[")
 COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
 
 
@@ -26,12 +28,13 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
     topics = reader(path).topics(path)
     columns = found_columns(topics)
     if not columns:
-        names = ", ".join(topic.name for topic in topics) or "none"
-        hint = "write rig.toml by hand, with [import.columns]"
+        every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
+        names = ", ".join(topic.name for topic in topics if topic.name) or ", ".join(every[:12]) or "none"
+        hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text((*every, 'topic:field')[0])}"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
     draft = drafted(path, columns_table(path, columns), system, specs)
     lines = [f"# not used: {each}" for each in others(topics, columns)]
-    lines += [f"{toml_text(name)} = {toml_text(str(at))}" for name, at in columns.items() if f'"{name}"' in draft.text]
+    lines += [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if f'"{name}"' in draft.text]
     head = "\n[import.columns]    # where each column is in the log\n"
     return draft._replace(text=draft.text + head + "\n".join(lines) + "\n")
 
@@ -51,40 +54,45 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
 
 def joints_of(topic: Topic) -> list[str]:
     """The joints that a topic names, in its order."""
-    return [match[1] for field in topic.fields if (match := re.fullmatch(r"position\[(.+)\]", field))]
+    return [match[1] for field in topic.fields if (match := re.fullmatch(r"position\[(.+)\]", word_of(field)[0]))]
 
 
 def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Address]:
     """Angles and rates of joints, called as a machine calls them; `coordinates` are by the joints' names in the log."""
     fields = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
     fields += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
-    return {column: Address(topic.name, field) for column, field in fields if field in topic.fields}
+    there = {word_of(field)[0]: (field, word_of(field)[1]) for field in reversed(topic.fields)}
+    return {column: Address(topic.name, *there[field]) for column, field in fields if field in there}
 
 
 def commands(topics: Sequence[Topic]) -> list[Address]:
     """Entries of an array on a topic whose name is that of torques."""
-    return [Address(t.name, field) for t in topics if COMMAND.search(t.name) for field in t.fields
-            if re.fullmatch(r"data(\[\d+\])?", field)]  # fmt: skip
+    return [Address(t.name, field) for t in topics for field in t.fields
+            if re.fullmatch(r"data(\[\d+\])?", last_word(field)) and COMMAND.search(f"{t.name}/{field}")]  # fmt: skip
 
 
 def _efforts(topics: Sequence[Topic]) -> list[Address]:
-    return [Address(t.name, field) for t in topics for field in t.fields if field.startswith("effort[")]
+    return [Address(t.name, field, word_of(field)[1]) for t in topics for field in t.fields if
+            word_of(field)[0].startswith("effort[")]  # fmt: skip
 
 
 def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
     """Fields whose names mean a state or an input; rows of a wide data set count from 0."""
     for field in topic.fields:
-        word = re.sub(r"\[(\d+)\]$", lambda m: str(int(m[1]) + 1), field.rpartition(".")[2])
+        word = re.sub(r"\[(\d+)\]$", lambda m: str(int(m[1]) + 1), last_word(field))
         column = meaning(word)
-        if column.kind and column.kind != "time" and "[" not in word and "stamp" not in field:
-            yield (word if column.kind == "input" else column.kind), Address(topic.name, field)
+        if column.kind and column.kind != "time" and not QUANTITY.match(word) and "stamp" not in field:
+            name = re.sub(r"\W+", "_", named_unit(word)[0]) if column.kind == "input" else column.kind
+            yield name, Address(topic.name, field, SIZES[column.unit][1] if column.unit else 1.0)
 
 
 def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
-    """Topics of numbers that no column is from."""
-    used = {at.topic for at in columns.values()}
-    return [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in topics if t.fields and
-            t.name not in used][:10]  # fmt: skip
+    """Topics of numbers that no column is from; of tables, the columns."""
+    used, places = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
+    rest = [t._replace(fields=tuple(f for f in t.fields if (t.name, f) not in places)) for t in topics]
+    tables = [str(Address(t.name, field)) for t in rest if not t.name.startswith("/") for field in t.fields]
+    named = [t for t in rest if t.name.startswith("/") and t.fields and t.name not in used]
+    return [*(f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named), *tables][:10]
 
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
@@ -99,10 +107,13 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), ROWS))
     if at.size < 2:
         raise DataError(f"{path}: its topics have no time in common; name others in [import.columns] by hand")
-    table = {"time": at}
+    timed = all(track.clock != UNTIMED for track in tracks.values())
+    table = {"time": at} if timed else {}
     for name, place in columns.items():
         track = tracks[place.topic]
         y = track.values[place.path]
         finite = np.isfinite(y)
-        table[name] = np.interp(at, (track.t[finite] - origin) * 1e-9, y[finite]) if finite.any() else 0 * at
+        table[name] = (
+            np.interp(at, (track.t[finite] - origin) * 1e-9, place.scale * y[finite]) if finite.any() else 0 * at
+        )
     return table

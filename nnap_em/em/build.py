@@ -61,11 +61,19 @@ def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array,
     return jax.vmap(system.mass)(q)
 
 
-def differences(signal: np.ndarray, order: int, lag: int) -> np.ndarray:
-    """Differences over `lag` rows, taken `order` times, of all sequences."""
-    for _ in range(order):
-        signal = signal[:, lag:] - signal[:, :-lag]
-    return signal[np.isfinite(signal)]
+def derivatives(signal: Float[np.ndarray, "seq time"], order: int, dt: float) -> list[Float[np.ndarray, " reading"]]:
+    """Derivatives of each sequence by differences over `LAG` rows, or over one reading where these are further apart.
+
+    Missing samples are bridged: of readings that come every other row none are `LAG` rows apart.
+    """
+    out = []
+    for y in signal:
+        t, y = np.flatnonzero(np.isfinite(y)).astype(float), y[np.isfinite(y)]
+        lag = max(round(LAG / float(np.median(np.diff(t)))), 1) if t.size > 1 else 1
+        for _ in range(order):
+            y, t = (y[lag:] - y[:-lag]) / ((t[lag:] - t[:-lag]) * dt), 0.5 * (t[lag:] + t[:-lag])
+        out.append(y)
+    return out
 
 
 def loads(system: AbstractSystem) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
@@ -93,11 +101,10 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
         position, rate = system.coordinates[joint], system.rates[joint]
         if rate in rig.measured:
             signal = y[..., rig.measured.index(rate)]
-            v, a = signal[np.isfinite(signal)], differences(signal, 1, LAG) / (LAG * rig.dt)
+            v, a = signal[np.isfinite(signal)], np.concatenate(derivatives(signal, 1, rig.dt))
         elif position in rig.measured:
             signal = y[..., rig.measured.index(position)]
-            v = differences(signal, 1, LAG) / (LAG * rig.dt)
-            a = differences(signal, 2, LAG) / (LAG * rig.dt) ** 2
+            v, a = (np.concatenate(derivatives(signal, order, rig.dt)) for order in (1, 2))
         else:
             continue
         speed[joint] = np.max(np.abs(v), initial=0.0)
@@ -118,7 +125,8 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
             torque = torque_along(servos[i], torque, q, scale, rig.dt)
         drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(torque[valid] ** 2))
     speed = np.maximum(speed, 1e-6)
-    return Scales(speed, np.maximum(acceleration, speed), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
+    least = speed / (rig.dt * float(np.max(np.sum(data.valid, axis=1))))  # to reach the largest speed in a sequence
+    return Scales(speed, np.maximum(acceleration, least), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 
 
 def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> tuple[Gaussian, tuple[bool, ...]]:

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset, horizon
-from ..data.logs import Logs
+from ..data.logs import HELD, Logs
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
@@ -29,14 +29,15 @@ from .identifiability import identifiability, sentences
 from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
-SEQUENCES, SECONDS = 6, 1.0
-"""Number and length of the sequences smoothed with the first model: a wrong one loses a hidden joint later on."""
+SEQUENCES, SECONDS, LEAST = 6, 1.0, 10
+"""Number of the sequences smoothed with the first model, and their length, which must determine the state [s, and rows
+where samples are that slow]: a wrong model loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
 REVERSALS = 20
 """Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
 distance over which friction turns and its size."""
-_WIDTH = 1.0  # s, of the readings that must determine the state
+_LONG = 20.0, 500  # s and rows of a sequence from which on it is better cut: a hidden joint is lost later on
 
 
 class CheckResult(NamedTuple):
@@ -63,7 +64,7 @@ class Along(NamedTuple):
 def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[CheckResult]:
     """Results of all checks of a data set, or what is missing where there is too little of it; nothing is fitted."""
     data = Dataset(*(np.asarray(part) for part in train.data))
-    amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train)]
+    amount = [*_amount(rig, data, test), *_missing(train, rig), *_held(train, rig), *_rough(train)]
     if amount[0].mark == ERROR:
         return amount
     try:
@@ -75,7 +76,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
         return [*amount, *stiff]
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
-    rows = min(data.valid.shape[1], round(SECONDS / rig.dt) + 1)
+    rows = min(data.valid.shape[1], _window(rig.dt) + 1)
     head = Dataset(*(part[:SEQUENCES, :rows] for part in horizon(data, rows)))
     along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
     return [
@@ -87,6 +88,11 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
         *(memory(rig, model, data, along, scales) if rig.memory else ()),
         *_observability(model, along, np.asarray(head.valid)),
     ]
+
+
+def _window(dt: float) -> int:
+    """Rows that are smoothed with the first model."""
+    return max(round(SECONDS / dt), LEAST)
 
 
 def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:
@@ -112,7 +118,8 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     rows = data.valid.sum(axis=1)
     shortage = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
     short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
-    long = "cut them into sequences of some seconds" if rows.max() * rig.dt > 20 else ""
+    too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1]
+    long = "cut them into sequences of some seconds" if too_long else ""
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, shortage)
     amount = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
@@ -126,22 +133,41 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
 def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
     y, valid = np.asarray(train.data.y), np.asarray(train.data.valid)
     for i, name in enumerate(rig.measured):
-        gone = np.isnan(y[..., i]) & valid
+        gone = np.sum(np.isnan(y[..., i]) & valid, axis=1) - _repeats(train, name)
         share = gone.sum() / valid.sum()
-        worst = int(np.argmax(gone.sum(axis=1) / valid.sum(axis=1)))
+        worst = int(np.argmax(gone / valid.sum(axis=1)))
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
         text += f", most in {train.files[worst]}" if share else ""
         yield CheckResult(_mark(share > 0.2, share > 0.75), "missing", text)
 
 
+def _repeats(train: Logs, name: str) -> Int[np.ndarray, " seq"]:
+    """Rows of each file that hold a reading over again."""
+    amounts = {entry.file: entry.amount for entry in train.masked if (entry.kind, entry.column) == (HELD, name)}
+    return np.array([amounts.get(file, 0) for file in train.files])
+
+
+def _held(train: Logs, rig: Rig) -> Iterator[CheckResult]:
+    """Rows in which each reading stands, where it is more than one."""
+    for i, name in enumerate(rig.measured):
+        again, read = _repeats(train, name), np.isfinite(np.asarray(train.data.y)[..., i]).sum(axis=1)
+        if files := np.count_nonzero(again):
+            rows = 1 + again.sum() / read[again > 0].sum()
+            text = f"{name}: each reading stands in {rows:.3g} rows, in {files} of {counted(len(again), 'file')}; "
+            text += f"all but the first are missing samples: {rows * rig.dt:.3g} s lie between two readings"
+            yield CheckResult(WARNING, "held", text)
+
+
 def _rough(train: Logs) -> Iterator[CheckResult]:
     """Readings masked on reading, and their share of each column."""
     total = int(np.asarray(train.data.valid).sum())
-    for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in train.masked):
-        entries = [entry for entry in train.masked if (entry.kind, entry.column) == (kind, column)]
+    masked = [entry for entry in train.masked if entry.kind != HELD]
+    for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in masked):
+        entries = [entry for entry in masked if (entry.kind, entry.column) == (kind, column)]
         count, what = sum(entry.amount for entry in entries), f"{column}: " if column else ""
         amount = counted(count, "reading" if column else "row")
-        text = f"{what}{kind}: {amount} in {len(entries)} of {counted(len(train.files), 'file')}"
+        files = len({entry.file for entry in entries})
+        text = f"{what}{kind}: {amount} in {files} of {counted(len(train.files), 'file')}"
         yield CheckResult(
             _mark(True, count > 0.3 * total),
             "rough",
@@ -350,12 +376,18 @@ def _velocity(
     if rate in rig.measured:
         return np.asarray(data.y)[..., rig.measured.index(rate)], ""
     if position in rig.measured:
-        y = np.asarray(data.y)[..., rig.measured.index(position)]
+        y = np.stack([_bridged(row) for row in np.asarray(data.y)[..., rig.measured.index(position)]])
         v = (y[:, LAG:] - y[:, :-LAG]) / (LAG * rig.dt)
         if np.isfinite(v).any():
             return v, ""
     x = along.x[..., len(model.system.coordinates) + joint]
     return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
+
+
+def _bridged(y: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+    """Readings with straight lines between them, so that there are some `LAG` rows apart wherever they are."""
+    k = np.flatnonzero(np.isfinite(y))
+    return np.interp(np.arange(y.size), k, y[k], left=np.nan, right=np.nan) if k.size else y
 
 
 def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
@@ -370,7 +402,7 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
     """
     names = model.system.coordinates + model.system.rates
-    dof, rows = len(model.system.coordinates), max(2, round(_WIDTH / model.dt))
+    dof, rows = len(model.system.coordinates), _window(model.dt)
     x = along.x.reshape(-1, len(names))
     scale = np.maximum([_std(one) for one in x.T], 1e-12)
     noise = np.exp(0.5 * np.asarray(model.log_r))
@@ -392,7 +424,7 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
     dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
     weak = [name for name, share in zip(names, known, strict=True) if 0.2 < share <= 0.5]
     spoilt = any(name in names[dof:] for name in dark)
-    text = f"{_WIDTH:g} s of readings determine {rank} of {len(names)} directions of the state"
+    text = f"{rows * model.dt:.3g} s of readings determine {rank} of {len(names)} directions of the state"
     text += f" (condition 1e{condition:.0f})"
     text += f"; not determined: {', '.join(dark)}" if dark else ""
     text += f"; hardly determined: {', '.join(weak)}" if weak else ""

@@ -1,18 +1,38 @@
-"""The times of a topic: which clock to take, and what is wrong with it."""
+"""The times of a topic: their order, stamps of other clocks, and which clock to take."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int, Real
 
+from ..data.units import UNITS
 from ..numerics.digits import counted
-from .recording import refuse
+from .recording import Lag, refuse
 
 APART = 10.0
 """Seconds between stamp and log time from which on they are those of two clocks."""
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
+FAR = 30 * 86400.0
+"""Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set."""
+FEW = 0.05
+"""Largest share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log."""
+LITTLE = 50
+"""Wrong times beyond a silence at most: as many rows as a sequence needs."""
+RUNS = 4096
+"""Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
+PARTS = 20
+"""Parts of a topic for each of which its stamps are compared with the log times."""
+PART = 50
+"""Messages of such a part at least, so that its median is no chance."""
+NS = 1_000_000_000
+SINCE_1970 = (1.0e9, 4.1e9)
+"""Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms, ..."""
+UPTIME = 1e14
+"""Numbers from which on times are in ns: 28 hours of uptime, or 3 years in us."""
+LATEST = 4_600_000_000 * NS
+"""ns within which times are held, so that their differences are no overflow: a wild stamp is wild there too."""
 
 
 class Clock(NamedTuple):
@@ -20,10 +40,21 @@ class Clock(NamedTuple):
 
     t: Int[np.ndarray, " kept"]
     """ns."""
-    used: Int[np.ndarray, " kept"]
-    """Indices of the used messages, in the order of their times."""
+    order: Int[np.ndarray, " message"] | None
+    """Indices of the used messages, in the order of their times; None: all, as they are."""
+    first: Int[np.ndarray, " kept"] | None
+    """Place in `order` of the first message of each time; None: each message has its own."""
     name: str
     notes: tuple[str, ...]
+    lag: Lag = ()
+
+    def take(self, values: Float[np.ndarray, " every"]) -> Float[np.ndarray, " kept"]:
+        """A column at these times: the last number of the messages at one time, NaN where none has one."""
+        values = values if self.order is None else values[self.order]
+        if self.first is None:
+            return values
+        last = np.maximum.reduceat(np.where(np.isfinite(values), np.arange(values.size), -1), self.first)
+        return np.where(last >= self.first, values[last], np.nan)
 
 
 def choose(
@@ -33,51 +64,139 @@ def choose(
 
     Raises DataError where there is no time at all, or it runs backwards.
     """
-    where = f"topic {topic!r}"
-    order = np.argsort(log, kind="stable")
     notes = []
     if stamp is not None:
-        reason = _odd(stamp[order], log[order])
+        order = np.argsort(log, kind="stable")
+        kept = trusted(stamp[order])
+        used = order if kept is None else order[kept]
+        reason = _odd(stamp[used], log[used])
         if reason is None:
-            return _single(stamp[order], order, "header stamp", ())
+            return _clock(stamp, used, "header stamp", (), "message", lags(stamp[used], log[used]))
         notes.append(f"header stamps {reason}: log times are taken")
-    if log.size > 1 and log.min() == log.max():
-        hint = "record with stamps, or write the topic with a header"
-        refuse(path, where, f"has no stamps: all {log.size} messages are at {log[0] * 1e-9:g} s", hint)
-    steps = np.diff(log)
-    back = steps < 0
-    if back.any():
-        k = int(np.argmin(np.where(back, log[1:] - np.maximum.accumulate(log)[:-1], 0)))
-        amount = float(np.maximum.accumulate(log)[k] - log[k + 1]) * 1e-9
-        if amount > BACK:
-            refuse(path, where, *_backwards(f"message {k + 2}", amount))
-        notes.append(f"{counted(back.sum(), 'message')} out of order by up to {amount:.2g} s: sorted")
-    return _single(log[order], order, "log time", tuple(notes))
+    return _sorted(path, f"topic {topic!r}", log, "log time", tuple(notes), "message", ((int(log[0]), 0),))
 
 
 def rising(path: Path, where: str, t: Int[np.ndarray, " row"], name: str) -> Clock:
-    """The times of a table [ns], which may stand but not run backwards."""
-    back = np.flatnonzero(np.diff(t) < 0)
-    if back.size:
-        k = int(back[0])
-        refuse(path, where, *_backwards(f"row {k + 2}", float(t[k] - t[k + 1]) * 1e-9))
-    if t.size > 1 and t[0] == t[-1]:
-        refuse(path, where, f"has no stamps: all {t.size} rows are at {t[0] * 1e-9:g} s", "log the time [s]")
-    return _single(t, np.arange(t.size), name, ())
+    """The times of a table [ns], which may stand but not run backwards by much."""
+    return _sorted(path, where, t, name, (), "row", ())
 
 
-def _backwards(row: str, amount: float) -> tuple[str, str]:
-    hint = "the clock was set back there: cut the file at that place"
-    return f"time runs backwards at {row}, by {amount:.6g} s", hint
+def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) -> Int[np.ndarray, " row"]:
+    """Times in ns, of a unit (a key of `UNITS`) or, without one, that which their size shows.
+
+    Raises DataError, with the unit, where they are too large for the unit.
+    """
+    if not np.isfinite(t).all():
+        refuse(path, where, "holds times that are no numbers", "cut the rows without a time")
+    low, high = SINCE_1970
+    size = float(np.median(np.abs(t.astype(np.float64)), overwrite_input=True))
+    shown = next((name for name in ("s", "ms", "us", "ns") if low <= size * UNITS[name] < high), "")
+    if not unit:
+        unit = shown or ("ns" if size > UPTIME else "s")
+    if size * UNITS[unit] > high:
+        problem = f"holds times of {size:.4g}, too large for {unit}: they look like times in {shown or 'us or ns'}"
+        refuse(path, where, problem, f"name it {f'time_{shown}' if shown else 'time_us or time_ns'}")
+    if t.dtype.kind in "iu":
+        each = round(UNITS[unit] * NS)
+        return np.clip(t.astype(np.int64), -LATEST // each, LATEST // each) * each
+    t = t * (UNITS[unit] * NS)
+    return np.round(np.clip(t, -LATEST, LATEST, out=t), out=t).astype(np.int64)
 
 
-def _single(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " m"], name: str, notes: tuple[str, ...]) -> Clock:
-    """The last of the messages at one time: the last command is held."""
-    last = np.append(np.diff(t) > 0, True)
-    if not last.all():
-        same = counted(np.sum(~last), "message")
-        notes = (*notes, f"{same} with the time of the next one: the last of each is taken")
-    return Clock(t[last], order[last], name, notes)
+def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
+    """Messages whose times [ns] are of one clock that goes on; None where it was set in the middle of the log.
+
+    Times are wrong if they go back by more than `BACK` from, or on to, those of the most messages, or if they are few
+    and lie `FAR` from the others: zeros before a clock was set, a wild stamp.
+    """
+    steps = np.diff(t)
+    first = np.append(0, np.flatnonzero((steps > BACK * NS) | (steps < -BACK * NS)) + 1)
+    back = _behind(t) > BACK * NS
+    if first.size == 1 or (back and first.size > RUNS):
+        return None if back else np.arange(t.size)
+    rises = np.append(True, steps > 0)
+    rises[first] = True  # a clock that stands is no evidence
+    weight = np.add.reduceat(rises.astype(int), first)
+    low, high = np.minimum.reduceat(t, first), np.maximum.reduceat(t, first)
+    chain = _longest(low, high, weight) if back else np.arange(first.size)
+    budget = max(FEW * weight.sum(), 1)
+    if weight.sum() - weight[chain].sum() > budget:
+        return None
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > FAR * NS))
+    size = np.bincount(groups, weight[chain])
+    few = (size < LITTLE) & (size <= budget)
+    if few.any() and not few.all() and size[few].sum() <= budget:
+        chain = chain[~few[groups]]
+    keep = np.zeros(first.size, bool)
+    keep[chain] = True
+    kept = np.flatnonzero(np.repeat(keep, np.diff(np.append(first, t.size))))
+    return kept if _behind(t[kept]) <= BACK * NS else None
+
+
+def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:
+    """Median of stamp minus log time in parts of a topic, at the median stamp of each [ns]."""
+    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // PART, 1), PARTS))
+    return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
+
+
+def _sorted(
+    path: Path, where: str, t: Int[np.ndarray, " m"], name: str, notes: tuple[str, ...], noun: str, lag: Lag
+) -> Clock:
+    """Times in their order, where they are a little out of it; refused where they are no clock."""
+    kept = trusted(t)
+    if kept is None:
+        k = int(np.argmin(np.diff(t)))
+        hint = "the clock was set back there: cut the file at that place"
+        amount = float(t[: k + 1].max() - t[k + 1]) * 1e-9
+        refuse(path, where, f"time runs backwards at {noun} {k + 2}, by {amount:.6g} s", hint)
+    if t.size > 1 and t[kept].min() == t[kept].max():
+        hint = "record with stamps, or write the time [s] of each"
+        refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {t[kept[0]] * 1e-9:g} s", hint)
+    if amount := _behind(t[kept]):
+        back = counted(int(np.sum(np.diff(t[kept]) < 0)), noun)
+        notes = (*notes, f"{back} out of order by up to {amount * 1e-9:.2g} s: sorted")
+        kept = kept[np.argsort(t[kept], kind="stable")]
+    return _clock(t, kept, name, notes, noun, lag)
+
+
+def _clock(
+    t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], name: str, notes: tuple[str, ...], noun: str, lag: Lag
+) -> Clock:
+    """One time for the messages of each time; notes about those that are left out."""
+    if order.size < t.size:
+        wild = np.delete(t, order)
+        amount, middle = counted(wild.size, noun), float(np.median(t[order])) * 1e-9
+        place = f"the first at {wild[0] * 1e-9:.10g} s, {abs(wild[0] * 1e-9 - middle):.3g} s from the others"
+        notes = (*notes, f"{amount} with a stamp of another clock dropped ({place})")
+    as_is = order.size == t.size and bool((order[1:] > order[:-1]).all())
+    t, places = (t, None) if as_is else (t[order], order)
+    if (t[1:] > t[:-1]).all():
+        return Clock(t, places, None, name, notes, lag)
+    first = np.append(0, np.flatnonzero(np.diff(t) > 0) + 1)
+    same = counted(t.size - first.size, noun)
+    notes = (*notes, f"{same} with the time of the next one: the last value of each column is taken")
+    return Clock(t[first], places, first, name, notes, lag)
+
+
+def _behind(t: Int[np.ndarray, " message"]) -> int:
+    """Largest amount by which a time is behind an earlier one [ns]."""
+    return 0 if (t[1:] >= t[:-1]).all() else int(np.max(np.maximum.accumulate(t) - t))
+
+
+def _longest(
+    low: Int[np.ndarray, " run"], high: Int[np.ndarray, " run"], weight: Int[np.ndarray, " run"]
+) -> np.ndarray:
+    """The runs, one after the other in time as in the file, that have the most messages."""
+    best, before = weight.copy(), np.full(low.size, -1)
+    for k in range(1, low.size):
+        possible = np.where(high[:k] - low[k] <= BACK * NS, best[:k], 0)
+        i = int(np.argmax(possible))
+        if possible[i]:
+            best[k], before[k] = best[k] + possible[i], i
+    chain = [int(np.argmax(best))]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])
 
 
 def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> str | None:
@@ -88,4 +207,8 @@ def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -
     if back.size:
         return f"run backwards ({back.size} times)"
     offset = float(np.median(np.abs(stamp - log))) * 1e-9
-    return f"are of another clock, {offset:.4g} s from that of the log" if offset > APART else None
+    if offset > APART:
+        return f"are of another clock, {offset:.4g} s from that of the log"
+    knots = np.array(lags(stamp, log), dtype=float)
+    set_ = np.abs(np.diff(knots[:, 1])) > 0.5 * np.diff(knots[:, 0])
+    return "were set within the log" if set_.any() else None

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..data.dataset import DataError
-from .recording import Address, Topic, field_of, near
+from .recording import Address, Topic, field_of, near, word_of
 
 _PARTS = (("", "position"), ("d", "velocity"))
 """Prefix of the name of a joint for its angle and its rate, and the array that holds them."""
@@ -25,8 +25,11 @@ def resolve(
 
 
 def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
-    """The address as the file has it."""
+    """The address as the file has it, whose names may hold a colon."""
     where = f"column {column!r} from {str(address)!r}"
+    for topic in topics:
+        if (path_there := str(address).removeprefix(f"{topic.name}:" if topic.name else "")) in topic.fields:
+            return address._replace(topic=topic.name, path=path_there)
     topic = next((topic for topic in topics if topic.name == address.topic), None)
     if topic is None:
         hint = near(address.topic, [topic.name for topic in topics])
@@ -37,10 +40,10 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
     names = set(_names(column, is_input))
-    addresses = [Address(topic.name, field) for topic in topics for field in topic.fields if field in names]
-    addresses = addresses or [
-        Address(topic.name, field) for topic in topics for field in topic.fields if field.rpartition(".")[2] in names
-    ]
+    addresses: list[Address] = []
+    for reading in (lambda field: (field, 1.0), word_of):
+        every = [(Address(topic.name, field), *reading(field)) for topic in topics for field in topic.fields]
+        addresses = addresses or [at._replace(scale=scale) for at, word, scale in every if word in names]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
         every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]

@@ -25,12 +25,12 @@ class Plan(NamedTuple):
     """A topic that is silent for longer [s] ends the sequence; None: a few of its intervals."""
     shortest: float | None
     """Shorter sequences are dropped [s]; None: 50 rows."""
-    longest: float
-    """Longer ones are cut [s]."""
+    longest: float | None
+    """Longer ones are cut [s]; None: `LONGEST`, or 500 rows where these last longer."""
 
 
-NOTHING = Plan({}, {}, False, None, None, 30.0)
-"""Plan of a rig without the table."""
+LONGEST = 30.0
+"""Sequences are cut to this, where nothing is declared [s]: a hidden joint is lost in longer ones."""
 _KEYS = ("columns", "duplicates", "input", "gap", "shortest", "longest")
 
 
@@ -52,9 +52,9 @@ def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
         _addresses(path, table, "columns", columns),
         _addresses(path, table, "duplicates", columns),
         mode == INPUTS[1],
-        _seconds(path, table, "gap", NOTHING.gap),
-        _seconds(path, table, "shortest", NOTHING.shortest),
-        _seconds(path, table, "longest", NOTHING.longest) or NOTHING.longest,
+        _seconds(path, table, "gap"),
+        _seconds(path, table, "shortest"),
+        _seconds(path, table, "longest"),
     )
 
 
@@ -79,10 +79,10 @@ def _address(path: Path, where: str, value: Any) -> Address:
     return Address(*address(text), float(scale))
 
 
-def _seconds(path: Path, table: Mapping[str, Any], key: str, absent: float | None) -> float | None:
-    value = table.get(key, absent)
-    if value is absent:
-        return absent
+def _seconds(path: Path, table: Mapping[str, Any], key: str) -> float | None:
+    value = table.get(key)
+    if value is None:
+        return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
         _refuse(path, f"[import] {key}", f"found {value!r}", f"write seconds above 0, {key} = 0.5")
     return float(value)

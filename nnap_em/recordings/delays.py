@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .signals import Signal, integrals
+from .signals import Signal, between, integrals
 
 REACH = 0.25
 """Longest delay that is looked for [s]."""
@@ -63,7 +63,9 @@ def pairs(
     dof, out = len(states) // 2, []
 
     def on_two_topics(one: str, two: str) -> bool:
-        return one in signals and two in signals and signals[one].topic != signals[two].topic
+        return (
+            one in signals and two in signals and signals[one].topic != signals[two].topic and signals[one].t.size > 1
+        )
 
     for name, joint in inputs.items():
         moved = ((states[dof + joint - 1], 1), (states[joint - 1], 2)) if joint <= dof else ()
@@ -119,7 +121,7 @@ def _part(
     """The best shift for the readings at these times, NaN where there is none, and the correlation there."""
     if at.size < 20 * wide:
         return math.nan, 0.0
-    cause, *around = (_between(signal, at[0] - REACH, at[-1] + REACH) for signal in (cause, *around))
+    cause, *around = (between(signal, at[0] - REACH, at[-1] + REACH) for signal in (cause, *around))
     target = _difference(np.interp(at, effect.t, effect.y), pair.order, wide)
     first = (0, wide // 2, wide)[pair.order]
     unexplained = _Rest(_explained(at[first : first + target.size], around))
@@ -143,13 +145,6 @@ def _part(
         fine /= 3
         best = max((best + j * fine for j in range(-3, 4)), key=likeness)
     return best, likeness(best)
-
-
-def _between(signal: Signal, start: float, end: float) -> Signal:
-    """The part of a signal with its values from start to end [s]."""
-    first, last = np.searchsorted(signal.t, (start, end))
-    part = slice(max(int(first) - 1, 0), int(last) + 1)
-    return Signal(signal.topic, signal.t[part], signal.y[part])
 
 
 def _liveliest(cause: Signal, effect: Signal) -> Float[np.ndarray, " x"]:

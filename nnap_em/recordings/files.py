@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..data.dataset import DataError
-from . import hdf5_file, mcap_file, table_file
+from . import hdf5_file, mcap_file, table_file, text_file
 from .recording import Reader
 
 readers: dict[str, Reader] = {
@@ -13,14 +13,35 @@ readers: dict[str, Reader] = {
     ".csv": table_file,
     ".parquet": table_file,
     ".mat": table_file,
+    ".txt": text_file,
+    ".tsv": text_file,
+    ".lvm": text_file,
 }
 """Reader by the end of the name; for another kind of file, add one that has `topics` and `read`."""
+_ROS = (
+    "pip install rosbags; rosbags-convert --src {path} --dst {stem}_mcap --dst-storage mcap (and give the .mcap in it)"
+)
+_ELSEWHERE = {
+    ".bag": _ROS,
+    ".db3": _ROS,
+    ".xlsx": "save the sheet as CSV UTF-8",
+    ".xls": "save the sheet as CSV UTF-8",
+    ".trace": "save the trace as *.trace.csv in CODESYS",
+    ".svdx": "export it as CSV: TC3ScopeExportTool.exe svd={path} target={stem}.csv silent",
+    ".svd": "export it as CSV: TC3ScopeExportTool.exe svd={path} target={stem}.csv silent",
+}
+"""Commands that write a file that is not read as one that is."""
 
 
 def reader(path: Path) -> Reader:
     """The reader for a file; DataError where there is none, or no file."""
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; give the log in it")
     if not path.is_file():
         raise DataError(f"{path}: there is no such file; check the path")
-    if path.suffix.lower() not in readers:
+    suffix = path.suffix.lower()
+    if suffix in _ELSEWHERE:
+        raise DataError(f"{path}: {suffix} is not read; {_ELSEWHERE[suffix].format(path=path, stem=path.stem)}")
+    if suffix not in readers:
         raise DataError(f"{path}: logs end in {', '.join(readers)}; rename it, or write one of these")
-    return readers[path.suffix.lower()]
+    return text_file if suffix == ".csv" and text_file.foreign(path) else readers[suffix]

@@ -49,7 +49,7 @@ def completed(text: str, addresses: Mapping[str, Address]) -> str:
     """rig.toml with a line for each column whose place was found by its name."""
     table = tomllib.loads(text).get("import", {})
     lines = [
-        f"{toml_text(name)} = {toml_text(str(at))}    # found by its name"
+        f"{toml_text(name)} = {at.toml}    # found by its name"
         for name, at in addresses.items()
         if name not in table.get("columns", {})
     ]

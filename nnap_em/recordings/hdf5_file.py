@@ -1,6 +1,5 @@
 """HDF5 files: a group with a time axis is a topic, its data sets are the fields."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
-from .clock import rising
+from ..data.formats import dated
+from ..data.units import TIME, UNITS
+from .clock import nanoseconds, rising
 from .objects import MOST
 from .recording import EXTRA, Recording, Topic, Track, refuse
 
-TIME = re.compile(r"(?:t|time|times|timestamp|timestamps|stamp|clock)(?:_(s|sec|ms|us|ns))?$", re.IGNORECASE)
-UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9}
 MARKS = ("axis", "kind", "role", "standard_name")
 """Attributes that mark a data set as the time."""
 _BLOCK = 2**18
@@ -54,10 +53,8 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
         names = ", ".join(group) or "nothing"
         hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
         refuse(path, where, f"has no time axis (holds {names})", hint)
-    if axis.dtype.kind == "f" and not np.isfinite(axis[:]).all():
-        refuse(path, f"data set {axis.name!r}", "holds times that are no numbers", "cut the rows without a time")
-    clock = rising(path, f"data set {axis.name!r}", _nanoseconds(axis), axis.name.rpartition("/")[2])
-    values = {each: _column(group, each)[clock.used] for each in paths}
+    clock = rising(path, f"data set {axis.name!r}", _nanoseconds(path, axis), axis.name.rpartition("/")[2])
+    values = {each: clock.take(_column(group, each)) for each in paths}
     return Track(clock.t, values, clock.name, clock.notes)
 
 
@@ -71,35 +68,33 @@ def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
     return np.concatenate([data[k : k + _BLOCK, int(index)].astype(np.float64) for k in blocks])
 
 
-def _nanoseconds(axis: Any) -> Int[np.ndarray, " row"]:
-    """The times, by the unit that an attribute, the name, or the size of whole numbers shows."""
-    t = axis[:]
+def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
+    """The times, by the unit that an attribute, the name, or their size shows."""
+    t, where = axis[:], f"data set {axis.name!r}"
+    if t.dtype.kind in "OS":
+        t = dated(t)
     named = TIME.match(axis.name.rpartition("/")[2])
-    unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).strip().lower() or (named and named[1]) or ""
-    if unit.lower() in UNITS:
-        scale = UNITS[unit.lower()]
-    else:
-        scale = 1e-9 if t.dtype.kind in "iu" and t.size and np.abs(t[-1]) > 1e14 else 1.0
-    return t.astype(np.int64) if scale == 1e-9 else np.round(t * (scale * 1e9)).astype(np.int64)
+    unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).lower().partition(" since ")[0].strip()
+    return nanoseconds(path, where, t, unit if unit in UNITS else (named and named[1]) or "")
 
 
 def _axis(group: Any) -> Any | None:
     """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
-    inside = [(name, data) for name, data in _numeric(group)]
+    inside = [(name, data) for name, data in _numeric(group, "iufOS")]
     for _, data in inside:
         if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in MARKS):
             return data
-    for name, data in inside:
-        if data.ndim == 1 and TIME.match(name):
-            return data
+    named = [(name, data) for name, data in inside if data.ndim == 1 and TIME.match(name)]
+    if named:  # the stamp of a sensor may be of another clock than the times of other groups
+        return min(named, key=lambda pair: "stamp" in pair[0].lower())[1]
     above = None if group.name == "/" else _axis(group.parent)
     return above if above is not None and any(data.shape[0] == above.shape[0] for _, data in inside) else None
 
 
-def _numeric(group: Any) -> Iterator[tuple[str, Any]]:
-    """Data sets of one number or one row of numbers per time."""
+def _numeric(group: Any, kinds: str = "iuf") -> Iterator[tuple[str, Any]]:
+    """Data sets of one number or one row of numbers per time; dates are texts."""
     for name, data in group.items():
-        if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in "iuf" and data.shape[0] > 1:
+        if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in kinds and data.shape[0] > 1:
             if data.ndim == 2 and data.shape[1] > MOST:
                 continue
             yield name, data

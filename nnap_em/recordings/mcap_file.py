@@ -114,9 +114,8 @@ def _track(path: Path, topic: str, paths: Sequence[str], parts: list[_Part]) -> 
     columns = np.concatenate([part.values for part in parts], axis=1)
     parts.clear()
     clock = choose(path, topic, log, np.concatenate(stamps) if sum(map(len, stamps)) == log.size else None)
-    if clock.used.size < log.size or (np.diff(clock.used) != 1).any():
-        columns = columns[:, clock.used]
-    return Track(clock.t, dict(zip(paths, columns, strict=True)), clock.name, clock.notes)
+    values = {name: clock.take(column) for name, column in zip(paths, columns, strict=True)}
+    return Track(clock.t, values, clock.name, clock.notes, clock.lag)
 
 
 def _nanoseconds(values: Float[np.ndarray, "message two"]) -> Int[np.ndarray, " message"] | None:

@@ -9,10 +9,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.formats import refuse
-from ..data.rig import nearest
+from ..data.rig import nearest, toml_text
+from ..data.units import SIZES, named_unit
 from ..numerics.digits import counted
 
 EXTRA = 'pip install "nnap-em[logs]"'
+SECOND = 1_000_000_000
+"""ns."""
+UNTIMED = "row number"
+"""Clock of a table without times, 1 s a row."""
+_ARRAYS = {
+    "position": re.compile(r"(?:act(?:ual)?_?)?pos(?:ition)?", re.IGNORECASE),
+    "velocity": re.compile(r"(?:act(?:ual)?_?)?(?:vel(?:o|ocity)?|speed)", re.IGNORECASE),
+    "effort": re.compile(r"(?:act(?:ual)?_?)?(?:effort|torque|tau)", re.IGNORECASE),
+}
+"""Names of the quantities of a joint where they stand under its name: `Axis1.ActPos`."""
 
 
 class Topic(NamedTuple):
@@ -27,6 +38,10 @@ class Topic(NamedTuple):
     """Paths of its numbers, such as `position[shoulder]` or `data[0]`, in the order of the message."""
 
 
+Lag = tuple[tuple[int, int], ...]
+"""Differences of two clocks of a topic over time: (stamp, stamp minus log time) [ns], a few from first to last."""
+
+
 class Track(NamedTuple):
     """Content of one topic."""
 
@@ -38,6 +53,8 @@ class Track(NamedTuple):
     """Source of the times: `header stamp`, `log time`, or the name of a column."""
     notes: tuple[str, ...]
     """Irregularities of the times."""
+    lag: Lag = ()
+    """Difference of this clock from that of the log; empty where the file has one clock only."""
 
 
 class Recording(NamedTuple):
@@ -73,11 +90,35 @@ class Address(NamedTuple):
     def __str__(self) -> str:
         return f"{self.topic}:{self.path}" if self.topic else self.path
 
+    @property
+    def toml(self) -> str:
+        """The value of a line in [import.columns]."""
+        text = toml_text(str(self))
+        return text if self.scale == 1.0 else f"{{ from = {text}, scale = {self.scale:.9g} }}"
+
 
 def address(text: str) -> tuple[str, str]:
     """Topic and path of `/joint_states:position[shoulder]`; a table of columns has one topic without name."""
     topic, _, path = text.rpartition(":")
     return topic, path
+
+
+def last_word(path: str) -> str:
+    """The end of a path of names: `q` of `/arm/q`, and of a quantity of a joint `position[joint0]`.
+
+    That is what a table calls `/joint_states/joint0/position` or `Axis1.ActPos`.
+    """
+    words = [word for word in re.split(r"[.\\:/](?!s(?:\^?2|²)?$|[^\[(]*[\])])", path) if word]
+    for array, pattern in _ARRAYS.items():
+        if len(words) > 1 and pattern.fullmatch(words[-1]):
+            return f"{array}[{words[-2]}]"
+    return words[-1] if words else path
+
+
+def word_of(field: str) -> tuple[str, float]:
+    """The end of the path, and the SI units in the unit that stands behind it in brackets."""
+    name, unit = named_unit(field, brackets=True)
+    return last_word(name), SIZES.get(unit, ("", 1.0))[1]
 
 
 def steps(path: str) -> Iterator[str | int]:

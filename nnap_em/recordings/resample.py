@@ -1,27 +1,45 @@
 """One log on the grid of its rig: columns, sequences, and an account of what was done."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.rig import Rig, nearest
-from ..data.units import thousandfold
+from ..data.units import unit_between
 from ..numerics.digits import counted
 from .columns import declared_at, resolve
-from .declared import Plan
+from .common_clock import on_one_clock
+from .declared import LONGEST, Plan
 from .delays import Delay, delay, pairs
 from .files import reader
-from .recording import Address, Recording, Topic, Track, refuse
-from .segments import LEAST, Gap, Segment, commanded, cut, gaps, grid, longest_silence, reach, spans, watched
+from .readings import as_taken
+from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
+from .segments import (
+    LEAST,
+    Gap,
+    Segment,
+    Spans,
+    covered,
+    cut,
+    gaps,
+    hold,
+    longest_silence,
+    present,
+    reach,
+    runs,
+    sent_on_change,
+)
 from .signals import SLOW, Signal, averaged, held, interpolated
 
 COARSE = 4.0
 """Rows from one reading to the next of the fastest topic from which on the grid is refused as too fine."""
+SPARSE = 50.0
+"""Rows for each reading of the fastest topic from which on they are refused: without a declared gap there are 20."""
 
 
 class TopicFacts(NamedTuple):
@@ -68,18 +86,46 @@ class Resampled(NamedTuple):
     topics: tuple[TopicFacts, ...]
     delays: tuple[Delay, ...]
     rows: int
-    """Rows of the grid from the first to the last in which all topics are present."""
+    """Rows for which there are readings."""
     sequences: tuple[Stretch, ...]
     values: tuple[Mapping[str, Float[np.ndarray, " row"]], ...]
     """Columns of each sequence that is used, in order."""
     notes: tuple[str, ...]
 
 
-def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float]) -> Resampled:
+def resample(
+    path: Path,
+    rig: Rig,
+    states: Sequence[str],
+    plan: Plan,
+    shifts: Mapping[str, float],
+    unwrap: Collection[str] = (),
+) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 
+    The columns to `unwrap` lose the jumps of their counters.
     Raises DataError where a column cannot be had.
     """
+    for name in unwrap:
+        if name not in (known := (*rig.logged_inputs, *rig.measured)):
+            raise DataError(f"{path}: --unwrap {name}: no column of this rig; {nearest(name, known)}")
+    return _gridded(_columns(path, rig, plan, shifts, unwrap), rig, states, plan)
+
+
+class _Columns(NamedTuple):
+    """Columns of a log at times of their own, and duplicates of some."""
+
+    path: Path
+    origin: int
+    addresses: Mapping[str, Address]
+    signals: Mapping[str, Signal]
+    longest: Mapping[str, float]
+    """Silence of each from which on it has a gap [s]; infinite for commands that hold until the next."""
+    topics: tuple[TopicFacts, ...]
+    notes: tuple[str, ...]
+
+
+def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str]) -> _Columns:
     source = reader(path)
     topics = source.topics(path)
     addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
@@ -93,18 +139,33 @@ def resample(path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Ma
     for at in every.values():
         fields.setdefault(at.topic, []).append(at.path)
     recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()})
+    tracks = {topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()}
+    recording = on_one_clock(recording._replace(tracks=tracks), rig.dt, shifts)
     origin = min(int(track.t[0]) for track in recording.tracks.values())
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
-    signals = {name: _signal(recording, name, at, clocks[at.topic]) for name, at in every.items()}
-    facts = tuple(_facts(topic, recording, addresses, origin, plan, rig.dt) for topic in topics)
-    return _gridded(recording, origin, rig, states, plan, addresses, signals, facts)
+    least = {name: 1 if name in rig.logged_inputs else 2 for name in every}
+    signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in every.items()}
+    signals, notes = as_taken(signals, rig, unwrap)
+    longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
+    longest |= {name: math.inf for name in rig.logged_inputs if sent_on_change(signals[name], rig.dt)}
+    facts = tuple(
+        _facts(topic, recording.tracks.get(topic.name), clocks.get(topic.name), addresses, signals, longest)
+        for topic in topics
+    )
+    return _Columns(path, origin, addresses, signals, longest, facts, (*recording.notes, *notes))
 
 
-def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"]) -> Signal:
+def _timed(track: Track, dt: float) -> Track:
+    """A table without times, its rows `dt` apart, as the rig declares."""
+    note = f"no times in the table: rows are taken as dt = {dt:g} s apart"
+    return track if track.clock != UNTIMED else track._replace(t=np.round(track.t * dt).astype(np.int64), notes=(note,))
+
+
+def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"], least: int) -> Signal:
     """A column at its own times; messages without that number are left out."""
     y = recording.tracks[at.topic].values[at.path]
     finite = np.isfinite(y)
-    if np.count_nonzero(finite) < 2:
+    if np.count_nonzero(finite) < least:
         amount = f"{counted(np.count_nonzero(finite), 'number')} in {counted(y.size, 'message')}"
         problem = f"from {str(at)!r}: {amount}, the rest are NaN or absent"
         hint = "name a field that holds numbers in [import.columns], or take the log out"
@@ -114,63 +175,71 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
     return Signal(at.topic, t[finite], y[finite] * at.scale)
 
 
-def _gridded(
-    recording: Recording,
-    origin: int,
-    rig: Rig,
-    states: Sequence[str],
-    plan: Plan,
-    addresses: Mapping[str, Address],
-    signals: Mapping[str, Signal],
-    facts: tuple[TopicFacts, ...],
-) -> Resampled:
+def _gridded(log: _Columns, rig: Rig, states: Sequence[str], plan: Plan) -> Resampled:
+    dt, signals, longest = rig.dt, log.signals, log.longest
     inputs = {name: signals[name] for name in rig.logged_inputs}
     readings = {name: signals[name] for name in rig.measured}
-    start, end = _common(recording.path, inputs, readings, rig.dt)
-    _fine(recording.path, readings, rig.dt)
-    at = grid(readings, start, end, rig.dt)
-    longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
-    present = _present(inputs, readings, at, rig.dt, longest)
-    shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / rig.dt), 2)
-    columns = {name: (averaged if plan.mean else held)(s, at, rig.dt) for name, s in inputs.items()}
-    columns |= {name: interpolated(s, at, rig.dt, reach(s, rig.dt))[0] for name, s in readings.items()}
-    segments = [
-        _checked(segment, columns, rig.measured)
-        for segment in cut(present, shortest, max(round(plan.longest / rig.dt), 2))
-    ]
-    used = [segment for segment in segments if not segment.why]
-    if not used:
-        most = max((segment.end - segment.first for segment in segments), default=0)
-        problem = f"the longest stretch in which all topics have messages has {counted(most, 'row')}"
-        hint = f"a sequence needs {shortest}: set [import] shortest or gap in rig.toml, or record longer"
-        refuse(recording.path, "the log", problem, hint)
+    end = max(float(s.t[-1]) for s in readings.values())
+    watched = {name: present(s, longest[name]) for name, s in _one_each(readings)}
+    commanded = {
+        name: present(s, longest[name], hold(s, dt) if longest[name] < math.inf else max(end - s.t[-1], 0.0))
+        for name, s in _one_each(inputs)
+    }
+    common = _common(log.path, signals, watched | commanded)
+    _fine(log.path, readings, dt)
+    fastest = min(readings.values(), key=lambda s: s.interval)
+    spans = covered([*watched.values()], 1)
+    _sparse(log.path, spans, fastest, dt)
+    pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
+    shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
+    most = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * LEAST)
+    segments = cut(pieces, dt, shortest, most)
+    sequences = [_sequence(segment, rig, plan, signals) for segment in segments]
+    if all(stretch.why for stretch, _ in sequences):
+        most = max((piece.rows for piece in pieces), default=0)
+        problem = f"the longest stretch with all topics has {counted(most, 'row')}, a sequence needs {shortest}"
+        unit = unit_between(fastest.interval / dt)
+        other = "record longer, or lower [import] shortest, or raise [import] gap"
+        hint = f"the times, or dt, are in {unit}: write s" if unit else other
+        refuse(log.path, "the log", problem, hint)
     around = tuple(rig.measured)
     joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
     causes = pairs(joints, states, signals, tuple(plan.duplicates))
     return Resampled(
-        recording.path,
-        origin,
-        addresses,
-        facts,
+        log.path,
+        log.origin,
+        log.addresses,
+        log.topics,
         tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
-        at.size,
-        tuple(_sequence(segment, columns, rig, at) for segment in segments),
-        tuple({name: y[segment.first : segment.end] for name, y in columns.items()} for segment in used),
-        (*recording.notes, *_notes(rig, signals)),
+        sum(run.rows for run in runs(spans, fastest, dt)),
+        tuple(stretch for stretch, _ in sequences),
+        tuple(columns for stretch, columns in sequences if not stretch.why),
+        (*log.notes, *_notes(rig, signals, longest)),
     )
 
 
-def _common(path: Path, inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> tuple[float, float]:
+def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans]) -> Spans:
     """Interval in which all topics are present [s]; DataError where there is none."""
-    intervals = spans(inputs, readings, dt)
-    start, end = max(first for first, _ in intervals.values()), min(last for _, last in intervals.values())
+    topics: dict[str, tuple[float, float]] = {}
+    for name, each in spans.items():
+        first, last = topics.get(signals[name].topic, (-math.inf, math.inf))
+        topics[signals[name].topic] = (max(first, each[0, 0]), min(last, each[-1, 1]))
+    start, end = max(first for first, _ in topics.values()), min(last for _, last in topics.values())
     if end <= start:
-        late = max(intervals, key=lambda topic: intervals[topic][0])
-        early = min(intervals, key=lambda topic: intervals[topic][1])
-        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in intervals.items())
+        late = max(topics, key=lambda topic: topics[topic][0])
+        early = min(topics, key=lambda topic: topics[topic][1])
+        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in topics.items())
         hint = f"--shift {late}=SECONDS where their clocks differ, or record them together"
         refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", hint)
-    return start, end
+    return np.array([[start, end]])
+
+
+def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:
+    """Refuse rows that would be empty for the most part: memory is that of the readings."""
+    rows = float(np.sum(seen[:, 1] - seen[:, 0])) / dt
+    if rows > SPARSE * fastest.t.size:
+        problem = f"{rows:.3g} rows of {fastest.t.size} readings would be empty for the most part"
+        refuse(path, "[import] gap", problem, "lower it, so that sequences end where the readings do")
 
 
 def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
@@ -180,65 +249,52 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
         place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
         problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
         other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"
-        hint = "one of the two is in ms: write s" if thousandfold(best.interval / dt) else other
+        unit = unit_between(best.interval / dt)
+        hint = f"one of the two is in {unit}: write s" if unit else other
         refuse(path, "[sampling] dt", problem, hint)
-
-
-def _present(
-    inputs: Mapping[str, Signal],
-    readings: Mapping[str, Signal],
-    at: Float[np.ndarray, " row"],
-    dt: float,
-    longest: Mapping[str, float],
-) -> Bool[np.ndarray, " row"]:
-    """Rows in which every input is known, and some topic of readings is present."""
-    present = np.ones(at.size, bool)
-    for name, s in _one_each(inputs):
-        present &= commanded(s, at, dt, longest[name])
-    seen = np.zeros(at.size, bool)
-    for name, s in _one_each(readings):
-        seen |= watched(s, at, dt, longest[name])
-    return present & seen
 
 
 def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
     """One of the columns that have the same times."""
-    known = set()
+    known: list[Signal] = []
     for name, s in signals.items():
-        key = (s.topic, s.t.size)
-        if key not in known:
-            known.add(key)
+        if not any(s.topic == other.topic and np.array_equal(s.t, other.t) for other in known):
+            known.append(s)
             yield name, s
 
 
-def _checked(segment: Segment, columns: Mapping[str, Float[np.ndarray, " row"]], measured: Sequence[str]) -> Segment:
-    """A segment in which a column of readings is empty is dropped: no other command takes it."""
-    for name in measured:
-        if not segment.why and np.count_nonzero(np.isfinite(columns[name][segment.first : segment.end])) < 2:
-            return segment._replace(why=f"{name} has no reading there")
-    return segment
-
-
-def _sequence(segment: Segment, columns: Mapping[str, np.ndarray], rig: Rig, at: Float[np.ndarray, " row"]) -> Stretch:
-    rows = slice(segment.first, segment.end)
-    missing = {name: int(np.isnan(columns[name][rows]).sum()) for name in rig.measured}
-    return Stretch(float(at[segment.first]), segment.end - segment.first, missing, segment.why)
+def _sequence(
+    segment: Segment, rig: Rig, plan: Plan, signals: Mapping[str, Signal]
+) -> tuple[Stretch, Mapping[str, Float[np.ndarray, " row"]]]:
+    """Columns of a segment; dropped is one in which a column of readings is empty, which no other command accepts."""
+    if segment.why:
+        return Stretch(segment.start, segment.rows, {}, segment.why), {}
+    at = segment.start + rig.dt * np.arange(segment.rows)
+    columns = {name: (averaged if plan.mean else held)(signals[name], at, rig.dt) for name in rig.logged_inputs}
+    for name in rig.measured:
+        columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))[0]
+    missing = {name: int(np.isnan(columns[name]).sum()) for name in rig.measured}
+    empty = [name for name, count in missing.items() if segment.rows - count < 2]
+    return Stretch(segment.start, segment.rows, missing, f"{empty[0]} has no reading there" if empty else ""), columns
 
 
 def _facts(
-    topic: Topic, recording: Recording, addresses: Mapping[str, Address], origin: int, plan: Plan, dt: float
+    topic: Topic,
+    track: Track | None,
+    t: Float[np.ndarray, " message"] | None,
+    addresses: Mapping[str, Address],
+    signals: Mapping[str, Signal],
+    longest: Mapping[str, float],
 ) -> TopicFacts:
     """Rate, jitter and gaps of a topic that was read; of others, the entries of the file."""
-    track: Track | None = recording.tracks.get(topic.name)
     used = tuple(name for name, at in addresses.items() if at.topic == topic.name)
-    if track is None:
+    if track is None or t is None:
         return TopicFacts(topic.name, topic.kind, used, topic.messages)
-    t = (track.t - origin) * 1e-9
+    columns = {name: s for name, s in signals.items() if s.topic == topic.name}
     steps = np.diff(t)
     typical = float(np.median(steps)) if steps.size else math.nan
-    signal = Signal(topic.name, t, t)
-    longest = longest_silence(signal, dt, plan.gap)
-    usual = steps[steps <= longest]
+    silent = steps > min(longest[name] for name in columns)
+    usual = steps[~silent] if silent.any() else steps
     return TopicFacts(
         topic.name,
         topic.kind,
@@ -249,14 +305,22 @@ def _facts(
         float(t[-1]),
         1 / typical if typical > 0 else math.nan,
         float(np.std(usual)) if usual.size else math.nan,
-        float(np.max(np.abs(usual - typical), initial=0.0)),
-        tuple(gaps(signal, longest)),
+        float(max(usual.max() - typical, typical - usual.min())) if usual.size else 0.0,
+        tuple(sorted({gap for name, s in _one_each(columns) for gap in gaps(s, longest[name])})),
         track.notes,
     )
 
 
-def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
-    """Messages about readings lost or interpolated between topics and rows."""
+def _notes(rig: Rig, signals: Mapping[str, Signal], longest: Mapping[str, float]) -> Iterator[str]:
+    """Messages about commands that are held, and readings lost or interpolated between topics and rows."""
+    end = max(float(signals[name].t[-1]) for name in rig.measured)
+    for name in rig.logged_inputs:
+        if longest[name] == math.inf:
+            amount = counted(signals[name].t.size, "value")
+            yield f"{name} is sent on change ({amount}, no rate): each is held until the next, the last to the end"
+        elif (late := end - float(signals[name].t[-1])) > longest[name]:
+            hint = "where the drive holds its last command, write [import] gap = inf"
+            yield f"{name} ends {late:.3g} s before the readings: rows from there on are left out; {hint}"
     reported = set()
     for name in rig.measured:
         s = signals[name]

@@ -1,12 +1,11 @@
-"""Rows of one uniform grid, and the stretches of it in which every topic is present."""
+"""Rows of uniform grids, and the stretches of time in which every topic is present."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .signals import SAME, Signal
 
@@ -16,6 +15,21 @@ NEAR = 2.5
 """Intervals of a topic between neighbours that are interpolated at most: one message may be lost."""
 LEAST = 50
 """Rows of a sequence, where no shortest one is declared."""
+FEW = 10
+"""Intervals between commands from which on they may have a rate."""
+SET_POINT = 0.5
+"""Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream."""
+REGULAR = 0.45
+"""Share of intervals near their median, or near the one before, from which on commands have a rate.
+
+With half the messages lost it is 0.5 or more, for times by chance 0.35.
+"""
+CHANCE = 0.01
+"""Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
+stood still in them."""
+
+Spans = Float[np.ndarray, "_ 2"]
+"""Starts and ends [s] of stretches of time that follow each other."""
 
 
 class Gap(NamedTuple):
@@ -26,11 +40,11 @@ class Gap(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Rows of the grid that follow each other."""
+    """Rows that follow each other."""
 
-    first: int
-    end: int
-    """The row after the last one."""
+    start: float
+    """Time of the first row [s]."""
+    rows: int
     why: str = ""
     """Reason why it is dropped; empty: it is used."""
 
@@ -45,54 +59,76 @@ def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
     return INTERVALS * max(signal.interval, dt) if declared is None else declared
 
 
+def sent_on_change(signal: Signal, dt: float) -> bool:
+    """True for commands without a rate, each of which holds until the next.
+
+    They are a few, set points, or irregular; or they go on after each silence as if there had been none.
+    """
+    steps = np.diff(signal.t)
+    if steps.size < FEW or signal.interval >= SET_POINT:
+        return True
+    usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
+    alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes
+    if max(usual, alike) < REGULAR:
+        return True
+    silent = steps > longest_silence(signal, dt, None)
+    if not silent.any():
+        return False
+    jumps = np.abs(np.diff(signal.y))
+    step = float(np.median(jumps[~silent]))
+    if step == 0 or jumps[silent].max() > 2 * step:  # sent without change, too; or not where it was
+        return False
+    near = 4 * step / float(np.ptp(np.quantile(signal.y, (0.05, 0.95))))
+    return near ** int(np.count_nonzero(silent)) < CHANCE
+
+
 def gaps(signal: Signal, longest: float) -> list[Gap]:
     """The silences that are longer [s]."""
+    spans = present(signal, longest)
+    return [Gap(start, end) for start, end in zip(spans[:-1, 1].tolist(), spans[1:, 0].tolist(), strict=True)]
+
+
+def present(signal: Signal, longest: float, hold: float = 0.0) -> Spans:
+    """Stretches without a gap; a command is held for `hold` [s] after the last value of each, not to its end."""
     places = np.flatnonzero(np.diff(signal.t) > longest)
-    return [Gap(float(signal.t[k]), float(signal.t[k + 1])) for k in places]
+    ends = signal.t[np.append(places, signal.t.size - 1)]
+    return np.stack([signal.t[np.append(0, places + 1)], ends + hold], axis=1)
 
 
-def spans(inputs: Mapping[str, Signal], readings: Mapping[str, Signal], dt: float) -> dict[str, tuple[float, float]]:
-    """Intervals in which each topic is present [s]; a command is held for one more of its intervals, not to its end."""
-    intervals: dict[str, tuple[float, float]] = {}
-    for signals, hold in ((inputs, True), (readings, False)):
-        for s in signals.values():
-            span = (float(s.t[0]), float(s.t[-1]) + (s.interval - 2 * SAME * dt if hold else 0.0))
-            first, last = intervals.get(s.topic, span)
-            intervals[s.topic] = (max(first, span[0]), min(last, span[1]))
-    return intervals
+def hold(signal: Signal, dt: float) -> float:
+    """Time for which a command is known after its last value [s]."""
+    return max(signal.interval, dt) - 2 * SAME * dt
 
 
-def grid(readings: Mapping[str, Signal], start: float, end: float, dt: float) -> Float[np.ndarray, " row"]:
-    """Rows from a reading of the fastest topic on, so that readings as regular as the grid are taken as they are."""
-    fastest = min(readings.values(), key=lambda s: s.interval)
-    t = fastest.t[fastest.t >= start - SAME * dt]
-    first = float(t[0]) if t.size else start
-    return first + dt * np.arange(max(math.floor((end - first) / dt + SAME) + 1, 0))
+def covered(parts: Sequence[Spans], least: int) -> Spans:
+    """Stretches of time that lie in at least so many of the parts."""
+    edges = np.concatenate([np.zeros(0), *(part.T.ravel() for part in parts)])
+    signs = np.concatenate([np.zeros(0, int), *(np.repeat((1, -1), len(part)) for part in parts)])
+    order = np.lexsort((-signs, edges))  # what begins where another part ends touches it
+    depth = np.cumsum(signs[order])
+    first = np.flatnonzero((depth >= least) & (depth - signs[order] < least))
+    last = np.flatnonzero((depth < least) & (depth - signs[order] >= least))
+    return np.stack([edges[order][first], edges[order][last]], axis=1)
 
 
-def commanded(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
-    """Rows in which an input is known: for one interval after its last value before a gap."""
-    known = np.ones(at.size, bool)
-    for gap in gaps(signal, longest):
-        known &= (at < gap.start + max(signal.interval, dt) - SAME * dt) | (at >= gap.end - SAME * dt)
-    return known
+def runs(spans: Spans, fastest: Signal, dt: float) -> list[Segment]:
+    """Rows `dt` apart in each span, from a reading of the fastest topic on if there is one near.
+
+    Readings as regular as the rows are taken as they are.  Spans less than a row apart are one.
+    """
+    apart = np.flatnonzero(spans[1:, 0] - spans[:-1, 1] > dt)
+    start, end = spans[:, 0][np.append(0, apart + 1)[: len(spans)]], spans[:, 1][np.append(apart, -1)[: len(spans)]]
+    reading = np.append(fastest.t, np.inf)[np.searchsorted(fastest.t, start - SAME * dt)]
+    start = np.where(reading < start + max(fastest.interval, dt), reading, start)
+    rows = np.floor((end - start) / dt + SAME).astype(int) + 1
+    return [Segment(first, n) for first, n in zip(start.tolist(), rows.tolist(), strict=True) if n > 0]
 
 
-def watched(signal: Signal, at: Float[np.ndarray, " row"], dt: float, longest: float) -> Bool[np.ndarray, " row"]:
-    """Rows outside the gaps of a reading."""
-    known = np.ones(at.size, bool)
-    for gap in gaps(signal, longest):
-        known &= (at <= gap.start + SAME * dt) | (at >= gap.end - SAME * dt)
-    return known
-
-
-def cut(present: Bool[np.ndarray, " row"], shortest: int, longest: int) -> list[Segment]:
-    """The stretches of `present` rows, the long ones in equal parts, the short ones marked as dropped."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(int))).reshape(-1, 2)
+def cut(runs: Sequence[Segment], dt: float, shortest: int, longest: int) -> list[Segment]:
+    """The runs of rows, the long ones in equal parts, the short ones marked as dropped."""
     segments = []
-    for first, end in edges.tolist():
-        parts = -(-(end - first) // longest)
-        places = np.round(np.linspace(first, end, parts + 1)).astype(int).tolist()
-        why = "" if end - first >= shortest else f"shorter than {shortest} rows"
-        segments += [Segment(a, b, why) for a, b in pairwise(places)]
+    for run in runs:
+        places = np.round(np.linspace(0, run.rows, -(-run.rows // longest) + 1)).astype(int).tolist()
+        why = "" if run.rows >= shortest else f"shorter than {shortest} rows"
+        segments += [Segment(run.start + a * dt, b - a, why) for a, b in pairwise(places)]
     return segments

@@ -1,10 +1,10 @@
 """A quantity at times of its own: held, averaged, interpolated and integrated exactly where it is read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 SAME = 1e-3
 """Share of a row by which times may differ and still be one: clocks count in ns, and rows are rounded."""
@@ -19,11 +19,13 @@ class Signal:
     topic: str
     t: Float[np.ndarray, " message"]
     y: Float[np.ndarray, " message"]
+    jumps: Int[np.ndarray, " jump"] = field(default_factory=lambda: np.zeros(0, int))
+    """Values before which a counter has started over."""
 
     @cached_property
     def interval(self) -> float:
         """Median time from one value to the next [s]."""
-        return float(np.median(np.diff(self.t))) if self.t.size > 1 else np.inf
+        return float(np.median(np.diff(self.t), overwrite_input=True)) if self.t.size > 1 else np.inf
 
 
 def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
@@ -47,23 +49,30 @@ def interpolated(
 ) -> tuple[Float[np.ndarray, " row"], Bool[np.ndarray, " row"]]:
     """Straight lines between neighbours, and where there is a value.
 
-    There is none where neighbours are more than `reach` [s] apart, nor, where readings come slower than rows, in rows
-    that are nearest to no reading.  Between readings of noise sigma a value has less: from sigma / sqrt(2) on.
+    There is none where neighbours are more than `reach` [s] apart or a jump lies between them, nor, where readings come
+    slower than rows, in rows that are nearest to no reading.  Between readings of noise sigma a value has less: from
+    sigma / sqrt(2) on.
     """
     t, slack = signal.t, SAME * dt
     right = np.clip(np.searchsorted(t, at), 1, max(t.size - 1, 1))
     width = t[right] - t[right - 1]
     x = np.clip(at, t[0], t[-1])
     exact = np.minimum(np.abs(x - t[right]), np.abs(x - t[right - 1])) <= slack
-    known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((width <= reach) | exact)
+    across = np.isin(right, signal.jumps)
+    known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((~across & (width <= reach)) | exact)
     if signal.interval > SLOW * dt:
-        nearest = np.round((t - at[0]) / dt).astype(int)
-        hit = np.zeros(at.size, bool)
-        hit[nearest[(nearest >= 0) & (nearest < at.size)]] = True
-        known &= hit
+        known &= np.searchsorted(t, at + dt / 2) > np.searchsorted(t, at - dt / 2)
     share = (x - t[right - 1]) / width
+    share = np.where(across, np.round(share), share)
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
     return np.where(known, y, np.nan), known
+
+
+def between(signal: Signal, start: float, end: float) -> Signal:
+    """The part of a signal with its values from start to end [s]."""
+    first, last = np.searchsorted(signal.t, (start, end))
+    part = slice(max(int(first) - 1, 0), int(last) + 1)
+    return Signal(signal.topic, signal.t[part], signal.y[part])
 
 
 def integrals(signal: Signal, at: Float[np.ndarray, " x"], times: int, *, steps: bool) -> Float[np.ndarray, " x"]:

@@ -1,38 +1,57 @@
 """CSV, Parquet and MAT files: one topic without a name, whose fields are the columns."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from ..data.formats import column_names, header_hint, read_table
-from .clock import rising
-from .hdf5_file import TIME, UNITS
-from .recording import Recording, Topic, Track, refuse
+from ..data.formats import column_names, read_log, refuse, untimed
+from ..data.units import TIME
+from .clock import nanoseconds, rising
+from .recording import SECOND, UNTIMED, Recording, Topic, Track
+
+EPISODE = re.compile(r"episode(_index|_id)?", re.IGNORECASE)
+"""Column that counts the sequences of one file, each with a clock of its own."""
+BETWEEN = 100
+"""Intervals between two episodes: more than the 5 of a gap, and few enough for rows of the grid to stay in step."""
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
     """The columns, save that of the time."""
     names = column_names(path)
     clock = _clock(path, names)
-    return (Topic("", f"table, time in column {clock!r}", None, tuple(name for name in names if name != clock)),)
+    kind = "table without times" if clock is None else f"table, time in column {clock!r}"
+    return (Topic("", kind, None, tuple(name for name in names if name != clock)),)
 
 
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
-    name = _clock(path, column_names(path))
-    table = read_table(path, (name,), fields[""])
-    scale = UNITS[(match[1] or "s").lower()] if (match := TIME.match(name)) else 1.0
-    t = np.round(table[:, 0] * scale * 1e9).astype(np.int64)
-    clock = rising(path, f"column {name!r}", t, name)
-    values = {column: table[clock.used, i] for i, column in enumerate(fields[""], 1)}
+    names = column_names(path)
+    name, episode = _clock(path, names), [each for each in names if EPISODE.fullmatch(each)][:1]
+    table = read_log(path, (*((name,) if name else ()), *episode), fields[""])
+    values = dict(zip(fields[""], table[:, table.shape[1] - len(fields[""]) :].T, strict=True))
+    if name is None:
+        return Recording(path, {"": Track(SECOND * np.arange(len(table)), values, UNTIMED, ())})
+    match, where = TIME.match(name), f"column {name!r}"
+    t = nanoseconds(path, where, table[:, 0], ((match and match[1]) or "").lower())
+    clock = rising(path, where, _in_a_row(t, table[:, 1]) if episode else t, name)
+    values = {column: clock.take(y) for column, y in values.items()}
     return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
 
 
-def _clock(path: Path, names: Sequence[str]) -> str:
-    """The column that is the time."""
+def _in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> Int[np.ndarray, " row"]:
+    """The times of episodes whose clocks restart, one after the other, with a silence between that is a gap."""
+    steps = np.diff(t)
+    new = np.diff(episode) != 0
+    usual = np.mean(steps[~new]) if not new.all() else SECOND  # of single precision, the mean is exact
+    return t[0] + np.append(0, np.cumsum(np.where(new, round(BETWEEN * usual), steps)))
+
+
+def _clock(path: Path, names: Sequence[str]) -> str | None:
+    """The column that is the time; None where no name is like one."""
     column = next((name for name in names if TIME.match(name)), None)
-    if column is None:
-        hint = header_hint(path) or "name it 'time' [s]"
+    if column is None and (hint := untimed(path, names)):
         refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", hint)
     return column

@@ -1,0 +1,51 @@
+"""Sample and hold: readings that stand in several rows, because the sensor is slower than the log."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .constant import runs
+
+HELD = 1.5
+"""Mean rows of a reading from which on the repeats are taken as missing: below, most rows hold one of their own."""
+_QUANTA = 3.5  # steps of the sensor: a reading that has moved on by more would have changed every row
+_CHANGES = 8  # of a moving signal, from which on the rows between them show a hold
+_JITTER = 0.3  # share of the rows by which a hold varies; one at least
+_REGULAR = 0.9  # share of the holds that keep to it
+
+
+def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
+    """Rows in which each reading of a column stands while it moves; 1 where it is new in every row.
+
+    An encoder that moves slowly repeats readings too, but its steps are single ones, and the faster it moves, the fewer
+    rows lie between them.  `signals` are the column in some logs of one machine.
+    """
+    changes = [_changes(y) for y in signals]
+    sizes = np.concatenate([size for _, size in changes]) if changes else np.zeros(0)
+    if not sizes.size:
+        return 1.0
+    moving = _QUANTA * float(np.percentile(sizes, 1))
+    rows = np.concatenate([np.diff(at)[(size[1:] > moving) & (size[:-1] > moving)] for at, size in changes])
+    if rows.size < _CHANGES:
+        return 1.0
+    typical = float(np.median(rows))
+    usual = np.abs(rows - typical) <= max(_JITTER * typical, 1.0)
+    mean = float(np.mean(rows[usual]))
+    return mean if typical > 1 and np.mean(usual) >= _REGULAR and mean >= HELD else 1.0
+
+
+def repeats(y: Float[np.ndarray, " time"], rows: float) -> Int[np.ndarray, " row"]:
+    """Rows that hold a reading over again, where each stands in so many; equal readings at rest are as many as fit."""
+    k = np.flatnonzero(np.isfinite(y))
+    first, end = np.array(runs(y[k]), int).reshape(-1, 2).T
+    count = np.maximum(np.round((end - first) / rows), 1).astype(int)
+    part = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    new = np.repeat(first, count) + np.round(part * np.repeat((end - first) / count, count)).astype(int)
+    return np.delete(k, new)
+
+
+def _changes(y: Float[np.ndarray, " time"]) -> tuple[Int[np.ndarray, " change"], Float[np.ndarray, " change"]]:
+    """Numbers of the readings that are new, and how far they are from the last."""
+    size = np.abs(np.diff(y[np.isfinite(y)]))
+    return np.flatnonzero(size), size[size > 0]

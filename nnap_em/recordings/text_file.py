@@ -1,0 +1,285 @@
+"""Text tables of PLCs, drives and tools: other separators, decimal commas, lines above the header, several clocks."""
+
+import codecs
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..data.formats import check_size, read_bytes, refuse, seconds, split
+from ..data.units import SIZES, TIME
+from ..numerics.digits import counted
+from .clock import nanoseconds, rising
+from .recording import SECOND, UNTIMED, Recording, Topic, Track
+
+HEAD, LINES = 2**18, 200
+"""Bytes and lines in which the layout of a file shows: headers have some dozens of lines."""
+MARKS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("", "."), ("", ","), (",", ","))
+"""Marks of columns (none: blanks) and of decimals; of two that explain a file alike, the first counts."""
+TICKS = 1e16
+"""Times from here on are 100 ns ticks since 1601, as Windows counts them; in 2026, 1.3e17."""
+TICKS_1970 = 116_444_736_000_000_000
+CODESYS = "[key]"
+"""First word of a CODESYS trace."""
+_TRUTHS = {"TRUE": "1", "FALSE": "0"}
+Cells = Sequence[tuple[int, str]]
+"""Fields of a column, with their lines in the file, counted from 1."""
+
+
+class Layout(NamedTuple):
+    """Places of the numbers of a table."""
+
+    marks: tuple[str, str]
+    first: int
+    """Lines above the first row of numbers."""
+    names: tuple[str, ...]
+    clocks: tuple[int, ...]
+    """Columns of times; each counts for the columns up to the next one."""
+    unit: str = "s"
+    """Unit of the times."""
+    dt: float = math.nan
+    """Interval of the rows [s], of a table without times that states it."""
+
+
+class Block(NamedTuple):
+    """Columns with one clock."""
+
+    clock: str
+    t: Int[np.ndarray, " row"] | None
+    """ns; None: the table has no times."""
+    columns: Mapping[str, Cells]
+    decimal: str
+
+
+def foreign(path: Path) -> bool:
+    """True for a text table that is no plain CSV file: names in line 1, then rows, ',' and '.'."""
+    text = _decoded(read_bytes(path, HEAD).rpartition(b"\n")[0])
+    found = layout(text.split("\n"))
+    if found is None:
+        return text.startswith(CODESYS)
+    names = [name for name in found.names if name]
+    plain = found.marks == MARKS[0] and found.first == 1 and len(set(names)) == len(names) and text[0] not in "#%"
+    return not plain or any("," in name for name in names)
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """A topic for each clock; one alone has no name."""
+    return tuple(
+        Topic(name, "text table" + (", no times" if block.t is None else ""), None, tuple(block.columns))
+        for name, block in _blocks(path).items()
+    )
+
+
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
+    """These columns; an empty field is NaN."""
+    blocks, tracks = _blocks(path), {}
+    for topic, names in fields.items():
+        block, values = blocks[topic], {}
+        for name in names:
+            values[name] = _floats(path, name, block.columns[name], block.decimal)
+        if block.t is None:
+            tracks[topic] = Track(SECOND * np.arange(len(values[names[0]])), values, UNTIMED, ())
+        else:
+            clock = rising(path, f"column {block.clock!r}", block.t, block.clock)
+            tracks[topic] = Track(clock.t, {n: clock.take(y) for n, y in values.items()}, clock.name, clock.notes)
+    return Recording(path, tracks)
+
+
+def layout(lines: Sequence[str]) -> Layout | None:
+    """The layout that the first lines of a file show; None where no row of numbers stands under names."""
+    lines = lines[:LINES][:-1] or lines  # the last one may be cut
+    every = {marks: [[_kind(text, marks[1]) for text in split(line, marks[0])] for line in lines] for marks in MARKS}
+    marks = max(MARKS, key=lambda each: sum(sum(row) for row in every[each] if len(row) - row.count(0) > 1))
+    kinds, widths = every[marks], Counter(map(len, every[marks]))
+    full = max(reversed(kinds), key=lambda row: row.count(1) * (widths[len(row)] > 1))
+
+    def alike(row: Sequence[int]) -> bool:
+        """Texts where the fullest row has some, and elsewhere numbers."""
+        return len(row) == len(full) and 1 in row and all(a >= 0 or b < 0 for a, b in zip(row, full, strict=True))
+
+    first = next((k for k, row in enumerate(kinds) if alike(row)), 0)
+    head = [split(re.sub(r"^\s*[#%]\s*", "", line), marks[0]) for line in lines[:first]]
+    row = split(lines[first], marks[0])
+    return next((found for dialect in DIALECTS if (found := dialect(head, row, marks))), None)
+
+
+def _twincat(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -> Layout | None:
+    """TwinCAT Scope: rows `Name`, `SymbolName`, `Unit`, ..., whose key stands again over every column of times."""
+    rows = {fields[0]: fields for fields in head if fields}
+    names = rows.get("Name", [])
+    clocks = tuple(i for i, x in enumerate(row[: len(names)]) if names[i] == "Name" and _kind(x, marks[1]) == 1)
+    if len(names) < 2 or not clocks:
+        return None
+    units = [re.sub(r"\s*\(.*", "", unit) for unit in rows.get("Unit", ())]
+    unit = "ticks" if _number(row[0], marks[1]) > TICKS else "ms"
+    return Layout(marks, len(head), _with_units(names, units), clocks, unit)
+
+
+def _labview(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -> Layout | None:
+    """LabVIEW measurement file: tags, then `X_Value` over every column of times, which may be left empty."""
+    rows = {fields[0]: fields for fields in head if fields}
+    if "X_Value" not in rows or "Delta_X" not in rows:
+        return None
+    names = _with_units(["" if name == "Comment" else name for name in head[-1]], rows.get("Y_Unit_Label", ()))
+    clocks = tuple(i for i, name in enumerate(names) if name == "X_Value")
+    if row[0]:
+        return Layout(marks, len(head), names, clocks)
+    dt = _number(next((text for text in rows["Delta_X"] if _kind(text, marks[1]) == 1), ""), marks[1])
+    return Layout(marks, len(head), tuple("" if name == "X_Value" else name for name in names), (), dt=dt)
+
+
+def _header(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -> Layout | None:
+    """A header, maybe with a row of units under it, below lines of any kind."""
+    widths, block = {len(row), len(_trimmed(row))}, []
+    for fields in reversed([fields for fields in head if any(fields)]):
+        if len(_trimmed(fields)) not in widths:
+            break
+        block.insert(0, _trimmed(fields))
+    if not block:
+        return None
+    names = _with_units(*block[:2]) if len(block) > 1 else tuple(block[0])
+    times = [i for i, name in enumerate(names) if TIME.match(name)]
+    match = TIME.match(names[times[0]]) if times else None
+    clocks = tuple(i for i in times if names[i] == names[times[0]])
+    return Layout(marks, len(head), names, clocks, ((match and match[1]) or "").lower())
+
+
+DIALECTS = (_twincat, _labview, _header)
+"""Layouts, by the lines above the first row of numbers; for another one, add a function like these."""
+
+
+def _blocks(path: Path) -> dict[str, Block]:
+    """The columns by their clocks, those with the same times together."""
+    check_size(path)
+    lines = _decoded(read_bytes(path)).rstrip().split("\n")
+    out: list[Block] = []
+    for block in (_codesys if lines[0].startswith(CODESYS) else _table)(path, lines):
+        same = [k for k, other in enumerate(out) if other.t is not None and np.array_equal(other.t, block.t)]  # pyright: ignore[reportArgumentType]
+        if same:
+            out[same[0]] = out[same[0]]._replace(columns={**out[same[0]].columns, **block.columns})
+        elif block.columns:
+            out.append(block)
+    if not out:
+        refuse(path, "the file", "holds no column of numbers under a name", "write a header, then rows of numbers")
+    return {f"clock {k}" if len(out) > 1 else "": block for k, block in enumerate(out, 1)}
+
+
+def _table(path: Path, lines: Sequence[str]) -> Iterator[Block]:
+    """The columns of a table, in one block for each column of times."""
+    found = layout([*lines, ""])
+    if found is None:
+        return
+    width, rows = len(found.names), []
+    for number, line in enumerate(lines[found.first :], found.first + 1):
+        fields = _trimmed(split(line, found.marks[0]))
+        if fields == ["EOF"]:
+            break
+        if len(fields) > width:
+            problem = f"found {counted(len(fields), 'field')} under {counted(width, 'name')}"
+            refuse(path, f"line {number}", problem, "name every column; mark columns and decimals differently")
+        rows += [[(number, text) for text in [*fields, *[""] * (width - len(fields))]]] if fields else []
+    named = [i for i, name in enumerate(found.names) if name and i not in found.clocks]
+    for clock in found.clocks or (None,):
+        inside = [
+            i for i in named if clock == max((c for c in found.clocks if c < i), default=(*found.clocks, None)[0])
+        ]
+        columns: dict[str, Cells] = {}
+        # a slower clock has fewer rows
+        full = [row for row in rows if clock is None or any(row[i][1] for i in (clock, *inside))]
+        for i in inside:
+            again = sum(found.names[i] == found.names[j] for j in named if j < i)
+            columns[found.names[i] + f" ({again})" * (again > 0)] = [row[i] for row in full]
+        if clock is not None:
+            t = _nanoseconds(path, found.names[clock], [row[clock] for row in full], found.unit, found.marks[1])
+            yield Block(found.names[clock], t, columns, found.marks[1])
+        else:
+            t = None if math.isnan(found.dt) else np.round(found.dt * SECOND * np.arange(len(rows))).astype(np.int64)
+            yield Block("Delta_X", t, columns, found.marks[1])
+
+
+def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
+    """CODESYS trace: for each variable `0.Variable; name`, then rows `; time; value`; bit 5 of `Flags`: us, else ms."""
+    name, unit = "", "ms"
+    t: list[tuple[int, str]] = []
+    y: list[tuple[int, str]] = []
+    for number, line in enumerate([*lines, "end"], 1):
+        key, _, rest = line.partition(";")
+        if not key.strip() and ";" in rest:
+            at, _, value = rest.partition(";")
+            t.append((number, at.strip()))
+            y.append((number, value.strip()))
+            continue
+        if t:
+            yield Block("time", _nanoseconds(path, "time", t, unit, "."), {name: y}, ".")
+            t, y = [], []
+        name = rest.strip() if key.endswith("Variable") else name
+        unit = "us" if key == "Flags" and rest.strip().isdecimal() and int(rest) & 32 else unit
+
+
+def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+    """Names with the units that stand under them, where these are known."""
+    known = [unit.strip("[]() ") for unit in units] + [""] * len(names)
+    return tuple(
+        f"{name} [{unit}]" if name and unit.lower() in SIZES else name for name, unit in zip(names, known, strict=False)
+    )
+
+
+def _nanoseconds(path: Path, name: str, cells: Cells, unit: str, decimal: str) -> Int[np.ndarray, " row"]:
+    """The times; ticks in whole numbers, of which floating point holds 16 digits."""
+    if empty := [line for line, text in cells if not text]:
+        refuse(path, f"line {empty[0]}, column {name!r}", "holds no time", "write it, or cut the row")
+    if cells and not math.isinf(seconds(cells[0][1])):
+        cells, unit = [(line, str(seconds(text))) for line, text in cells], "s"
+    t = _floats(path, name, cells, decimal)
+    if unit == "ticks":
+        whole = [int(text) if text.isdecimal() else int(x) for (_, text), x in zip(cells, t, strict=True)]
+        return np.array([100 * (ticks - TICKS_1970) for ticks in whole])
+    return nanoseconds(path, f"column {name!r}", t, unit)
+
+
+def _floats(path: Path, name: str, cells: Cells, decimal: str) -> Float[np.ndarray, " row"]:
+    out = np.empty(len(cells))
+    for k, (line, text) in enumerate(cells):
+        try:
+            out[k] = _number(text, decimal)
+        except ValueError:
+            hint = "write a number such as -0.125, or leave the field empty: a missing sample"
+            refuse(path, f"line {line}, column {name!r}", f"found {text!r}", hint)
+    return out
+
+
+def _number(text: str, decimal: str) -> float:
+    """A number, or a truth value of a PLC; NaN for an empty field."""
+    if decimal == ",":
+        text = text.replace(".", "?").replace(",", ".")
+    return float(_TRUTHS.get(text.upper(), text.replace("_", "?")) or "nan")
+
+
+def _kind(text: str, decimal: str) -> int:
+    """1 for a number, 0 for an empty field, -1 for a text."""
+    try:
+        return int(not math.isnan(_number(text, decimal)))
+    except ValueError:
+        return -1
+
+
+def _trimmed(fields: Sequence[str]) -> list[str]:
+    """The fields up to the last one that is not empty."""
+    return list(fields[: max((k for k, text in enumerate(fields, 1) if text), default=0)])
+
+
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8, UTF-16 with its mark, or else as Windows writes it in western Europe."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("cp1252", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -1,0 +1,443 @@
+"""Clocks of logs: wrong stamps, units, two clocks of one log, silences; all compared with what was written."""
+
+import tracemalloc
+from datetime import UTC, datetime
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
+
+from nnap_em.data import formats
+from nnap_em.data.dataset import DataError
+from nnap_em.data.rig import read_rig
+from nnap_em.recordings import clock
+from nnap_em.recordings.declared import read_plan
+from nnap_em.recordings.files import reader
+from nnap_em.recordings.resample import Resampled, resample
+from nnap_em.recordings.segments import covered, runs, sent_on_change
+from nnap_em.recordings.signals import Signal
+from nnap_em.systems import specs
+
+DT = 0.01
+RIG = """\
+format = 1
+name = "bench"
+[model]
+type = "pendulum"
+m = 0.3
+lc = 0.2
+I = 0.01
+g = 9.81
+friction = "unknown"
+[input]
+columns = ["u"]
+joints = [1]
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["theta1", "dtheta1"]
+[import]
+"""
+TOPICS = """
+[import.columns]
+theta1 = "/js:position[joint]"
+dtheta1 = "/js:velocity[joint]"
+u = "/cmd:data[0]"
+"""
+ARM = RIG.replace('["u"]', '["u", "v"]').replace("[1]", "[1, 2]").replace("pendulum", "acrobot")
+ARM = ARM.replace("m = 0.3\nlc = 0.2\nI = 0.01", "m1 = 1\nm2 = 1\nl1 = 1\nl2 = 1\nlc1 = 1\nlc2 = 1\nI1 = 1\nI2 = 1")
+T = DT * np.arange(1000)
+DAY = 86400.0
+
+
+@pytest.fixture(autouse=True)
+def _no_delays(monkeypatch):
+    """Delays between topics, whose tests are in `test_import.py`, take most of the time of an import this short."""
+    monkeypatch.setattr("nnap_em.recordings.resample.pairs", lambda *_: [])
+
+
+def _columns(t):
+    return {"u": np.cos(t), "theta1": np.sin(3 * t), "dtheta1": 3 * np.cos(3 * t)}
+
+
+def _csv(path, time, columns, name: str = "time"):
+    """A CSV file of texts or numbers, with nothing where a number is NaN."""
+    rows = zip(time, *(values.tolist() for values in columns.values()), strict=True)
+    texts = [",".join(str(x) if x == x else "" for x in row) for row in rows]
+    path.write_text("\n".join([",".join([name, *columns]), *texts]) + "\n")
+    return path
+
+
+def _mcap(path, log, stamps, command_t, command):
+    joints = joint_states(("joint",), np.sin(3 * T)[:, None], 3 * np.cos(3 * T)[:, None], stamps=stamps)
+    return write_mcap(
+        path, {"/js": (ros2(*JOINTS), log, joints), "/cmd": (ros2(*MULTI), ns(command_t), arrays(command))}
+    )
+
+
+def _import(path, more: str = "", shifts=None, rig: str = RIG) -> Resampled:
+    rig_file = path.with_name("rig.toml")
+    rig_file.write_text(rig + more + (TOPICS if path.suffix == ".mcap" else ""))
+    declared = read_rig(rig_file, specs)
+    plan = read_plan(rig_file, (*declared.logged_inputs, *declared.measured))
+    return resample(path, declared, ("theta1", "dtheta1"), plan, shifts or {})
+
+
+def _notes(log: Resampled) -> str:
+    return "; ".join((*log.notes, *(note for topic in log.topics for note in topic.notes)))
+
+
+def _rows(log: Resampled) -> list[int]:
+    return [stretch.rows for stretch in log.sequences if not stretch.why]
+
+
+def _changed(rows, values):
+    t = 1.7e9 + T
+    t[rows] = values
+    return t
+
+
+WRONG = {  # stamps [s], the rows that are left out, and the sequences
+    "zeros before the clock was set": (_changed(slice(10), 0.0), range(10), [990]),
+    "a clock that stands at 0 for long": (_changed(slice(300), 0.0), range(300), [700]),
+    "one stamp of 2106": (_changed(500, 2.0**32), [500], [1000]),
+    "the last one of 2106": (_changed(999, 2.0**32), [999], [999]),
+    "one stamp 100 s late": (_changed(500, 1.7e9 + 105), [500], [1000]),
+    "one stamp 5 s early": (_changed(700, 1.7e9 + 2), [700], [1000]),
+    "zeros in the middle": (_changed(slice(500, 550), 0.0), range(500, 550), [500, 450]),
+    "a number beyond all times": (_changed(500, 1e30), [500], [1000]),
+    "a pause of three days": (1.7e9 + T + 3 * DAY * (T >= 5), [], [500, 500]),
+    "a clock set after 3 s": (1.7e9 * (T >= 3) + T, [], [300, 700]),
+}
+
+
+@pytest.mark.parametrize("t, dropped, rows", WRONG.values(), ids=WRONG)
+def test_stamps_of_another_clock_are_left_out_and_memory_follows_the_samples(tmp_path, t, dropped, rows):
+    path = _csv(tmp_path / "a.csv", t, _columns(T))
+    tracemalloc.start()
+    log = _import(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert _rows(log) == rows and peak < 2e7  # 1000 rows of 4 numbers are 32 kB, the text and its lists the rest
+    assert (f"{len(dropped)} row" in _notes(log)) == bool(dropped)
+    kept = np.delete(_columns(T)["u"], list(dropped))
+    if len(rows) == 1 and rows[0] == kept.size:
+        np.testing.assert_array_equal(log.values[0]["u"], kept)
+
+
+EDGES = {  # times [s] and the number that is used; None: refused
+    "5 % of the times": (np.r_[T[:50] + 20, T[50:] - 5], 950),
+    "more than 5 %": (np.r_[T[:51] + 20, T[51:] - 5], None),
+    "49 times before 31 days": (np.r_[T[:49], T[49:] + 31 * DAY], 951),
+    "50 times before 31 days": (np.r_[T[:50], T[50:] + 31 * DAY], 1000),
+    "49 times before 29 days": (np.r_[T[:49], T[49:] + 29 * DAY], 1000),
+    "0.9 s back": (T - 0.9 * (T > 9.955), 1000),
+    "1.1 s back": (T - 1.1 * (T > 9.955), 996),
+    "1.1 s back for long": (T - 1.1 * (T > 5), None),
+    "backwards in small steps": (T[::-1], None),
+    "one of two": (np.array([0.0, 1.7e9]), 2),
+    "one of three": (np.array([0.0, 1.7e9, 1.7e9 + 1]), 2),
+}
+
+
+@pytest.mark.parametrize("t, count", EDGES.values(), ids=EDGES)
+def test_which_times_are_of_one_clock(t, count):
+    kept = clock.trusted(np.round(t * NS).astype(np.int64))
+    assert (None if kept is None else kept.size) == count
+
+
+@pytest.mark.parametrize("wrong", [clock.RUNS // 2 - 1, clock.RUNS // 2])
+def test_more_wrong_stretches_than_are_looked_at_are_refused(wrong):
+    """Every wrong time is a stretch, and what follows it another."""
+    t = np.arange(50_000) * NS // 100
+    t[np.arange(1, wrong + 1) * 20] += 10**6 * NS
+    kept = clock.trusted(t)
+    assert (None if kept is None else t.size - kept.size) == (wrong if 2 * wrong < clock.RUNS else None)
+
+
+def test_small_steps_back_in_a_table_are_sorted_and_larger_ones_refused(tmp_path):
+    t = T.copy()
+    t[[400, 401]] = t[[401, 400]]
+    columns = {name: values[np.argsort(np.argsort(t))] for name, values in _columns(T).items()}
+    log = _import(_csv(tmp_path / "a.csv", t, columns))
+    assert "1 row out of order by up to 0.01 s: sorted" in _notes(log)
+    np.testing.assert_array_equal(log.values[0]["u"], _columns(T)["u"])
+    with pytest.raises(DataError, match=r"backwards at row 502, by 1.99 s; the clock was set back there"):
+        _import(_csv(tmp_path / "b.csv", T - 2 * (T > 5), _columns(T)))
+
+
+def test_rows_of_one_stamp_keep_all_their_columns(tmp_path):
+    """One row a message: commands in some rows, readings in those that follow, at the same milliseconds."""
+    columns = {name: np.full(2 * T.size, np.nan) for name in ("u", "theta1", "dtheta1")}
+    for name, values in _columns(T).items():
+        columns[name][0 if name == "u" else 1 :: 2] = values
+    log = _import(_csv(tmp_path / "a.csv", np.repeat(T, 2), columns))
+    for name, values in _columns(T).items():
+        np.testing.assert_allclose(log.values[0][name], values, rtol=0, atol=1e-9)  # times are in ns, at 9 rad/s^2
+    times = np.array([0, 0, 1, 1, 1, 2])
+    track = clock.rising(tmp_path, "times", times, "time")
+    values = np.array([1.0, np.nan, np.nan, 2.0, 3.0, np.nan])
+    np.testing.assert_array_equal(track.take(values), [1.0, 3.0, np.nan])  # the last of each, if there is one
+
+
+UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("kind", ["csv", "h5", "parquet"])
+def test_stamps_since_1970_are_read_by_their_size(tmp_path, kind, unit):
+    """Whole numbers, and in a table those of a float; of milliseconds as they are in seconds."""
+    stamps = (ns(T) // 10**6) * (UNITS[unit] // 10**3) if unit != "s" else 1.7e9 + T
+    columns, path = _columns(T), tmp_path / f"a.{kind}"
+    if kind == "csv":
+        _csv(path, stamps, columns, "timestamp")
+    elif kind == "h5":
+        write_hdf5(path, {"arm": {"timestamp": stamps} | columns})
+    else:
+        pq.write_table(pa.table({"timestamp": stamps} | columns), path)
+    (track,) = reader(path).read(path, {"/arm" if kind == "h5" else "": ("u",)}).tracks.values()
+    np.testing.assert_allclose(track.t - EPOCH, ns(T) - EPOCH, atol=300)  # ns: a float64 of 1.7e9 s holds 240
+    np.testing.assert_allclose(_import(path).values[0]["u"], columns["u"], rtol=1e-12)
+
+
+SIZES = {  # numbers, the unit by the name, and ns of the first or words of the refusal
+    "seconds": (1.5, "", 1_500_000_000),
+    "ms as named": (1.5, "ms", 1_500_000),
+    "ns of a day and more": (1.1e14, "", 110_000 * NS),
+    "us or ns": (9e13, "", "look like times in us or ns; name it time_us or time_ns"),
+    "ms, named s": (1.7e12, "s", "too large for s: they look like times in ms; name it time_ms"),
+    "2099": (4.09e9, "", 4_090_000_000 * NS),
+    "2001 in ms": (1e12, "", 1_000_000_000 * NS),
+}
+
+
+@pytest.mark.parametrize("number, unit, there", SIZES.values(), ids=SIZES)
+def test_times_are_of_the_unit_that_their_name_or_size_shows(tmp_path, number, unit, there):
+    for dtype in (float, int) if number > 2 else (float,):
+        t = np.array([number, number, number]).astype(dtype)
+        if isinstance(there, int):
+            assert clock.nanoseconds(tmp_path, "times", t, unit)[0] == there
+        else:
+            with pytest.raises(DataError, match=there):
+                clock.nanoseconds(tmp_path, "times", t, unit)
+
+
+@pytest.mark.parametrize("unit, scale", [("ms", 1e3), ("us", 1e6), ("days", 1 / DAY)])
+def test_a_unit_that_is_not_named_is_refused_with_it(tmp_path, unit, scale):
+    with pytest.raises(DataError, match=f"in {unit}: write s"):
+        _import(_csv(tmp_path / "a.csv", scale * T, _columns(T)))
+
+
+DATES = {
+    "2023-11-14T22:13:20.005": 1_700_000_000.005,
+    "2023-11-14T22:13:20.005Z": 1_700_000_000.005,
+    "2023-11-14 23:13:20,005+01:00": 1_700_000_000.005,
+    "2023/11/14 22:13:20": 1_700_000_000.0,
+    "20231114T221320Z": 1_700_000_000.0,
+    "22:13:20": np.inf,
+}
+
+
+@pytest.mark.parametrize("text, moment", DATES.items())
+def test_dates_of_iso_8601_are_seconds(text, moment):
+    assert formats.seconds(text) == moment
+
+
+@pytest.mark.parametrize("kind", ["csv", "texts", "h5", "dates", "durations"])
+def test_times_as_dates_give_the_rows_of_times_in_seconds(tmp_path, kind):
+    texts = [datetime.fromtimestamp(s, UTC).isoformat() for s in (ns(T) * 1e-9).tolist()]
+    columns, path = _columns(T), tmp_path / ("a.csv" if kind == "csv" else "a.h5" if kind == "h5" else "a.parquet")
+    if kind == "csv":
+        _csv(path, texts, columns)
+    elif kind == "h5":
+        write_hdf5(path, {"arm": {"time": np.array(texts, "S")} | columns})
+    else:
+        durations = pa.array(ns(T) - EPOCH, pa.duration("ns"))
+        of = {"texts": texts, "dates": pa.array(ns(T), pa.timestamp("ns")), "durations": durations}
+        pq.write_table(pa.table({"time": of[kind]} | columns), path)
+    log = _import(path)
+    np.testing.assert_allclose(log.values[0]["u"], columns["u"], rtol=1e-12)
+    np.testing.assert_allclose(log.values[0]["theta1"], columns["theta1"], atol=3 * 1e-6)  # 3 rad/s, dates are in us
+
+
+def test_a_text_that_is_no_date_is_named_with_its_line(tmp_path):
+    times = [f"2023-11-14T22:13:{s:02d}" for s in range(10)]
+    path = _csv(tmp_path / "a.csv", [*times[:6], "noon", *times[7:]], _columns(T[:10]))
+    with pytest.raises(DataError, match=r"line 8, column 'time': found 'noon'"):
+        _import(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\n \n\n"])
+def test_a_csv_file_in_blocks_is_the_same_and_of_any_size(tmp_path, monkeypatch, end):
+    t = np.round(T, 6)
+    path = _csv(tmp_path / "a.csv", t, _columns(T))
+    path.write_bytes(path.read_bytes().replace(b"\n", end.encode() if len(end) < 3 else b"\n") + end[2:].encode())
+    whole = formats.read_csv(path, ("time",), ("theta1", "u"))
+    np.testing.assert_array_equal(whole[:, 2], _columns(T)["u"])
+    monkeypatch.setattr(formats, "BLOCK", 100)
+    monkeypatch.setattr(formats, "LARGEST", 1000)
+    np.testing.assert_array_equal(formats.read_log(path, ("time",), ("theta1", "u")), whole)
+    with pytest.raises(DataError, match="too much for one sequence"):
+        formats.read_table(path, ("time",), ("u",))
+    lines = path.read_text().split("\n")
+    for row, text, words in ((700, "1,2,3", "line 701: found 3 fields"), (800, "1,2,x,3", "line 801, column 'theta1'"),
+                             (900, "", "line 901: found 1 field")):  # fmt: skip
+        path.write_text("\n".join([*lines[:row], text, *lines[row + 1 :]]))
+        with pytest.raises(DataError, match=words):
+            formats.read_log(path, ("time",), ("theta1", "u"))
+
+
+OFFSETS = {  # of the header stamps from log times [s], and what the page has about it
+    "a latency": (-0.005, ""),
+    "a latency of more than a row": (-0.012, "--shift /js=0.012 takes it out"),
+    "a latency that may be one": (-0.24, "--shift /js=0.24 takes it out"),
+    "behind": (-0.26, "of /js are 0.260 s behind the clock of the log: taken out"),
+    "far behind": (-2.0, "2.000 s behind the clock of the log: taken out"),
+    "ahead by less than a row": (0.005, ""),
+    "ahead": (0.02, "0.020 s ahead of the clock of the log: taken out"),
+    "far ahead": (9.0, "9.000 s ahead of the clock of the log: taken out"),
+    "since boot": (-1.6e9, "of another clock, 1.6e+09 s from that of the log: log times"),
+}
+
+
+@pytest.mark.parametrize("offset, note", OFFSETS.values(), ids=OFFSETS)
+def test_two_clocks_of_a_log_are_taken_out_or_reported(tmp_path, offset, note):
+    """Messages at the same log times; the command is that of its row where the clocks are one again."""
+    log = _import(_mcap(tmp_path / "a.mcap", ns(T), ns(T + offset), T, np.cos(T)))
+    assert note in _notes(log) and bool(note) == bool(_notes(log))
+    assert ("taken out" in note or "log times" in note) == (abs(log.sequences[0].rows - 1000) < 1 and bool(note))
+    if "taken out" in note or "log times" in note:
+        np.testing.assert_allclose(log.values[0]["u"], np.cos(T), rtol=1e-12)
+        np.testing.assert_allclose(log.values[0]["theta1"], np.sin(3 * T), atol=3e-6)  # 3 rad/s, to 1 us
+
+
+def test_a_header_clock_that_drifts_is_taken_out(tmp_path):
+    """2000 ppm: 20 ms in 10 s; straight lines through 20 medians leave half a part, 0.5 ms, at each end."""
+    log = _import(_mcap(tmp_path / "a.mcap", ns(T), ns(1.002 * T), T, np.cos(T)))
+    assert "taken out" in _notes(log)
+    first = log.sequences[0].start
+    np.testing.assert_allclose(log.values[0]["theta1"], np.sin(3 * (first + DT * np.arange(_rows(log)[0]))), atol=3e-3)
+
+
+def test_a_header_clock_that_was_set_is_not_taken(tmp_path):
+    log = _import(_mcap(tmp_path / "a.mcap", ns(T), ns(T + 5 * (T > 5)), T, np.cos(T)))
+    assert "header stamps were set within the log: log times are taken" in _notes(log) and _rows(log) == [1000]
+
+
+def test_a_shift_that_was_given_is_not_proposed_again(tmp_path):
+    path = _mcap(tmp_path / "a.mcap", ns(T), ns(T - 0.1), T, np.cos(T))
+    assert "--shift" in _notes(_import(path))
+    assert not _notes(_import(path, shifts={"/js": 0.1}))
+
+
+def test_groups_whose_times_have_different_names_are_pointed_out(tmp_path):
+    columns = _columns(T)
+    readings = {name: columns[name] for name in ("theta1", "dtheta1")}
+    for own in ({"stamp": T - 2}, {"stamp": T - 2, "time": T}):
+        path = write_hdf5(tmp_path / f"{len(own)}.h5", {"js": own | readings, "cmd": {"time": T, "u": columns["u"]}})
+        log = _import(path)
+        assert ("are these of one clock?" in _notes(log)) == (len(own) == 1)
+    np.testing.assert_array_equal(log.values[0]["u"], columns["u"])  # by `time`, which both have
+
+
+def _sent(t, values, tmp_path, more: str = "") -> Resampled:
+    return _import(_mcap(tmp_path / "a.mcap", ns(T), ns(T), np.array(t, float), np.array(values, float)), more)
+
+
+@pytest.mark.parametrize("more", ["", "gap = 0.1", 'input = "mean"'])
+def test_commands_on_change_hold_to_the_end(tmp_path, more):
+    log = _sent([2.0, 2.3, 7.0], [0.4, -0.3, 0.2], tmp_path, more)
+    assert _rows(log) == [800] and "u is sent on change (3 values, no rate)" in _notes(log)
+    expected = np.repeat([0.4, -0.3, 0.2], [30, 470, 300])
+    np.testing.assert_allclose(log.values[0]["u"], expected, atol=1e-6)  # stamps are in ns
+
+
+def test_one_command_is_enough(tmp_path):
+    log = _sent([2.0], [0.4], tmp_path)
+    assert _rows(log) == [800] and set(log.values[0]["u"]) == {0.4}
+
+
+def test_commands_that_end_are_reported_and_held_as_declared(tmp_path):
+    kept = T < 6
+    log = _sent(T[kept], np.cos(T[kept]), tmp_path)
+    assert _rows(log) == [600] and "u ends 4 s before the readings" in _notes(log) and "gap = inf" in _notes(log)
+    log = _sent(T[kept], np.cos(T[kept]), tmp_path, "gap = inf")
+    assert _rows(log) == [1000]
+    np.testing.assert_array_equal(log.values[0]["u"][600:], np.cos(5.99))
+
+
+rng = np.random.default_rng(0)
+_SLOW = np.cumsum(np.full(40, 0.5))
+_LOST = np.delete(T, np.r_[200:300]), np.delete(T, np.r_[200:300, 600:700])
+CHANGE = {  # times and values of commands, and whether each holds until the next
+    "a few": (T[:10], np.cos(T), True),
+    "no longer few": (T[:11], np.cos(T), False),
+    "set points": (_SLOW, _SLOW, True),
+    "a slow stream": (0.98 * _SLOW, _SLOW, False),
+    "irregular": (np.cumsum(rng.exponential(0.05, 300)), rng.normal(size=300), True),
+    "jitter": (T + 0.4 * DT * rng.uniform(-1, 1, T.size), np.cos(T), False),
+    "two rates": (np.r_[0.04 * np.arange(200), 12 + DT * np.arange(150)], rng.normal(size=350), False),
+    "three rates": (np.cumsum(np.repeat([0.04, 0.01, 0.2], 100)), rng.normal(size=300), False),
+    "half lost": (T[rng.uniform(size=T.size) < 0.5], rng.normal(size=1000), False),
+    "stands still in one silence": (_LOST[0], np.cos(T), False),
+    "in two": (_LOST[1], np.cos(T), True),
+    "in a silence of a slow ramp": (_LOST[0], T, True),
+    "does not stand still": (_LOST[1], np.cos(_LOST[1]), False),
+    "rough": (_LOST[1], rng.normal(size=800), False),
+    "a square wave that is repeated": (_LOST[1], np.sign(np.cos(T)), False),
+}
+
+
+@pytest.mark.parametrize("t, y, on_change", CHANGE.values(), ids=CHANGE)
+def test_commands_sent_on_change_are_known_by_their_times_and_values(t, y, on_change):
+    assert sent_on_change(Signal("", t, y[: t.size]), DT) == on_change
+
+
+def test_an_input_that_is_silent_alone_is_seen(tmp_path):
+    """Two inputs of one table with as many values each, of which one is silent for 3 s."""
+    half, silent = np.full((2, T.size), np.nan), (T >= 4) & (T < 7)
+    half[0, ::2] = np.cos(T[::2])
+    places = np.flatnonzero(~silent)
+    places = places[np.linspace(0, places.size - 1, 500).astype(int)]
+    half[1, places] = np.cos(T[places])
+    columns = {"u": half[0], "v": half[1], "theta1": np.sin(3 * T), "dtheta1": 3 * np.cos(3 * T)}
+    path = _csv(tmp_path / "a.csv", T, columns)
+    log = _import(path, rig=ARM)
+    assert np.isfinite(half[0]).sum() == np.isfinite(half[1]).sum()
+    assert _rows(log) == pytest.approx([401, 299], abs=2)
+    (gap,) = log.topics[0].gaps
+    assert (gap.start, gap.end) == pytest.approx((3.99, 7.0), abs=0.02)
+
+
+def test_a_declared_gap_that_would_fill_memory_with_empty_rows_is_refused(tmp_path):
+    path = _csv(tmp_path / "a.csv", T + 1000 * (T >= 5), _columns(T))
+    assert _rows(_import(path, "gap = 100")) == [500, 500]
+    with pytest.raises(DataError, match=r"\[import\] gap: 1.01e\+05 rows of 1000 readings would be empty"):
+        _import(path, "gap = 1001")
+    assert _rows(_import(_csv(tmp_path / "b.csv", T + 400 * (T >= 5), _columns(T)), "gap = 401\nlongest = 500")) == [
+        41000
+    ]
+
+
+def test_stretches_that_lie_in_several_parts_are_those_of_a_count_at_each_time():
+    at = np.linspace(-0.05, 1.05, 2203)
+    for _ in range(20):
+        parts = [np.sort(rng.uniform(size=2 * n)).reshape(-1, 2) for n in rng.integers(1, 6, size=3)]
+        inside = [np.any((at[:, None] >= part[:, 0]) & (at[:, None] <= part[:, 1]), axis=1) for part in parts]
+        for least in (1, 2, 3):
+            spans = covered(parts, least)
+            there = np.any((at[:, None] >= spans[:, 0]) & (at[:, None] <= spans[:, 1]), axis=1)
+            np.testing.assert_array_equal(there, np.sum(inside, axis=0) >= least)
+
+
+def test_rows_of_each_stretch_begin_at_a_reading():
+    readings = Signal("", np.r_[T[:300], T[300:] + 0.0037], np.zeros(1000))
+    spans, later = np.array([[0.0, 2.99], [3.0, 9.9937]]), np.array([[0.0, 0.0], [0.5, 0.0]])
+    (one, two) = runs(spans + later, readings, DT)
+    assert (one.start, one.rows) == (0.0, 300) and (two.start, two.rows) == (pytest.approx(3.5037), 650)
+    (both,) = runs(spans, readings, DT)  # less than a row apart
+    assert both.rows == 1000

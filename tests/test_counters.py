@@ -1,0 +1,154 @@
+"""Counters that start over: jumps of one size are found and unwrapped exactly, and nothing that machines do is one."""
+
+import numpy as np
+import pytest
+from helpers import swing_rig
+
+from nnap_em.commands import cli
+from nnap_em.data.counters import counter, unwrapped
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.logs import read_logs
+
+T = 0.01 * np.arange(601)
+ANGLE = 1.5 * np.sin(1.1 * T) + 0.4 * np.sin(4.7 * T + 0.4)  # at most 3.2 rad/s
+SPEED = np.round(99 * np.gradient(ANGLE, T))
+NOISE = np.random.default_rng(0).normal(size=T.size)
+COUNTS = np.round(ANGLE * 4096 / (2 * np.pi) * 10)  # 12 bits of a motor before a gear of 10
+
+
+def _signed(counts: np.ndarray, *, unsigned: bool) -> np.ndarray:
+    """16 bits of sign and magnitude, read as a number without sign or as one of two's complement."""
+    return np.where(counts < 0, (32768 if unsigned else -32768) - counts, counts)
+
+
+COUNTERS = {  # name: (readings, what they are of, size, options)
+    "12 bits": (COUNTS % 4096, COUNTS, 4096, {}),
+    "14 bits": (4 * COUNTS % 16384, 4 * COUNTS, 16384, {}),
+    "16 bits with a sign": ((9 * COUNTS + 32768) % 65536 - 32768, 9 * COUNTS, 65536, {}),
+    "a motor before a gear of 19.2": (ANGLE % (2 * np.pi / 19.2), ANGLE, 2 * np.pi / 19.2, {}),
+    "a motor before a gear of 100": (ANGLE % (np.pi / 50), ANGLE, np.pi / 50, {}),
+    "noise": ((ANGLE + 1e-3 * NOISE) % (np.pi / 5), ANGLE + 1e-3 * NOISE, np.pi / 5, {}),
+    "degrees": ((5e2 * ANGLE + 180) % 360 - 180, 5e2 * ANGLE, 360, {}),
+    "one jump of an axis": ((T**2 + T) % 30.0, T**2 + T, 30.0, {}),
+    "slow encoder": (np.round(50 * T) % 256, np.round(50 * T), 256, {}),
+    "a lost turn": (ANGLE + 2 * np.pi * (T > 3), ANGLE, 2 * np.pi, {"angle": True}),
+    "sign and magnitude": (_signed(COUNTS, unsigned=True), COUNTS, 32768, {}),
+    "sign and magnitude, two's complement": (_signed(COUNTS, unsigned=False), COUNTS, 32768, {}),
+    "rate of sign and magnitude": (_signed(SPEED, unsigned=True), SPEED, 32768, {"rate": True}),
+    "rate without its sign": (SPEED % 65536, SPEED, 65536, {"rate": True}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("y, true, size, options", COUNTERS.values(), ids=COUNTERS)
+def test_jumps_are_found_and_unwrapped(y, true, size, options):
+    """Exactly, as sizes are counts or parts of a turn; a rate has its own zero."""
+    found = counter(y, T, **options)
+    assert found is not None
+    assert found.size == pytest.approx(size, rel=1e-5)
+    error = unwrapped(y, found, rate="rate" in options) - true
+    assert np.ptp(error) < 1e-4 * size
+    assert "rate" not in options or np.all(error == 0)
+
+
+@pytest.mark.parametrize("lost", (1, 2, 4))
+def test_a_jump_in_a_gap_is_found(lost):
+    y = (ANGLE % 0.7).copy()
+    for row in np.flatnonzero(np.abs(np.diff(y)) > 0.35):
+        y[row + 1 : row + 1 + lost] = np.nan
+    found = counter(y, T)
+    assert found is not None
+    error = (unwrapped(y, found) - ANGLE)[np.isfinite(y)]
+    assert np.ptp(error) < 1e-3
+
+
+BOUNCES = np.sign(np.sin(4 * T)) * (1 - 0.1 * (4 * T / np.pi % 1))
+MACHINES = {
+    "smooth": (ANGLE, {"angle": True}),
+    "noise": (NOISE, {"angle": True}),
+    "encoder between two steps": (np.round(0.3 + 0.4 * np.sin(5 * T)), {"angle": True}),
+    "encoder among three steps": (np.round(0.8 * NOISE), {}),
+    "coarse encoder": (np.round(2 * ANGLE), {}),
+    "spike": (ANGLE + 50 * (T[200] == T), {"angle": True}),
+    "dropouts": (np.where(np.abs(NOISE) > 2.2, 0.0, ANGLE + 20), {}),
+    "table of four stations": (90 * np.floor(T) % 360 + 0.1 * NOISE, {}),
+    "a jump inside the range": (np.where(T < 3, T, T - 2.6), {}),
+    "table of two stations": (np.floor(T) % 2 + 0.01 * NOISE, {}),
+    "bounces": (BOUNCES, {"rate": True}),
+    "bounces of an axis": (BOUNCES, {}),
+    "bounces that speed up": (np.sign(np.sin(4 * T)) * (1 + 0.1 * (4 * T / np.pi % 1)), {}),
+    "kicks of a coasting cart": (2.0 - T % 1, {"rate": True}),
+    "a kick at rest": (np.where(T < 2.9, 0.3 * np.exp(-T) - 0.018, 0.98 * np.exp(2.9 - T)), {"rate": True}),
+    "too fast for its rows": (np.sin(250 * T), {"angle": True}),
+    "folded": (np.abs(ANGLE), {"angle": True}),
+}
+
+
+@pytest.mark.parametrize("y, options", MACHINES.values(), ids=MACHINES)
+def test_what_machines_do_is_no_counter(y, options):
+    assert counter(y, T, **options) is None
+
+
+RIG = """\
+format = 1
+name = "bench"
+[model]
+type = "pendulum"
+m = 0.3
+lc = 0.2
+I = 0.01
+g = 9.81
+friction = "unknown"
+[input]
+columns = ["u"]
+joints = [1]
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["theta1"]
+[import.columns]
+theta1 = { from = "counts", scale = 0.00015339807878856412 }
+"""
+
+
+@pytest.fixture
+def motor(tmp_path):
+    """12 bits of a motor before a gear of 10, at times between those of the rows, and a folder."""
+    t = 0.007 * np.arange(900)
+    angle = np.interp(t, T, ANGLE, right=ANGLE[-1])
+    write_csv(tmp_path / "log.csv", {"time": t, "u": np.cos(t), "counts": np.round(angle * 40960 / (2 * np.pi)) % 4096})
+    (tmp_path / "rig.toml").write_text(RIG)
+    return tmp_path
+
+
+def _imported(folder, *words: str) -> np.ndarray:
+    """Time and angle of what `import` writes."""
+    argv = ["import", str(folder / "log.csv"), "--rig", str(folder / "rig.toml"), "--out", str(folder / "out")]
+    assert cli.main([*argv, "--test", "0", *words]) == 0
+    return read_table(folder / "out/train/000.csv", ("time", "u"), ("theta1",))[:, [0, 2]]
+
+
+def test_nothing_is_interpolated_across_a_jump(motor, capsys):
+    """Rows beside a jump are empty, and all others as near to the turning angle as its counts and 7 ms allow."""
+    t, theta = _imported(motor).T
+    assert "--unwrap theta1 takes the jumps out" in capsys.readouterr().err
+    turn = 2 * np.pi / 10
+    off = (theta - np.interp(t, T, ANGLE) + turn / 2) % turn - turn / 2
+    assert 5 < np.isnan(off).sum() < 100
+    assert np.nanmax(np.abs(off)) < 5e-4
+    with pytest.raises(DataError, match=r"column 'theta1': jumps by 0.6283, in \d+ places, .* import --unwrap theta1"):
+        read_logs(motor / "out/train", swing_rig(measured=("theta1",)))
+
+
+def test_a_counter_is_unwrapped_as_asked(motor):
+    t, theta = _imported(motor, "--unwrap", "theta1").T
+    assert np.isfinite(theta).all()
+    np.testing.assert_allclose(theta, np.interp(t, T, ANGLE) - ANGLE[0] + theta[0], rtol=0, atol=5e-4)
+
+
+def test_a_column_that_is_not_there_is_not_unwrapped(motor, capsys):
+    argv = ["import", str(motor / "log.csv"), "--rig", str(motor / "rig.toml"), "--out", str(motor / "out")]
+    assert cli.main([*argv, "--unwrap", "theta"]) == 2
+    assert "--unwrap theta: no column of this rig; did you mean 'theta1'?" in capsys.readouterr().err

@@ -1,0 +1,304 @@
+"""Formats of drives, PLCs and tools: the numbers that were written come back on the grid, or a line says what helps."""
+
+import functools
+import re
+
+import dialects
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from dialects import DT, Q, T, U, V
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from nnap_em.commands import cli
+from nnap_em.data.dataset import DataError
+from nnap_em.data.logs import DataWarning, read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.draft.from_machine import draft_machine
+from nnap_em.recordings import text_file
+from nnap_em.recordings.columns import resolve
+from nnap_em.recordings.declared import read_plan
+from nnap_em.recordings.files import reader
+from nnap_em.recordings.recording import Address, Topic, address, last_word, word_of
+from nnap_em.recordings.resample import resample
+from nnap_em.systems import specs
+
+RIG = f"""
+format = 1
+name = "bench"
+[model]
+type = "pendulum"
+m = 0.5
+lc = 0.4
+I = 0.002
+g = 9.81
+friction = "none"
+[input]
+columns = ["u"]
+joints = [1]
+[sampling]
+dt = {DT}
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["theta1", "dtheta1"]
+"""
+ARM = """<mujoco><worldbody><body name="link"><joint name="joint0" axis="0 1 0"/>
+<inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.001"/></body></worldbody></mujoco>"""
+
+
+def _rig(folder, columns=()):
+    """The rig, with the addresses of columns that their names do not give."""
+    lines = [f"{name} = {at}" for name, at in dict(columns).items()]
+    (folder / "rig.toml").write_text("\n".join([RIG, "[import.columns]", *lines]) + "\n")
+    return folder / "rig.toml"
+
+
+def _imported(log, path):
+    """The sequences of a log, the columns in the order of the rig."""
+    rig = read_rig(path, specs)
+    plan = read_plan(path, (*rig.logged_inputs, *rig.measured))
+    values = resample(log, rig, specs[rig.system].states, plan, {}).values
+    return [np.stack([each[name] for name in (*rig.logged_inputs, *rig.measured)], 1) for each in values]
+
+
+COLUMNS = (T, U, Q, V)
+DEGREES = (T, U, np.degrees(Q), V)
+JOINT = "/joint_states/joint0"
+LISTS = {"theta1": '"observation.state[0]"', "dtheta1": '"observation.state[1]"', "u": '"action[0]"'}
+SCOPE = {
+    "theta1": '{ from = "clock 1:fAngle [deg]", scale = 0.0174532925199433 }',
+    "dtheta1": '"clock 1:fSpeed [rad/s]"',
+    "u": '"clock 2:fTorque"',
+}
+BARE = {name: at.replace(" [deg]", "").replace(" [rad/s]", "") for name, at in SCOPE.items()}
+QUANTITIES = {"u": f'"{JOINT}/effort"', "theta1": f'"{JOINT}/position"', "dtheta1": f'"{JOINT}/velocity"'}
+
+
+def _table(header: str, columns=COLUMNS, separator: str = ",", decimal: str = ".", **more):
+    more |= {"separator": separator, "decimal": decimal}
+    return functools.partial(dialects.table, header=header, columns=columns, **more)
+
+
+def _names(separator: str, first: str = "time") -> str:
+    return separator.join((first, "u", "theta1", "dtheta1"))
+
+
+UNITS = _table(
+    "Zeit;u;theta1;dtheta1\nms;Nm;°;rad/s",
+    (1e3 * T, *DEGREES[1:]),
+    ";",
+    ",",
+    above=("Prüfstand", "", "2026-01-01;12:00"),
+    encoding="cp1252",
+)
+QUOTED = _table('"time [s]","Motor torque, Nm","theta1 [deg]","dtheta1 [rad/s]"', DEGREES)
+PATHS = _table(f"__time,{JOINT}/effort,{JOINT}/position,{JOINT}/velocity", (1.7e9 + T, *COLUMNS[1:]))
+PLAIN = functools.partial(dialects.twincat, full=False, separator=",", decimal=".")
+READ = {  # what writes a file, its name, and the addresses that names do not give
+    "TwinCAT Scope": (dialects.twincat, "a.csv", SCOPE),
+    "TwinCAT Scope, ticks": (functools.partial(dialects.twincat, ticks=True), "a.csv", SCOPE),
+    "TwinCAT Scope, names only": (PLAIN, "a.csv", BARE),
+    "CODESYS trace": (dialects.codesys, "a.trace.csv", {}),
+    "CODESYS trace in us": (functools.partial(dialects.codesys, flags=36), "a.trace.csv", {}),
+    "CODESYS text": (dialects.codesys_text, "a.txt", {}),
+    "LabVIEW": (dialects.labview, "a.lvm", {}),
+    "LabVIEW, many times": (functools.partial(dialects.labview, x_columns="Multi"), "a.lvm", {}),
+    "LabVIEW, no times": (functools.partial(dialects.labview, x_columns="No"), "a.lvm", {}),
+    "ControlDesk": (dialects.control_desk, "a.mat", {"u": '"Model Root/u\\\\Out1"'}),
+    "Simulink": (dialects.structure_with_time, "a.mat", {}),
+    "decimal comma": (_table(_names(";"), COLUMNS, ";", ","), "a.csv", {}),
+    "decimal comma in quotes": (_table(_names(","), COLUMNS, ",", ",", quote=True), "a.csv", {}),
+    "a comment": (_table(_names(","), above=("# of Monday",)), "a.csv", {}),
+    "tabs": (_table(_names("\t"), COLUMNS, "\t"), "a.tsv", {}),
+    "units": (UNITS, "a.csv", {}),
+    "quoted names": (QUOTED, "a.csv", {"u": '"Motor torque, Nm"'}),
+    "colons": (_table("time,a:u,a:pos,a:vel"), "a.csv", {"theta1": '"a:pos"', "dtheta1": '"a:vel"'}),
+    "PlotJuggler": (PATHS, "a.csv", QUANTITIES),
+    "NumPy": (_table("# time u theta1 dtheta1", COLUMNS, " "), "a.txt", {}),
+    "no time": (_table("u,theta1,dtheta1", COLUMNS[1:]), "a.csv", {}),
+    "no time, decimal comma": (_table("u;theta1;dtheta1", COLUMNS[1:], ";", ","), "a.csv", {}),
+}
+
+
+@pytest.mark.parametrize("write, name, columns", READ.values(), ids=READ)
+def test_what_was_written_is_read(tmp_path, write, name, columns):
+    log = write(tmp_path / name)
+    (table,) = _imported(log, _rig(tmp_path, columns))
+    # nine digits in the file; PlotJuggler's epoch is known to 2.4e-7 s, at a rate of 3 rad/s and 9 rad/s^2
+    close = {"rtol": 2e-8, "atol": 3e-6 if "__time" in log.read_bytes().decode("latin-1") else 2e-8}
+    np.testing.assert_allclose(table[:, 1:].T, [Q[: len(table)], V[: len(table)]], **close)
+    held = U if not columns.get("u", "").startswith('"clock') else np.repeat(U[::2], 2)  # every other row, held
+    np.testing.assert_allclose(table[:, 0], held[: len(table)], **close)
+    assert len(table) >= len(T) - 2
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_lists_and_episodes_of_lerobot_are_read(tmp_path, fixed):
+    """Each episode is a sequence; the numbers are those of the file, in single precision."""
+    log = dialects.lerobot(tmp_path / "set", fixed=fixed)
+    tables = _imported(log, _rig(tmp_path, LISTS))
+    half = len(T) // 2
+    assert [len(table) for table in tables] == [half, half]
+    for k, table in enumerate(tables):
+        rows = slice(k * half, (k + 1) * half)
+        np.testing.assert_allclose(table.T, [U[rows], Q[rows], V[rows]], atol=1e-6)
+
+
+DATASET = functools.partial(dialects.matlab_object, name="logsout", kind="Simulink.SimulationData.Dataset")
+SERIES = functools.partial(dialects.matlab_object, name="theta1", kind="timeseries")
+STRUCT = "s.time = theta1.Time; s.theta1 = theta1.Data; save('log.mat', '-struct', 's', '-v7')"
+
+
+def _last(row: str, decimal: str = "."):
+    """A table whose last row is another."""
+    return _table(_names(";"), COLUMNS, ";", decimal, last=row)
+
+
+REFUSED = {  # what writes a file, its name, and words of the message
+    "Dataset": (DATASET, "a.mat", "variable 'logsout'", "for k = 1:logsout.numElements", "'-struct'"),
+    "timeseries": (SERIES, "a.mat", STRUCT),
+    "bag": (None, "run.bag", "rosbags-convert --src", "run.bag --dst run_mcap --dst-storage mcap"),
+    "db3": (None, "run.db3", "pip install rosbags", "run.db3 --dst run_mcap --dst-storage mcap"),
+    "xlsx": (None, "a.xlsx", "save the sheet as CSV"),
+    "CODESYS binary": (None, "a.trace", "*.trace.csv"),
+    "TwinCAT recording": (None, "a.svdx", "TC3ScopeExportTool.exe svd="),
+    "commas twice": (_table(_names(","), COLUMNS, ",", ","), "a.csv", "fields under 4 names", "decimals with '.'"),
+    "a text": (_last("9;x;1;1"), "a.csv", "line 202, column 'u': found 'x'; write a number"),
+    "a date": (_last("2026-01-01;1;1;1"), "a.csv", "line 202, column 'time': found '2026-01-01'"),
+    "a field too many": (_last("9;1;1;1;1"), "a.csv", "line 202: found 5 fields under 4 names"),
+    "thousands": (_last("9;1.000,5;1;1", ","), "a.csv", "line 202, column 'u': found '1.000,5'"),
+    "no time": (_last(";1;1;1"), "a.csv", "line 202, column 'time'", "holds no time"),
+    "a misspelt time": (_table(_names(",", "tme")), "a.csv", "no column of times", "if 'tme' is that"),
+    "no header": (_table("0;1;2;3", COLUMNS, ";"), "a.txt", "no column of numbers under a name"),
+}
+
+
+@pytest.mark.parametrize("write, name, words", [(w, n, words) for w, n, *words in REFUSED.values()], ids=REFUSED)
+def test_what_is_not_read_is_refused_with_the_line_that_helps(tmp_path, write, name, words):
+    log = tmp_path / name
+    log.write_bytes(b"x") if write is None else write(log)
+    with pytest.raises(DataError) as refused:
+        _imported(log, _rig(tmp_path))
+    for word in (str(log), *words):
+        assert word in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_draft_of_another_dialect_is_imported(tmp_path):
+    log = dialects.table(tmp_path / "a.csv", "t_ms;fTorque;theta1_deg;dtheta1", (1e3 * T, *DEGREES[1:]), ";", ",")
+    assert cli.main(["init", str(log), "--system", "pendulum"]) == 0
+    drafted = tmp_path / "rig.toml"
+    drafted.write_text(re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", drafted.read_text()))
+    assert (read_rig(drafted, specs).dt, read_rig(drafted, specs).input_columns) == (DT, ("fTorque",))
+    assert '"theta1" = { from = "theta1_deg", scale = 0.0174532925 }' in drafted.read_text()
+    (table,) = _imported(log, drafted)
+    np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=2e-8)
+
+
+@pytest.mark.parametrize(
+    "names", [f"{JOINT}/position,{JOINT}/velocity", "MAIN.joint0.ActPos [deg],MAIN.joint0.ActVelo [rad/s]"]
+)
+def test_joints_of_a_machine_are_found_in_paths(tmp_path, names):
+    model = tmp_path / "arm.xml"
+    model.write_text(ARM)
+    angle = np.degrees(Q) if "deg" in names else Q
+    log = dialects.table(tmp_path / "a.csv", f"__time,{names}", (T, angle, V))
+    text = draft_machine(log, model, tmp_path).text
+    assert f"dt = {DT}" in text and 'columns = ["joint0", "djoint0"]' in text
+    at = f'"{names.split(",")[0]}"'
+    assert (
+        f'"joint0" = {{ from = {at}, scale = 0.0174532925 }}' in text if "deg" in names else f'"joint0" = {at}' in text
+    )
+
+
+WORDS = {  # a path, and its last word
+    "q": "q", "/arm/q": "q", "arm.q[3]": "q[3]", "position[hip.left]": "position[hip.left]", "a/b [rad/s]": "b [rad/s]",
+    "/joint_states/joint0/position": "position[joint0]", "Axis1.ActPos": "position[Axis1]", "pos": "pos",
+    "vel rad/s": "vel rad/s", "Axis:torque": "effort[Axis]", "Root/u\\Out1": "Out1", "speed_m/s": "speed_m/s",
+    "observation.state[2]": "state[2]",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("path, word", WORDS.items())
+def test_the_last_word_of_a_path(path, word):
+    assert last_word(path) == word
+    assert word_of(f"{path} [deg]" if "[" not in path else path)[1] == (np.pi / 180 if "[" not in path else 1.0)
+
+
+def test_a_name_with_a_colon_is_no_topic(tmp_path):
+    """Nor is a topic missed whose name has one."""
+    topics = [Topic("", "", None, ("Axis:pos", "u")), Topic("/a:b", "", None, ("q",))]
+    declared = {name: Address(*address(at)) for name, at in (("one", "Axis:pos"), ("two", "/a:b:q"))}
+    found = resolve(tmp_path, topics, ("u",), ("one", "two"), declared)
+    assert [(at.topic, at.path) for at in found.values()] == [("", "u"), ("", "Axis:pos"), ("/a:b", "q")]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_log_without_times_is_read_where_dt_is_declared(tmp_path, suffix):
+    path = tmp_path / f"train/01.{suffix}"
+    path.parent.mkdir()
+    if suffix == "csv":
+        dialects.table(path, "u,theta1,dtheta1", COLUMNS[1:])
+    else:
+        pq.write_table(pa.table({"u": U, "theta1": Q, "dtheta1": V}), path)
+    rig = read_rig(_rig(tmp_path), specs)
+    with pytest.warns(DataWarning, match=r"no column of times: rows are taken as dt = 0.004 s apart; log the time"):
+        data = read_logs(path.parent, rig).data
+    np.testing.assert_allclose(data.t[0], T, atol=1e-12)
+    np.testing.assert_allclose(data.y[0].T, [Q, V], atol=2e-8)
+
+
+def test_a_log_whose_times_have_another_name_is_refused(tmp_path):
+    (tmp_path / "train").mkdir()
+    dialects.table(tmp_path / "train/01.csv", "t_ms,u,theta1,dtheta1", (1e3 * T, *COLUMNS[1:]))
+    with pytest.raises(DataError, match="column 'time': missing"):
+        read_logs(tmp_path / "train", read_rig(_rig(tmp_path), specs))
+
+
+def test_structs_with_different_clocks_are_refused(tmp_path):
+    def struct(t, y):
+        return {"time": t, "signals": {"values": y, "label": "", "dimensions": 1}}
+
+    scipy.io.savemat(tmp_path / "a.mat", {"u": struct(T, U), "theta1": struct(T[::2], Q[::2]), "dtheta1": struct(T, V)})
+    with pytest.raises(
+        DataError, match="column 'time': stands there twice with different numbers; save signals of one"
+    ):
+        reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("name", ["out", "yout"])
+def test_columns_of_a_matrix_have_numbers(tmp_path, name):
+    """Simulink's format Array."""
+    scipy.io.savemat(tmp_path / "a.mat", {"tout": T[:, None], name: np.stack([Q, V], 1)})
+    (topic,) = reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
+    assert topic.fields == (f"{name}[0]", f"{name}[1]") and "'tout'" in topic.kind
+
+
+def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
+    for header in ("time,u,theta1", "time,/a/b,c:d", "a,time,b"):
+        assert not text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+    for header in ('time,"a, b",c', "time,a,a", "# time,a,b"):
+        assert text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+
+
+_lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size=7), max_size=4), max_size=9)
+
+
+@settings(deadline=None, max_examples=60)  # it writes files
+@example(rows=[["Name", "Age"], ["bob", "3"], ["eve", "4"]], separator=",")
+@example(rows=[["Channels"], ["Delta_X"], ["X_Value", "a"], ["", "4"], ["", "4"]], separator="\t")
+@given(rows=_lines, separator=st.sampled_from(",;\t "))
+def test_any_text_is_read_or_refused(tmp_path_factory, rows, separator):
+    path = tmp_path_factory.getbasetemp() / "any.txt"
+    path.write_text("\n".join(separator.join(row) for row in rows))
+    text_file.foreign(path)
+    try:
+        wanted = {topic.name: topic.fields for topic in text_file.topics(path)}
+        for track in text_file.read(path, wanted).tracks.values():
+            assert (np.diff(track.t) > 0).all()
+    except DataError as refused:
+        assert str(path) in str(refused) and ";" in str(refused)

@@ -19,9 +19,18 @@ class BaseTilt(AbstractEffect):
 
     @classmethod
     def candidates(cls, around):
-        still = jnp.zeros(len(around.system.coordinates))
-        weighs = np.any(cls(a(0.1)).turned(around.system, still, still))
-        return [one(cls, 0.0, 0.03, 0.5)] if around.system.angles[0] and weighs else []
+        return [one(cls, 0.0, 0.03, 0.5)] if cls.weighs(around.system) else []
+
+    @classmethod
+    def weighs(cls, system):
+        """True where gravity acts on the first joint, a hinge."""
+        still = jnp.zeros(len(system.coordinates))
+        return system.angles[0] and bool(np.any(cls(a(0.1)).turned(system, still, still)))
+
+    def same_as(self, system, measured):
+        """A bias of the first angle the other way: nothing but gravity depends on that angle itself."""
+        first = system.coordinates[0]
+        return (("sensor_bias", None, first, ()),) if first in measured else ()
 
     def turned(self, system, q, v):
         """Change of the gravity torque by the tilt [N m]."""

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from .base import AbstractEffect, Scalar, a, one, pair
+from .base import AbstractEffect, Scalar, a, known, one, pair
 
 
 class BaseTilt(AbstractEffect):
@@ -53,6 +53,8 @@ class BaseVibration(AbstractEffect):
     sine: Scalar
     cosine: Scalar
     frequency: Scalar
+    slowest: Scalar = known(default=0.0)
+    """Frequency of one period in the recording [Hz]: less is a base that leans."""
 
     @classmethod
     def candidates(cls, around):
@@ -60,7 +62,11 @@ class BaseVibration(AbstractEffect):
             return []
         span = around.duration[1] - around.duration[0]
         count = GRID * math.ceil(min(8.0 * span / 0.4, 400) / GRID)
-        return [pair(cls.of, 0.1, 5.0, (8.0 / count * i, 0.3 / span)) for i in range(1, count + 1)]
+        make = lambda *numbers: cls.of(*numbers, 1 / span)  # noqa: E731
+        return [pair(make, 0.1, 5.0, (float(f), 0.3 / span)) for f in np.linspace(1 / span, 8.0, count)]
+
+    def possible(self):
+        return float(self.frequency) >= float(self.slowest)
 
     def values(self):
         amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)

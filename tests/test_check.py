@@ -58,7 +58,7 @@ def _changed(logs: Logs, **parts) -> Logs:
 def test_a_good_data_set_is_all_ok(slide):
     report = _report(slide, test=slide)
     assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
-    assert list(report) == ["length", "test", "missing", "sampling", "noise", "torque", "motion", "states"]
+    assert list(report) == ["length", "test", "missing", "sampling", "noise", "torque", "dynamics", "motion", "states"]
     assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in report["length"][0][1]
     assert "2 of 2 directions" in report["states"][0][1]
 
@@ -279,7 +279,8 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     _heavier(folder)
     assert cli.main(["check", str(folder)]) == 1
     bad = capsys.readouterr()
-    assert "nnap-em: 1 error" in bad.err
+    assert "nnap-em: 2 errors" in bad.err
+    assert re.search(r"(?m)^error    dynamics    u is in another unit: multiply it by 1e\+06 ", bad.out)
     assert re.search(r"(?m)^error    torque      u: up to .* look at its unit", bad.out)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -308,3 +308,12 @@ def test_absent_strength_is_no_effect():
             np.testing.assert_allclose(full.emission(x, row), x, atol=1e-12)
             assert fields(start)
     assert len(seen) > 15
+
+
+def test_a_vibration_has_a_period_in_the_recording():
+    """A slower one is an acceleration that hardly changes, as a tilt is."""
+    kind, known_of = catalogue["base_vibration"], around(declared_model(plant.Case(steps=STEPS, hidden=False, seed=3)))
+    first = kind.candidates(known_of)[0].start
+    assert float(first.frequency) == pytest.approx(1 / (known_of.duration[1] - known_of.duration[0]))
+    assert first.possible()
+    assert not eqx.tree_at(lambda law: law.frequency, first, 0.99 * first.frequency).possible()

@@ -84,6 +84,19 @@ def test_a_curve_has_the_units_of_its_machine():
     assert "N/m" in finding.sentence and "N m" not in finding.sentence
 
 
+@pytest.mark.parametrize(
+    ("law", "same"),
+    [
+        (catalogue["base_tilt"].of(0.1), {("sensor_bias", None, "theta1", ())}),
+        (catalogue["sensor_bias"].of(0.1, channel="theta1"), {("base_tilt", None, None, ())}),
+        (catalogue["sensor_bias"].of(0.1, channel="theta2"), set()),
+    ],
+)
+def test_a_tilted_base_and_a_biased_first_angle_are_listed_with_each_other(law, same):
+    (finding,) = findings(_closed(ARM, law))
+    assert set(finding.equivalent) == same
+
+
 def test_a_law_of_known_form_has_no_shape():
     (finding,) = findings(_closed(ARM, _spring(2)))
     assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)

@@ -7,11 +7,12 @@ import pytest
 from nnap_em.commands import cli
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnose import rivals
 from nnap_em.diagnose.hypothesis import Found
 from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed
 from nnap_em.diagnose.rivals import compare_equivalents, instead, possible
-from nnap_em.diagnose.verdict import EQUIVALENT_NATS
+from nnap_em.diagnose.verdict import EQUIVALENT_NATS, PRICE
 from nnap_em.fit.identify import identify
 from nnap_em.systems import specs
 
@@ -43,6 +44,11 @@ def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
     assert abs(float(effect.values()["gain"]) - GAIN) < 0.05
     assert instead(bare, data, None, lambda effect: effect.name == "base_tilt") is None  # a slide has no such law
     assert "motor_gain" in {effect.name for effect in possible(bare, data)}
+
+
+def test_a_law_pays_for_its_number(weak_drive):
+    _, bare, full = weak_drive
+    assert [np.sum(fit.state.top) - rivals._total(fit) for fit in (bare, full)] == pytest.approx([0.0, PRICE])
 
 
 def test_only_what_the_whole_length_cannot_tell_stays_equivalent(weak_drive):

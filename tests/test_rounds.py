@@ -220,6 +220,25 @@ def test_laws_whose_columns_are_the_same_are_equivalent(monkeypatch):
     assert rounds.overlaps(seen, seen.screened[0]) == pytest.approx([0.0, 0.0, 1 - 0.01 / 4], abs=1e-5)
 
 
+@pytest.mark.parametrize(("sine", "cosine", "left"), [(0.0, 2.0, 0.0), (1.0, 0.0, 1.0), (1.0, 1.0, 0.5)])
+def test_a_law_of_two_strengths_is_equivalent_to_one_that_gives_what_was_fitted(sine, cosine, left):
+    """A ripple, whose cosine is a tilt: the two have one column in common."""
+    ripple = _screened(_law("air_drag"), 0.5)
+    ripple = ripple._replace(candidate=ripple.candidate._replace(probes=ripple.candidate.probes * 2))
+    ripple = ripple._replace(coefficients=np.asarray([sine, cosine]))
+    columns = np.eye(4)[:, [0, 1, 1]]
+    seen = Screen((ripple, _screened(_spring(), 0.4)), (columns.T @ columns,), (np.eye(3, 6, dtype=bool),))
+    assert rounds.overlaps(seen, ripple) == pytest.approx([0.0, left], abs=1e-6)
+
+
+@pytest.mark.parametrize(("gain", "accepted"), [(102.9, "motor_gain"), (103.1, "torsional_spring")])
+def test_a_law_pays_a_nat_for_each_of_its_numbers(monkeypatch, gain, accepted):
+    """A spring has four, a gain one."""
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(_spring(), 0.5)]
+    outcome, _ = _run(monkeypatch, entries, gains={"torsional_spring": gain}, loss=OneStep())
+    assert outcome.accepted.effect.name == accepted
+
+
 def test_the_best_of_every_kind_stands_for_it(monkeypatch):
     entries = [_screened(_law("air_drag", v), share) for v, share in ((1.0, 0.1), (2.0, 0.4), (3.0, 0.2))]
     outcome, _ = _run(monkeypatch, entries)

@@ -79,7 +79,8 @@ examples:
   nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
 
 OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
-test/ serves for the reported prediction error only, never for the fit.
+test/ serves for the reported prediction error only, never for the fit.  Exit status 3 where the fit does not describe
+the motion: the first sentence of the report says why.
 """
 _DIAGNOSE = """\
 examples:
@@ -274,7 +275,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command: 0 is done, 1 a check with an error, 2 refused with one line on stderr, 130 Ctrl-C."""
+    """Run one command: 0 is done, 1 a check with an error, 2 refused with one line on stderr, 3 a fit that does not
+    describe the motion, 130 Ctrl-C.
+    """
     arguments = parser()
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":

@@ -20,8 +20,11 @@ from ..storage.log import Log
 from .cli import SMOOTHERS
 from .common import read_bench, resumable, warn_of_torques
 
+MISFIT = 3
+"""Exit status of a fit that does not describe the motion."""
 
-def run(args: argparse.Namespace, log: Log) -> None:
+
+def run(args: argparse.Namespace, log: Log) -> int:
     """Fit, and report; the test logs serve for the reported error alone."""
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
@@ -38,10 +41,11 @@ def run(args: argparse.Namespace, log: Log) -> None:
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}
         save(args.out / MODEL, fitted, fingerprint=fingerprint(data), notes=notes)
-        write_identification(
+        described = write_identification(
             args.out, fitted, bench.train, bench.test, epochs,
             smoother=args.smoother, seed=args.seed, began=began, log=log,
         )  # fmt: skip
+    return 0 if described else MISFIT
 
 
 def smoother(args: argparse.Namespace) -> MakeSmoother:

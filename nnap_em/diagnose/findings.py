@@ -99,9 +99,8 @@ def findings(closed: Closed) -> list[Finding]:
             "share_of_error": record.share,
         }
         beside = drawn is None and remainder is not None
-        one = Finding(
-            effect, parameters, evidence, record.equivalent, sentence, drawn or remainder, form or remains, beside
-        )
+        equivalent = tuple(dict.fromkeys([*effect.same_as(model.system, fitted.rig.measured), *record.equivalent]))
+        one = Finding(effect, parameters, evidence, equivalent, sentence, drawn or remainder, form or remains, beside)
         out.append(one)
     return out
 

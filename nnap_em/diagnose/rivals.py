@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from ..data.dataset import Dataset
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, flat
 from ..fit.identify import Identified, finished
 from ..fit.memory import extended
 from ..storage.log import silent
@@ -19,7 +19,7 @@ from .propose import proposals, seeded, surroundings
 from .refit import Trial, refit
 from .screen import screen
 from .smoothed import SmoothedFit
-from .verdict import EQUIVALENT_NATS
+from .verdict import EQUIVALENT_NATS, PRICE
 
 STARTS = 3
 """Places from which a law is fitted; one that is not linear, from all that there are."""
@@ -105,8 +105,9 @@ def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedF
 
 
 def _total(fitted: Identified) -> float:
-    """Log-likelihood of all sequences [nat]."""
-    return float(np.nansum(np.asarray(fitted.state.top)))
+    """Log-likelihood of all sequences, less the price of the numbers of its laws [nat]."""
+    numbers = sum(flat(effect).size for effect in fitted.model.effects)
+    return float(np.nansum(np.asarray(fitted.state.top))) - PRICE * numbers
 
 
 def _with(fitted: Identified, trial: Trial) -> Identified:

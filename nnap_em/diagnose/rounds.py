@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, flat
 from ..model.state_space import StateSpaceModel
 from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
@@ -17,7 +17,7 @@ from .refit import Trial
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
 from .trial import Refit, fitted, with_candidate
-from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, SAME, agreed, odds, required, suspected
+from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, odds, required, suspected
 
 _Law = TypeVar("_Law", Screened, Refit)
 
@@ -82,7 +82,7 @@ def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context
     admissible = _standing(admissible, [case.removed for case in admissible], fit.model)
     values = [case.removed * _odds(case.candidate.start, fit.model) for case in admissible]
     tied = [case for case, value in zip(admissible, values, strict=True) if value >= EQUIVALENT * max(values)]
-    best = max(tied, key=lambda case: (_odds(case.candidate.start, fit.model), case.gain))
+    best = max(tied, key=lambda case: (_odds(case.candidate.start, fit.model), _priced(case)))
     law = best.candidate.start
     rivals = [case for case in tied if other_cause(case.effect, law, fit.model.system)]
     if rivals and context.loss.predicts:
@@ -92,9 +92,16 @@ def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = zip(candidates, overlaps(outcome.screen, best.screened), strict=True)
     same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EQUIVALENT_NATS)]
-    same += [key_of(case.effect) for case in tied if case.effect.named and best.gain - case.gain < EQUIVALENT_NATS]
+    same += [
+        key_of(case.effect) for case in tied if case.effect.named and _priced(best) - _priced(case) < EQUIVALENT_NATS
+    ]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
+
+
+def _priced(case: Refit) -> float:
+    """Gain in log-likelihood less the price of the law's numbers [nat]."""
+    return case.gain - PRICE * flat(case.effect).size
 
 
 def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[_Law]:

@@ -292,14 +292,18 @@ def _screened(
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:
-    """Share of the information on the `chosen` candidate that each could not give in its place; 0: the same model."""
+    """Share of the information on the `chosen` law, as it is fitted, that each candidate could not give in its place.
+
+    It is 0 for the same model: a ripple of one period a turn may have the amplitude and phase of a tilt.
+    """
     candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
     where = spans(candidates)
     reference = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
-    total, out = information[reference, reference].astype(float), []
+    fitted = np.asarray(chosen.coefficients, float)
+    total, out = fitted @ information[reference, reference] @ fitted, []
     for span in where:
-        cross = information[reference, span].astype(float)
+        cross = fitted @ information[reference, span].astype(float)
         block = information[span, span].astype(float)
-        left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross.T
-        out.append(float(np.clip(np.trace(left) / max(np.trace(total), 1e-300), 0.0, 1.0)))
+        left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross
+        out.append(float(np.clip(left / max(total, 1e-300), 0.0, 1.0)))
     return out

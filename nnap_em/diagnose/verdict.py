@@ -28,6 +28,9 @@ EQUIVALENT = 0.9
 refits decide between others, and between laws of different causes the question stays open."""
 EQUIVALENT_NATS = 5.0
 """Log-likelihood [nat] within which two laws are indistinguishable: 1 in 150."""
+PRICE = 1.0
+"""Log-likelihood [nat] that a law pays for each of its numbers where laws are compared: chance gives half of it
+[Akaike 1974, IEEE Trans. Automatic Control 19(6)]."""
 SAME = 0.01
 """Share of the information on an effect that an equivalent one may leave unexplained."""
 KEEP = 0.6

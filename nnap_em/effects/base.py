@@ -212,6 +212,10 @@ class AbstractEffect(eqx.Module):
         """The same law with more of a form, to be tried once it is found."""
         return []
 
+    def same_as(self, system: AbstractSystem, measured: tuple[str, ...]) -> tuple[tuple, ...]:
+        """Laws that are the same model on this machine, by name, joint, channel and inputs."""
+        return ()
+
     def answers(self) -> bool:
         """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from .base import AbstractEffect, Scalar, a, one, pair
+from .base import AbstractEffect, Scalar, a, known, one, pair
 
 
 class BaseTilt(AbstractEffect):
@@ -19,9 +19,18 @@ class BaseTilt(AbstractEffect):
 
     @classmethod
     def candidates(cls, around):
-        still = jnp.zeros(len(around.system.coordinates))
-        weighs = np.any(cls(a(0.1)).turned(around.system, still, still))
-        return [one(cls, 0.0, 0.03, 0.5)] if around.system.angles[0] and weighs else []
+        return [one(cls, 0.0, 0.03, 0.5)] if cls.weighs(around.system) else []
+
+    @classmethod
+    def weighs(cls, system):
+        """True where gravity acts on the first joint, a hinge."""
+        still = jnp.zeros(len(system.coordinates))
+        return system.angles[0] and bool(np.any(cls(a(0.1)).turned(system, still, still)))
+
+    def same_as(self, system, measured):
+        """A bias of the first angle the other way: nothing but gravity depends on that angle itself."""
+        first = system.coordinates[0]
+        return (("sensor_bias", None, first, ()),) if first in measured else ()
 
     def turned(self, system, q, v):
         """Change of the gravity torque by the tilt [N m]."""
@@ -44,6 +53,8 @@ class BaseVibration(AbstractEffect):
     sine: Scalar
     cosine: Scalar
     frequency: Scalar
+    slowest: Scalar = known(default=0.0)
+    """Frequency of one period in the recording [Hz]: less is a base that leans."""
 
     @classmethod
     def candidates(cls, around):
@@ -51,7 +62,11 @@ class BaseVibration(AbstractEffect):
             return []
         span = around.duration[1] - around.duration[0]
         count = GRID * math.ceil(min(8.0 * span / 0.4, 400) / GRID)
-        return [pair(cls.of, 0.1, 5.0, (8.0 / count * i, 0.3 / span)) for i in range(1, count + 1)]
+        make = lambda *numbers: cls.of(*numbers, 1 / span)  # noqa: E731
+        return [pair(make, 0.1, 5.0, (float(f), 0.3 / span)) for f in np.linspace(1 / span, 8.0, count)]
+
+    def possible(self):
+        return float(self.frequency) >= float(self.slowest)
 
     def values(self):
         amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .base import Scalar, SensorEffect, one
+from .mounting import BaseTilt
 
 
 class SensorBias(SensorEffect):
@@ -21,6 +22,11 @@ class SensorBias(SensorEffect):
     def candidates(cls, around):
         sizes = zip(around.measured, map(float, around.reading), strict=True)
         return [one(partial(cls, channel=name), 0.0, 0.03 * size, 0.5 * size) for name, size in sizes]
+
+    def same_as(self, system, measured):
+        """A tilt of the base the other way, for the first angle."""
+        tilts = self.channel == system.coordinates[0] and BaseTilt.weighs(system)
+        return (("base_tilt", None, None, ()),) if tilts else ()
 
     def reading(self, value, past):
         return value + self.bias

@@ -26,6 +26,7 @@ from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
+from .inverse_dynamics import UNEXPLAINED, explanations, gains, mistakes, regression
 from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
@@ -84,6 +85,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
         *_sampling(rig, along, scales),
         *_noise(rig, model, data),
         *torques(rig, system, data, scales),
+        *dynamics(rig, system, data),
         *_motion(rig, model, data, along),
         *(memory(rig, model, data, along, scales) if rig.memory else ()),
         *_observability(model, along, np.asarray(head.valid)),
@@ -238,6 +240,28 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
             f"kept as declared is {values}, and all else is relative to that"
         )
         yield CheckResult(_mark(True, False), "scale", text)
+
+
+def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:
+    """Share of the torques that the declared inverse dynamics explain, and the mistakes in a log that spoil it.
+
+    Silent where a coordinate is not read, and where neither the log as it is nor a corrected one is explained.
+    """
+    problem = regression(rig, system, data)
+    if problem is None:
+        return
+    plain = problem.left()
+    explained = lambda left: ", ".join(f"{100 * (1 - share):.4g} %" for share in left)  # noqa: E731
+    if found := mistakes(explanations(rig, problem), plain):
+        text = ", or just as well: ".join(one.text for one in found)
+        text += f"; with that the declared bodies explain {explained(found[0].left)} of the torque, by joint, "
+        yield CheckResult(
+            _mark(True, any(one.ruins for one in found)), "dynamics", f"{text}as it is {explained(plain)}"
+        )
+    elif np.all(plain < UNEXPLAINED):
+        text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
+        slopes = zip(rig.input_columns, gains(problem), strict=True)
+        yield CheckResult(OK, "dynamics", "".join([text, *(f"; {name}: slope {slope:.3g}" for name, slope in slopes)]))
 
 
 def drives(

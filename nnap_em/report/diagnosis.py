@@ -14,6 +14,7 @@ from ..diagnose.findings import Finding, advice, disputes, entry, friction_chang
 from ..diagnose.keys import Key, key_of, place_of, words
 from ..diagnose.outcome import Closed, Step
 from ..fit.identify import FrictionTable, friction_table
+from ..fit.misfit import moved
 from ..fit.predict import GIVEN, Prediction
 from ..residual.innovations import tests
 from ..residual.interventions import Intervention
@@ -63,8 +64,10 @@ def write_diagnosis(
     ]
     disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
+    outcome, far = verdict(accepted, error, failed, rivals, suspects, closed.complete), moved(closed.after)
     document = shared(closed.before, train, test, seed=seed, began=began) | {
-        "verdict": verdict(accepted, error, failed, rivals, suspects, closed.complete),
+        "verdict": " ".join([outcome, *(one.sentence for one in far)]),
+        "moved": [one._asdict() for one in far],
         "complete": closed.complete,
         "effects": [entry(f) for f in accepted],
         "interventions": [_disturbance(force, train.files) for force in closed.interventions],

@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,11 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..diagnose.keys import listed
+from ..em.build import build_system
 from ..fit.identify import FrictionTable, Identified, friction_table
+from ..fit.misfit import misfits, moved
 from ..fit.predict import smooth
+from ..identifiability.check import dynamics
 from ..numerics.digits import counted
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes, replace_text
@@ -37,8 +41,11 @@ def write_identification(
     seed: int,
     began: float,
     log: Log,
-) -> None:
-    """Write the report of a fit whose model is model.npz in `out`; `began` is `time.perf_counter()` at the start."""
+) -> bool:
+    """Write the report of a fit whose model is model.npz in `out`; `began` is `time.perf_counter()` at the start.
+
+    True where the fit describes the motion.
+    """
     figures: list[Picture] = []
     names, laws, ranges = names_of(fitted), None, None
     if fitted.rig.friction:
@@ -57,9 +64,15 @@ def write_identification(
     if error:
         caption = "On test sequences that the fit has not seen."
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
+    misfit = [one.sentence for one in misfits(fitted, train.data, error, test.data if test else None)]
+    if misfit:
+        causes = dynamics(fitted.rig, build_system(fitted.rig), train.data)
+        misfit += [cause.text for cause in causes if cause.mark != "ok"]
     entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
-        "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"])),
+        "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), misfit),
+        "misfit": misfit,
+        "moved": [one._asdict() for one in moved(fitted)],
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),
@@ -79,15 +92,19 @@ def write_identification(
     write_json(out / "report.json", document, fitted.rig.named)
     replace_text(out / "report.html", fitted.rig.named(page(document, figures)))
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
+    return not misfit
 
 
-def _verdict(fitted: Identified, sequences: int, diverged: int) -> str:
+def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence[str] = ()) -> str:
+    """The outcome of a fit: first, where it does not describe the motion, that; last numbers that left the rig's."""
     dof = len(fitted.model.system.coordinates)
     friction = [f"the friction of {counted(dof, 'joint')}"] * fitted.rig.friction
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
     early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
-    return f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
+    text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
+    first = [f"The fit does not describe the motion, do not use it: {'; '.join(misfit)}."] * bool(misfit)
+    return " ".join([*first, text, *(one.sentence for one in moved(fitted))])
 
 
 def _stopped_early(fitted: Identified) -> str:
@@ -100,6 +117,8 @@ def _stopped_early(fitted: Identified) -> str:
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
+    if document["misfit"] or document["moved"]:
+        log(document["verdict"])
     for law in document["friction_law"] or []:
         log(law["text"])
     for text in document["friction_memory"]:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, specs
+from nnap_em.data.constant import travel
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, Logs
@@ -219,6 +220,66 @@ def test_a_machine_at_rest_is_not_stuck():
     assert _faults({"theta1": counts, "dtheta1": rate}) == {}
     assert _faults({"theta1": counts}) == {}
     assert _faults({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
+
+
+def _arm(seed: int, step: float, noise: float, rate: str, hold: int = 1) -> Columns:
+    """Seven axes, of which one moves from pose to pose; the others rest, creep a little, or slip by some steps."""
+    rng, t = np.random.default_rng(seed), DT * np.arange(ROWS)
+    q = np.tile(rng.uniform(-2, 2, (7, 1)), ROWS)
+    for start, length in ((0.5, 1.0), (2.2, 0.7), (3.5, 0.8)):
+        q[seed % 7] += rng.uniform(-1, 1) * _ease((t - start) / length)
+    q[(seed + 1) % 7] += 2e-5 * (1 - np.exp(-t))
+    q[(seed + 2) % 7] += 5e-5 * (t > rng.uniform(1, 4))
+    speed = np.gradient(q, DT, axis=1)
+    read = q + noise * rng.standard_normal(q.shape)
+    read = step * np.round(read / step) if step else read
+    counted = np.diff(read, axis=1, prepend=read[:, :1]) / DT
+    filtered = np.zeros_like(counted)
+    for k in range(1, ROWS):
+        filtered[:, k] = 0.8 * filtered[:, k - 1] + 0.2 * counted[:, k]
+    gyro = 2e-3 * np.round((speed + 1e-3 + 3e-3 * rng.standard_normal(q.shape)) / 2e-3)
+    rates = {"counted": counted, "filtered": filtered, "gyro": gyro, "dead": np.where(abs(speed) < 5e-3, 0.0, speed)}
+    columns = {f"q{i}": y for i, y in enumerate(read)} | {f"dq{i}": y for i, y in enumerate(rates.get(rate, []))}
+    return {name: y[np.arange(ROWS) // hold * hold] for name, y in columns.items()}
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+@pytest.mark.parametrize("rate", ["none", "counted", "filtered", "gyro", "dead"])
+def test_axes_that_rest_on_purpose_are_left_alone(rate, hold):
+    """Six of seven axes rest, at all steps and noises of an encoder; a rate has an offset, a delay or a threshold."""
+    for seed, (step, spread) in enumerate(
+        [(0, 1e-5), (1e-6, 0), (1e-6, 5e-7), (4e-5, 0), (4e-5, 1e-5), (1.5e-3, 3e-4)]
+    ):
+        alarms = [entry for entry in rough(_arm(seed, step, spread, rate, hold), DT) if entry.kind != "spike"]
+        assert alarms == []
+
+
+@pytest.mark.parametrize("rate", ["none", "counted", "filtered", "gyro"])
+def test_an_axis_of_an_arm_that_sticks_while_it_moves_is_found(rate):
+    """The other side: the same arm, whose moving axis repeats a reading for half a second of its way."""
+    readings = dict(_arm(0, 4e-5, 1e-5, rate))
+    readings["q0"] = readings["q0"].copy()
+    readings["q0"][81:131] = readings["q0"][80]
+    ((kind, column, rows),) = [entry for entry in rough(readings, DT) if entry.kind != "spike"]
+    assert (kind, column) == ("stuck", "q0")
+    assert set(range(81, 131)) <= set(rows.tolist())
+
+
+def test_a_rate_that_jerks_with_its_coordinate_is_no_spike():
+    """One row of a rate, which the coordinate follows; where it does not follow, the row is masked."""
+    t, rate = DT * np.arange(ROWS), np.cos(3 * DT * np.arange(ROWS))
+    jerk = 0.2 * (np.arange(ROWS) == 250)
+    follows = travel(rate + jerk, DT)
+    assert _faults({"q": np.sin(3 * t) / 3, "dq": rate + jerk}) == {("spike", "dq"): {250}}
+    assert _faults({"q": follows, "dq": rate + jerk}) == {}
+
+
+def test_axes_of_a_measured_arm_that_rest_are_left_alone(shared):
+    """Its rates, filtered from coarse steps, are 0 for up to 41 rows; they came as sensors that start late."""
+    for path in (shared / "data" / "measured" / "kr300").glob("t*/*.csv"):
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        readings = {name: table[name] for name in table.dtype.names if name[0] in "qds"}
+        assert [entry for entry in rough(readings, 0.008) if entry.kind != "spike"] == []
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["with its rate", "alone"])

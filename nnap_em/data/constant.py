@@ -1,6 +1,6 @@
 """Equal readings that are none: of a sensor that is stuck, starts late, or is at the end of its range.
 
-Another column or a jump contradicts a stuck sensor; its motion goes on beyond a limit.
+A joint that rests repeats a reading as well: only its motion contradicts the sensor.
 """
 
 import math
@@ -12,15 +12,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .plausible import Columns, bridge
-from .spikes import LONGEST, noise
+from .spikes import noise
 
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
 _SIDE = 10  # rows before and after a run that show its motion: fewer vanish in noise, more are no parabola
 _AHEAD = 3  # rows that a parabola through `_SIDE` rows is trusted beyond its end
 _SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
-_SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
-_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise .2 % of the runs have as many
+_MORE = 4.0  # times a usual step, or a usual disagreement of two columns, that one must be to contradict a sensor
+_DELAY = 5  # rows by which a filtered rate may be late
+_REPEATS = 0.01  # share of other readings that repeat from which a column is coarse
+_USUAL = 95  # percentile of the steps of a column
 
 
 class Run(NamedTuple):
@@ -47,18 +49,18 @@ def constant_readings(
         return
     others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
     usual = float(np.median(np.repeat(others, others)))
+    apart = _disagreement(name, readings, dt)
     full = np.zeros(y.size, bool)
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
         at_limit = [every[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]
-        if limit in limits or any(_beyond(name, readings, run, sign, dt) for run in at_limit):
+        if limit in limits or any(_beyond(y, run, sign, dt, apart) for run in at_limit):
             full |= _closed(y == limit) & np.isfinite(y)
     if full.any():
         yield FULL, np.flatnonzero(full)
-    lively = bool(np.sum((lengths > 1) & (lengths < STILL) & ~full[first]) <= 0.002 * y.size)
-    noisy = np.where(full, np.nan, y) if lively else None
+    y = np.where(full, np.nan, y)
     for run in (every[i] for i in np.flatnonzero((lengths >= max(STILL, 3 * usual)) & ~full[first])):
-        if _stuck(name, readings, run, dt, noisy):
-            late = run.first == np.flatnonzero(np.isfinite(y))[0]
+        if _jumps(y, run) or (_alive(y, run) if apart is None else _moves(y, run, apart, dt)):
+            late = run.first == np.flatnonzero(np.isfinite(readings[name]))[0]
             yield "late start" if late else "stuck", np.arange(run.first + (not late), run.end)
 
 
@@ -80,74 +82,100 @@ def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, 
     return out
 
 
-def _stuck(name: str, readings: Columns, run: Run, dt: float, noisy: Float[np.ndarray, " time"] | None) -> bool:
-    """True where equal readings are none: another column moved meanwhile, or the next reading is somewhere else.
+class _Apart(NamedTuple):
+    """Disagreement of a coordinate and its rate."""
 
-    The noise of a column that hardly ever repeats a reading counts as well: `noisy`, without readings at a limit.
-    """
-    away = _travel(name, readings, run, dt)
-    if away is not None:
-        return float(np.max(np.abs(away), initial=0.0)) > 1.0 or _jumps(readings[name], run)
-    return _jumps(readings[name], run) or (noisy is not None and _alive(noisy, run))
+    way: Float[np.ndarray, " time"]
+    """Motion that the other column shows and this one does not."""
+    least: Float[np.ndarray, " time"]
+    """Way that shows no motion in a run from each row: steps, noise and delay."""
+    walk: float
+    """Standard deviation of the noise of an integrated rate over one row."""
+    rate: bool
+    """True where this column is the rate."""
+
+
+def _disagreement(name: str, readings: Columns, dt: float) -> _Apart | None:
+    """Integral of the rate against the coordinate; None where one of the two is missing."""
+    rate = name.startswith("d") and name[1:] in readings
+    q, w = (readings.get(other) for other in ((name[1:], name) if rate else (name, f"d{name}")))
+    if q is None or w is None or min(np.isfinite(q).mean(), np.isfinite(w).mean()) < 0.5:
+        return None
+    way, step = travel(w, dt) - bridge(q), 3 * quantum(q)
+    if rate:
+        return _Apart(-way, np.full(q.size, step + 9 * noise(q)), 0.0, rate)
+    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), noise(w) * dt, rate)
+
+
+def travel(rate: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " time"]:
+    """Integral of a rate from the first row."""
+    w = bridge(rate)
+    return np.append(0.0, np.cumsum(dt * (w[1:] + w[:-1]) / 2))
+
+
+def _moves(y: Float[np.ndarray, " time"], run: Run, apart: _Apart, dt: float, sign: float = 0.0) -> bool:
+    """True where the other column shows that the joint moved meanwhile, more than the two usually disagree."""
+    length = min(run.length, (y.size - run.length) // 2)
+    if length < 2:
+        return False
+    away = _away(apart.way, _places(run.first, run.end - length), length)
+    outside = np.append(_places(0, run.first - length), _places(run.end, y.size - length))
+    usual = float(np.percentile(np.abs(_away(apart.way, outside, length)).max(axis=1), 80)) if outside.size else 0.0
+    hole = _hole(y, run) * dt * length if apart.rate else 0.0
+    least = float(apart.least[run.first]) + 6 * apart.walk * math.sqrt(length) + hole
+    return float(np.max(sign * away if sign else np.abs(away))) > _MORE * usual + least
+
+
+def _places(first: int, last: int, most: int = 30) -> Int[np.ndarray, " row"]:
+    """Rows from `first` to `last`, not more than `most` of them."""
+    return np.unique(np.linspace(first, last, min(most, max(last - first + 1, 0))).astype(int))
+
+
+def _away(
+    way: Float[np.ndarray, " time"], first: Int[np.ndarray, " place"], length: int
+) -> Float[np.ndarray, "place row"]:
+    """The way within `length` rows from each place."""
+    return way[first[:, None] + np.arange(length)] - way[first][:, None]
+
+
+def _hole(y: Float[np.ndarray, " time"], run: Run) -> float:
+    """Distance of the readings next to a held one: the step of a coarse rate, or the threshold under which it is 0."""
+    held = np.convolve(y == y[run.first], np.ones(3), "same") > 0
+    other = y[np.isfinite(y) & ~held]
+    step = np.abs(np.diff(y))
+    usual = float(np.percentile(step[step > 0], _USUAL)) if (step > 0).any() else 0.0
+    return min(float(np.min(np.abs(other - y[run.first]), initial=math.inf)), usual)
 
 
 def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """True where the reading after the run is far from it, beside the usual steps."""
+    """True where the readings behind the run are and stay far from it, beside the usual steps and those near by.
+
+    A joint that rests on both sides slips, and a filtered rate returns.
+    """
     step = np.abs(np.diff(y[np.isfinite(y)]))
-    usual = np.percentile(step[step > 0], 95) if (step > 0).any() else 0.0
-    later = y[run.end : run.end + LONGEST + 1]
-    later = later[np.isfinite(later)]
-    return later.size > 0 and bool(abs(later[0] - y[run.first]) > 4 * usual)
+    before, after = (side[np.isfinite(side)][: _SIDE + 1] for side in (y[: run.first + 1][::-1], y[run.end :]))
+    near = np.abs(np.concatenate([np.diff(before), np.diff(after)]))
+    if not after.size or near.size < STILL or np.median(near) == 0:
+        return False
+    usual, jump = max(np.percentile(step[step > 0], _USUAL), near.max()), abs(after[0] - y[run.first])
+    return bool(jump > _MORE * usual and np.min(np.abs(after - y[run.first])) > jump / 2)
 
 
 def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """True where the readings right before and right after the run are noise, as elsewhere: no creep, no steps.
+    """True where the readings right before and right after the run are noise, as elsewhere, far above their steps.
 
-    A value that is held again there is that of an encoder between two steps.
+    A column in which other readings repeat is coarse, and silent at rest.
     """
-    usual = noise(y)
-    around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
-    if np.sum(around < _SAME * usual) >= _REPEATS:
+    usual, step = noise(y), np.diff(np.delete(y, slice(run.first, run.end)))
+    if np.mean(step == 0) > _REPEATS or usual < 3 * quantum(y):
         return False
-    sides = [part[np.isfinite(part)][:10] for part in (y[: run.first][::-1], y[run.end :])]
+    sides = [part[np.isfinite(part)][:_SIDE] for part in (y[: run.first][::-1], y[run.end :])]
     sides = [side for side in sides if side.size >= 8]
     bend, turn = (np.array([np.std(np.diff(side, n)) for side in sides]) for n in (2, 3))
-    least = max(usual / 3, 3 * _quantum(y))
-    return len(sides) > 0 and bool(np.all((bend > least) & (turn > bend)))
+    return len(sides) > 0 and bool(np.all((bend > usual / 3) & (turn > bend)))
 
 
-def _steps(side: Float[np.ndarray, " row"]) -> Float[np.ndarray, " step"]:
-    """Sizes of the first steps of a side."""
-    return np.abs(np.diff(side[np.isfinite(side)][: _SIDE + 1]))
-
-
-def _partner(name: str, readings: Columns) -> str | None:
-    """The rate of a coordinate, or the coordinate of a rate."""
-    return next((other for other in (f"d{name}", name[1:] * name.startswith("d")) if other in readings), None)
-
-
-def _travel(name: str, readings: Columns, run: Run, dt: float) -> Float[np.ndarray, " row"] | None:
-    """Motion during equal readings by the other column, over the part that noise and steps explain."""
-    other = _partner(name, readings)
-    if other is None:
-        return None
-    y, z = readings[name], readings[other]
-    part = z[run.first : run.end]
-    longest = max((same.length for same in runs(part)), default=0)
-    if np.isfinite(part).mean() < 0.5 or longest >= max(STILL, 0.5 * run.length):
-        return None
-    part = bridge(part)
-    since = dt * np.arange(run.length)
-    still = y[run.first]
-    if other == f"d{name}":
-        away = dt * (np.cumsum(part) - part[0])
-        return away / (6 * noise(z) * dt * math.sqrt(run.length) + 3 * _quantum(y) + 1e-300)
-    away = part - np.median(part[:3]) - still * since
-    uncertainty = 9 * noise(z) + 3 * _quantum(z) + (_quantum(y) + 0.3 * abs(still)) * since[-1]
-    return away / (uncertainty + 1e-300)
-
-
-def _quantum(y: Float[np.ndarray, " time"]) -> float:
+def quantum(y: Float[np.ndarray, " time"]) -> float:
     """The step of the sensor: the smallest of the column, or the usual one between values that are held in turn.
 
     A log that was resampled or filtered has steps as small as its digits; the sensor's are between its plateaus.
@@ -162,20 +190,20 @@ def _quantum(y: Float[np.ndarray, " time"]) -> float:
     return max(least, usual) if math.isfinite(least) else 0.0
 
 
-def _beyond(name: str, readings: Columns, run: Run, sign: float, dt: float) -> bool:
+def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apart: _Apart | None) -> bool:
     """True where it went beyond its limit: by the other column, or by the motion before and after.
 
     A rate decides against the motion of its coordinate: a machine at a stop comes and goes as fast.
     """
-    y = readings[name]
     before, after = y[max(run.first - _SIDE, 0) : run.first], y[run.end : run.end + _SIDE]
     if np.isfinite(before).sum() < 5 or np.isfinite(after).sum() < 5:
         return False
-    away = _travel(name, readings, run, dt)
-    if away is not None and (float(np.max(sign * away)) > 1.0 or _partner(name, readings) == f"d{name}"):
-        return float(np.max(sign * away)) > 1.0
+    if apart is not None:
+        moves = _moves(y, run, apart, dt, sign)
+        if moves or not apart.rate:
+            return moves
     rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
-    spread, coarse = noise(y), 4 * _quantum(y)
+    spread, coarse = noise(y), 4 * quantum(y)
     for side in (before, after[::-1]):
         expected, uncertainty = _ahead(side, rows, spread)
         if np.all(sign * (expected - y[run.first]) <= _SURE * uncertainty + coarse):

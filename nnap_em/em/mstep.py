@@ -144,7 +144,8 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
     first = jax.tree.map(pick, first)
-    near = jnp.repeat((STEP * core.unknown.scale) ** -2.0, weights.nodes.shape[1])
+    near = jnp.where(jnp.isfinite(rule.coarse), (STEP * core.unknown.scale) ** -2.0, 0.0)
+    near = jnp.repeat(near, weights.nodes.shape[1])
     near = jnp.diag(jnp.concatenate([near, jnp.zeros(weights.prior.size, near.dtype)]))
     w = weights.fit(core.unknown, core.w, total.score, total.information + near, rule.iterations)
     hessian = _definite(total.information + weights.prior_precision(core.unknown))
@@ -157,11 +158,11 @@ def _definite(precision: Float[Array, "phi phi"]) -> Float[Array, "phi phi"]:
     return precision + 100 * jnp.finfo(precision.dtype).eps * jnp.diag(jnp.diag(precision))
 
 
-STEP = 1.0
-"""Standard deviation of the change of a node's torque in one M-step [scales of the map, a tenth of typical torques].
+STEP = 0.1
+"""Standard deviation of the change of a node's torque in one M-step on logs that rest [scales of the map].
 
-At rest only the slope of the map is determined, and a step by it alone would make friction a peak of 100 times its
-size, which no later step leaves. No fixed point moves.
+There only the slope of the map is determined, and a step by it alone would make friction a peak of many times its size,
+which no later step leaves. No fixed point moves.
 """
 COARSE = 0.1
 """`ScoringMStep.coarse` of logs that rest [standard deviations of an offset of friction]."""

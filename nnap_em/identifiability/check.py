@@ -14,7 +14,7 @@ from ..data.logs import HELD, Logs
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
-from ..em.readings import reading_noise
+from ..em.readings import reading_noise, resolution
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
 from ..fit.identify import begin
@@ -199,6 +199,9 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         noisy = max(seen, declared or 0.0) > 0.3 * spread
         alone = name not in model.system.sensors  # of three axes one may sense nothing
         drowned = "; the motion hardly rises above it: move more, or look at the units" if noisy else ""
+        codes = resolution(signal)
+        steps = f"; it reads codes {codes:.2g} {unit} apart and repeats them, which is noise of {codes / 12**0.5:.2g}"
+        drowned += steps if codes else ""
         if declared is None:
             text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
             yield CheckResult(_mark(noisy, noisy and alone), "noise", text)
@@ -355,7 +358,7 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         hints = [
             (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
             (turns < 4, "too few turns to identify Coulomb friction"),
-            (near_rest > 0.8, "it rests most of the time"),
+            (near_rest > 0.5, "it rests most of the time: move more, and slowly through zero velocity"),
             (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
         ]
         remarks = [hint for holds, hint in hints if holds]

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,12 @@ def optimised() -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
+
+
+def data_sets(shared: Path) -> list[Path]:
+    """The rig.toml of every shared data set without a fault; one with a fault has an expected.txt."""
+    paths = sorted((shared / "data").glob("*/*/rig.toml"))
+    return [path for path in paths if (path.parent / "train").is_dir() and not path.with_name("expected.txt").exists()]
 
 
 def swing_rig(**changes) -> Rig:

@@ -763,8 +763,8 @@ MUTANTS = (
     Mutant(
         "a gap does not end a sequence",
         "recordings/segments.py",
-        "np.diff(signal.t) > longest)",
-        "np.diff(signal.t) > 9 * longest)",
+        "np.diff(signal.t) > signal.longest)",
+        "np.diff(signal.t) > 9 * signal.longest)",
         "test_import.py::test_sequences_are_cut_at_gaps[readings]",
     ),
     Mutant(

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import csv_text, swing, swing_rig, with_field
+from helpers import csv_text, data_sets, swing, swing_rig, with_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -172,7 +172,7 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path, columns):
 
 @pytest.mark.slow
 def test_every_shared_log_is_read_without_a_word(shared):
-    paths = sorted((shared / "data").glob("*/*/rig.toml"))
+    paths = data_sets(shared)
     assert len(paths) > 10
     for path in paths:
         rig = read_rig(path, specs)

@@ -97,6 +97,7 @@ UNITS = _table(
 )
 QUOTED = _table('"time [s]","Motor torque, Nm","theta1 [deg]","dtheta1 [rad/s]"', DEGREES)
 PATHS = _table(f"__time,{JOINT}/effort,{JOINT}/position,{JOINT}/velocity", (1.7e9 + T, *COLUMNS[1:]))
+DATES = functools.partial(dialects.dated, names=_names(";"), columns=COLUMNS)
 PLAIN = functools.partial(dialects.twincat, full=False, separator=",", decimal=".")
 READ = {  # what writes a file, its name, and the addresses that names do not give
     "TwinCAT Scope": (dialects.twincat, "a.csv", SCOPE),
@@ -119,6 +120,7 @@ READ = {  # what writes a file, its name, and the addresses that names do not gi
     "colons": (_table("time,a:u,a:pos,a:vel"), "a.csv", {"theta1": '"a:pos"', "dtheta1": '"a:vel"'}),
     "PlotJuggler": (PATHS, "a.csv", QUANTITIES),
     "NumPy": (_table("# time u theta1 dtheta1", COLUMNS, " "), "a.txt", {}),
+    "dates": (DATES, "a.csv", {}),
     "no time": (_table("u,theta1,dtheta1", COLUMNS[1:]), "a.csv", {}),
     "no time, decimal comma": (_table("u;theta1;dtheta1", COLUMNS[1:], ";", ","), "a.csv", {}),
 }
@@ -171,7 +173,7 @@ REFUSED = {  # what writes a file, its name, and words of the message
     "a date": (_last("2026-01-01;1;1;1"), "a.csv", "line 202, column 'time': found '2026-01-01'"),
     "a field too many": (_last("9;1;1;1;1"), "a.csv", "line 202: found 5 fields under 4 names"),
     "thousands": (_last("9;1.000,5;1;1", ","), "a.csv", "line 202, column 'u': found '1.000,5'"),
-    "no time": (_last(";1;1;1"), "a.csv", "line 202, column 'time'", "holds no time"),
+    "no time": (_last(";1;1;1"), "a.csv", "line 202, column 'time': found ''", "never empty"),
     "a misspelt time": (_table(_names(",", "tme")), "a.csv", "no column of times", "if 'tme' is that"),
     "no header": (_table("0;1;2;3", COLUMNS, ";"), "a.txt", "no column of numbers under a name"),
 }

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers import data_sets
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
@@ -218,7 +219,7 @@ def test_the_command_writes_once_and_never_over(tmp_path, capsys):
 
 
 def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_path):
-    paths = sorted((shared / "data").glob("*/*/rig.toml"))
+    paths = data_sets(shared)
     assert paths
     for path in paths:
         owner = read_rig(path, specs)

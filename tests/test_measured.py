@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers import data_sets
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import read_logs
@@ -27,7 +28,7 @@ def _read(folder: Path, sequences: int, rows: int) -> tuple[Rig, Dataset]:
 
 
 def test_every_shared_rig_has_a_finite_first_e_step(shared):
-    folders = sorted(path.parent for path in (shared / "data").glob("*/*/rig.toml"))
+    folders = [path.parent for path in data_sets(shared)]
     assert folders
     for folder in folders:
         rig, data = _read(folder, 2, 100)

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import numpy as np
 import scipy.io
@@ -19,10 +19,11 @@ from ..storage.files import replace_text
 from .dataset import Array, DataError
 from .mat_structs import mat_columns
 from .rig import nearest
-from .units import TIME
+from .units import is_time
 
 LARGEST = 256 * 2**20  # bytes of the file of one sequence: some million rows
 BLOCK = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
+Table = Float[np.ndarray, "time column"]
 
 
 def has_logs(folder: Path) -> bool:
@@ -44,7 +45,7 @@ def log_files(folder: Path) -> list[Path]:
     return files
 
 
-def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Float[np.ndarray, "time column"]:
+def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Table:
     """The columns `required`, then `gaps`, of a log in the format that its name ends in; NaN = missing (`gaps` only).
 
     Raises DataError that names the row and the column.
@@ -53,9 +54,9 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
     return _readers[path.suffix.lower()](path, required, gaps)
 
 
-def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Float[np.ndarray, "time column"]:
+def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Table:
     """The same of a log of any size, whose times may be dates [s since 1970]."""
-    return _readers[path.suffix.lower()](path, required, gaps, dates=True)
+    return _readers[path.suffix.lower()](path, required, gaps, True)
 
 
 def column_names(path: Path) -> list[str]:
@@ -96,12 +97,18 @@ def _digits(name: str, values: Float[np.ndarray, " time"]) -> str:
 
 def header_hint(path: Path) -> str | None:
     """The hint where line 1 of a CSV file is no header of columns separated by ','; None where it may be one."""
-    return _header_hint(_text(path)) if path.suffix.lower() == ".csv" else None
+    if path.suffix.lower() != ".csv":
+        return None
+    first, last = _ends(path)
+    if all(map(_is_number, first.split(","))):
+        return "line 1 holds numbers: write a header"
+    above = "remove the lines above the header" if first.count(",") < last.count(",") else None
+    return _separator_hint(path) or above
 
 
 def untimed(path: Path, names: Sequence[str]) -> str | None:
     """The hint where a column may be meant as the times; None where a table has no such column at all."""
-    like = [name for name in names if TIME.match(name) or difflib.get_close_matches("time", [name.casefold()])]
+    like = [name for name in names if is_time(name) or difflib.get_close_matches("time", [name.casefold()])]
     return header_hint(path) or (f"name it 'time' [s], if {like[0]!r} is that" if like else None)
 
 
@@ -122,34 +129,27 @@ def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
     return names, [row for first, lines in _blocks(path) for row in _fields(path, names, first, lines)]
 
 
-def read_csv(
-    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
-) -> Float[np.ndarray, "time column"]:
+def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
     """The columns `required`, then `gaps`, of a CSV file with a header, in file units; NaN = empty field (`gaps` only).
 
     `dates`: texts of `required` may be dates of ISO 8601.  Raises DataError that names the line and the column.
     """
     names = split(_first_line(path))
-    every = (*required, *gaps)
-    if not set(every) <= set(names) or len(set(names)) < len(names):
-        _check_names(path, names, required, gaps, "line 1, ", header_hint(path))
-    places = [names.index(name) for name in every]
-    table = np.empty((_lines(path), len(every)), order="F")
-    end, lines = 0, []
-    for end, lines in _blocks(path):
-        block = table[end : end + len(lines)]
+    _check_names(path, names, required, gaps)
+    places = {name: names.index(name) for name in (*required, *gaps)}
+
+    def table(first: int, lines: Sequence[str]) -> Table:
         if (plain := _plain(lines, len(names))) is not None:
-            block[:] = plain[:, places]
-            continue
-        columns = list(zip(*_fields(path, names, end, lines), strict=True))
-        for k, name in enumerate(every):
-            block[:, k] = _numbers(path, name, columns[places[k]], name in gaps, end, dates and name in required)
-    return table[: end + len(lines)]
+            return plain[:, [*places.values()]]
+        columns = [*zip(*_fields(path, names, first, lines), strict=True)]
+        numbered = range(first + 2, first + 2 + len(lines))
+        return np.stack([numbers(path, name, numbered, columns[i], name in gaps, dates and name in required)
+                         for name, i in places.items()], -1)  # fmt: skip
+
+    return np.concatenate([table(first, lines) for first, lines in _blocks(path)])
 
 
-def read_parquet(
-    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
-) -> Float[np.ndarray, "time column"]:
+def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
     """The same of a Parquet file, where null and NaN are missing samples."""
     names = _parquet_columns(path)
     _check_names(path, list(names), required, gaps)
@@ -159,16 +159,14 @@ def read_parquet(
     return _stack(path, columns, gaps, dates)
 
 
-def read_mat(
-    path: Path, required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
-) -> Float[np.ndarray, "time column"]:
+def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
     """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
     columns = _mat_columns(path)
     _check_names(path, list(columns), required, gaps)
     return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps, dates)
 
 
-_readers: dict[str, Callable[..., np.ndarray]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
+_readers: dict[str, Callable[..., Table]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
 
 
 def _mat_columns(path: Path) -> dict[str, Any]:
@@ -277,59 +275,53 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         raise _unreadable(path, error) from None
 
 
-def _text(path: Path) -> str:
+@contextmanager
+def _opened(path: Path) -> Iterator[TextIO]:
+    """A file as text; whatever is wrong with it as a DataError."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise DataError(f"{path}: line {line}: not UTF-8; save the file as plain UTF-8 text") from None
-    if not text.strip():
-        refuse(path, "line 1", "the file is empty", "write a header and one row per sample, or remove the file")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+        with path.open(encoding="utf-8-sig") as file:
+            yield file
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    except UnicodeDecodeError:
+        line = read_bytes(path).decode(errors="replace").partition("\ufffd")[0].count("\n") + 1
+        refuse(path, f"line {line}", "not UTF-8", "save the file as plain UTF-8 text")
 
 
 def _first_line(path: Path) -> str:
-    """The first line of a text file; DataError where it cannot be read."""
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            line = file.readline()
-    except (OSError, UnicodeDecodeError):
-        line = ""
-    return line.rstrip("\n") if line.strip() else _text(path).split("\n", 1)[0]
+    with _opened(path) as file:
+        line = file.readline()
+        if not line.strip() and not any(map(str.strip, file)):
+            refuse(path, "line 1", "the file is empty", "write a header and one row per sample, or remove the file")
+    return line.rstrip("\n")
 
 
-def _lines(path: Path) -> int:
-    """Number of lines of a text file at most."""
+def _ends(path: Path) -> tuple[str, str]:
+    """The first and the last line of a text file."""
     with path.open("rb") as file:
-        return 1 + sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: file.read(BLOCK), b""))
+        file.seek(max(path.stat().st_size - BLOCK, 0))
+        return _first_line(path), file.read().decode(errors="replace").strip().splitlines()[-1]
 
 
-def _ends(text: str) -> tuple[str, str]:
-    """The first and the last line."""
-    return text.split("\n", 1)[0], text.rstrip().rpartition("\n")[2]
-
-
-def _separator_hint(text: str) -> str | None:
-    first, last = _ends(text)
+def _separator_hint(path: Path) -> str | None:
+    first, last = _ends(path)
     other = next((mark for mark in (";", "\t") if mark in first and mark in last), None)
     return f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
 
 
-def _header_hint(text: str) -> str | None:
-    first, last = _ends(text)
-    if all(map(_is_number, first.split(","))):
-        return "line 1 holds numbers: write a header"
-    above = "remove the lines above the header" if first.count(",") < last.count(",") else None
-    return _separator_hint(text) or above
+def number(text: str, decimal: str = ".") -> float:
+    """A number; NaN for an empty field, infinite for another text."""
+    if decimal == ",":
+        text = text.replace(".", "?").replace(",", ".")
+    try:
+        return float(text.replace("_", "?") or "nan")  # Python takes 1_0 for 10
+    except ValueError:
+        return math.inf
 
 
 def _is_number(field: str) -> bool:
     """True for a number and for an empty field."""
-    try:
-        float(field.strip() or "nan")
-    except ValueError:
-        return False
-    return True
+    return not math.isinf(number(field.strip()))
 
 
 def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -338,57 +330,48 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
     Two rows at least, or a DataError.
     """
     count, lines = 0, []
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            file.readline()
-            while block := file.readlines(BLOCK):
-                lines += block
-                blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
-                lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]
-                if lines:
-                    yield count, lines
-                count, lines = count + len(lines), rest
-    except UnicodeDecodeError:
-        _text(path)
+    with _opened(path) as file:
+        file.readline()
+        while block := file.readlines(BLOCK):
+            lines += block
+            blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
+            lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]
+            if lines:
+                yield count, lines
+            count, lines = count + len(lines), rest
     if count < 2:
         refuse(path, f"line {count + 1}", f"found {counted(count, 'row')}", "write a header and 2 rows or more")
 
 
-def _plain(lines: Sequence[str], columns: int) -> Float[np.ndarray, "row column"] | None:
+def _plain(lines: Sequence[str], columns: int) -> Table | None:
     """All fields of the lines at full speed; None where one is no finite number, or they are not so many in each."""
-    try:
+    with suppress(ValueError):
         table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
-    except ValueError:
-        return None
-    return table if table.shape == (len(lines), columns) and np.isfinite(table).all() else None
+        return table if table.shape == (len(lines), columns) and np.isfinite(table).all() else None
 
 
 def _fields(path: Path, names: Sequence[str], first: int, lines: Sequence[str]) -> list[list[str]]:
     """The fields of lines, as many as there are names; the first line is row `first`."""
     rows = [split(line) for line in lines]
-    for number, row in enumerate(rows, first + 2):
+    for line, row in enumerate(rows, first + 2):
         if len(row) != len(names):
             hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
             problem = f"found {counted(len(row), 'field')} under {counted(len(names), 'name')}"
-            refuse(path, f"line {number}", problem, _separator_hint(_text(path)) or hint)
+            refuse(path, f"line {line}", problem, _separator_hint(path) or hint)
     if first == 0 and not any(map(_is_number, rows[0])):
         problem = f"holds no number, found {','.join(rows[0])!r}"
         refuse(path, "line 2", problem, header_hint(path) or "remove the row of units")
     return rows
 
 
-def _check_names(
-    path: Path,
-    names: Sequence[str],
-    required: Sequence[str],
-    gaps: Sequence[str],
-    line: str = "",
-    hint: str | None = None,
-) -> None:
+def _check_names(path: Path, names: Sequence[str], required: Sequence[str], gaps: Sequence[str]) -> None:
+    """Refuse columns that are not there, or more than once."""
+    line = "line 1, " if path.suffix.lower() == ".csv" else ""
     every = (*required, *gaps)
     spare = [name for name in names if name not in every]
     for name in every:
         if name not in names:
+            hint = header_hint(path)
             alone = "no other column is free for it: log it, or correct the columns of rig.toml"
             other = "or correct [input] columns in rig.toml" if name in required else ""
             other = "or `nnap-em import` it: it reads other names, separators and clocks" if name == "time" else other
@@ -398,28 +381,22 @@ def _check_names(
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
 
-def _numbers(
-    path: Path, name: str, texts: Sequence[str], gaps: bool, first: int, dates: bool
+def numbers(
+    path: Path, name: str, lines: Sequence[int], texts: Sequence[str], gaps: bool, dates: bool, decimal: str = "."
 ) -> Float[np.ndarray, " time"]:
-    """The numbers of one column at full speed; where that fails, field by field to find the mistake or the date."""
-    try:
+    """The numbers of one column, or its dates, at full speed; where that fails, field by field to find the mistake."""
+    with suppress(ValueError):
         values = np.array([float(text) if text else math.nan for text in texts])
         plain = np.isfinite(values).all() if not gaps else not np.isinf(values).any()
-        if plain and "_" not in "".join(texts):  # Python takes 1_0 for 10
+        if plain and decimal == "." and "_" not in "".join(texts):
             return values
-    except ValueError:
-        pass
-    return np.array([_number(path, name, row, text.strip(), gaps, dates) for row, text in enumerate(texts, first)])
-
-
-def _number(path: Path, name: str, row: int, text: str, gaps: bool, dates: bool) -> float:
-    try:
-        value = float(text.replace("_", "?") or "nan")
-    except ValueError:
-        value = seconds(text) if dates else math.inf
-    if math.isinf(value) or (math.isnan(value) and not gaps):
-        _no_number(path, name, row, repr(text), math.isnan(value), gaps)
-    return value
+    dates = dates and math.isinf(number(texts[0], decimal))
+    values = np.array([seconds(text) if dates else number(text, decimal) for text in texts])
+    wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (not gaps)))
+    if wrong.size:
+        k = int(wrong[0])
+        _no_number(path, f"line {lines[k]}, column {name!r}", repr(texts[k]), math.isnan(values[k]), gaps)
+    return values
 
 
 def seconds(text: str) -> float:
@@ -438,14 +415,12 @@ def dated(values: np.ndarray) -> Float[np.ndarray, " time"]:
     return np.array([seconds(text.decode() if isinstance(text, bytes) else str(text)) for text in values.tolist()])
 
 
-def _no_number(path: Path, name: str, row: int, text: str, missing: bool, gaps: bool) -> NoReturn:
+def _no_number(path: Path, where: str, text: str, missing: bool, gaps: bool) -> NoReturn:
     hint = "write a number such as -0.125" + (", or leave the field empty: a missing sample" if gaps else "")
-    refuse(path, place(path, name, row), f"found {text}", hint + ("; time and inputs are never empty" * missing))
+    refuse(path, where, f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
-def _stack(
-    path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool
-) -> Float[np.ndarray, "time column"]:
+def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool) -> Table:
     """Columns of numbers side by side, checked as those of a CSV file are."""
     rows = np.size(next(iter(columns.values())))
     if rows < 2:
@@ -465,6 +440,7 @@ def _stack(
         wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
         if wrong.size:
             value = values[wrong[0]]
-            _no_number(path, name, int(wrong[0]), f"{value:g}", bool(np.isnan(value)), name in gaps)
+            where = place(path, name, int(wrong[0]))
+            _no_number(path, where, f"{value:g}", bool(np.isnan(value)), name in gaps)
         out.append(values)
     return np.stack(out, -1)

@@ -20,7 +20,7 @@ from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
-from .units import unit_between
+from .units import other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
@@ -243,9 +243,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     steps = np.diff(t) / rig.dt
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
-        other = "correct [sampling] dt of rig.toml, or resample"
-        unit = unit_between(float(typical)) if typical > 0 else ""
-        hint = f"one of the two is in {unit}: write s" if unit else other
+        hint = other_unit(float(typical), "correct [sampling] dt of rig.toml, or resample")
         refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE

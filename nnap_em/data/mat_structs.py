@@ -37,14 +37,12 @@ def _control_desk(name: str, record: Any) -> Iterator[tuple[str, Any]]:
 def _structure_with_time(name: str, record: Any) -> Iterator[tuple[str, Any]]:
     """Simulink's structure with time: signals(k).values, called as their labels or else as the variable."""
     signals = np.atleast_1d(record["signals"].item())
-    labels = [
-        str(signal["label"]) if np.size(signal["label"]) else "" for signal in signals if "label" in signal.dtype.names
-    ]
+    labels = {str(each["label"]) for each in signals if "label" in each.dtype.names and np.size(each["label"])}
     if np.size(record["time"].item()):
         yield "time", record["time"].item()
-    for k, signal in enumerate(signals):
-        other = name if len(signals) == 1 else f"{name}({k + 1})"
-        yield labels[k] if len(set(filter(None, labels))) == len(signals) else other, signal["values"]
+    for k, signal in enumerate(signals, 1):
+        other = name if len(signals) == 1 else f"{name}({k})"
+        yield str(signal["label"]) if len(labels) == len(signals) else other, signal["values"]
 
 
 _STRUCTS = {("X", "Y"): _control_desk, ("time", "signals"): _structure_with_time}

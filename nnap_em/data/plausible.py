@@ -111,7 +111,8 @@ def bridge(values: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
 def _stretches(rows: Float[np.ndarray, "time column"]) -> Iterator[tuple[bytes, int]]:
     """Every stretch of the sequence as its content and first row, those aside in which half the rows are the same."""
     length = min(STRETCH, len(rows))
-    kinds = np.unique(rows, axis=0, return_inverse=True, equal_nan=False)[1].ravel() if rows.size else np.zeros(0)
+    known = np.nan_to_num(rows, nan=math.inf)  # missing samples are alike
+    kinds = np.unique(known, axis=0, return_inverse=True)[1].ravel() if rows.size else np.zeros(0)
     for k, window in enumerate(np.lib.stride_tricks.sliding_window_view(kinds, length)):
         if len(set(window.tolist())) > length / 2:
             yield np.ascontiguousarray(rows[k : k + length]).tobytes(), k

@@ -8,32 +8,33 @@ _UNITS = {  # of parameters and states, by their names
     r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
     r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
 }  # fmt: skip
-SIZES = {  # units at the end of a name: the SI unit, and how many of it
-    "deg/s": ("rad/s", math.pi / 180), "°/s": ("rad/s", math.pi / 180), "deg": ("rad", math.pi / 180),
-    "°": ("rad", math.pi / 180), "rpm": ("rad/s", math.pi / 30), "mm/s": ("m/s", 1e-3), "mm": ("m", 1e-3),
-    "ms": ("s", 1e-3), "us": ("s", 1e-6), "mnm": ("N m", 1e-3), "nmm": ("N m", 1e-3), "rad/s": ("rad/s", 1.0),
-    "rad": ("rad", 1.0), "m/s": ("m/s", 1.0), "nm": ("N m", 1.0), "n m": ("N m", 1.0), "n": ("N", 1.0),
-    "m": ("m", 1.0), "s": ("s", 1.0),
-}  # fmt: skip
-TIME = re.compile(
-    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|zeit|zeitstempel)"  # __time: PlotJuggler; tout: Simulink
-    r"(?:(?:[ _]+|[ _]*[\[(])(s|sec|seconds|ms|us|µs|ns|nanoseconds)[\])]?)?$",
-    re.IGNORECASE,
-)
-"""Names of a column of times, and its unit."""
 UNITS = {
     "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "µs": 1e-6,
     "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "days": 86400.0,
 }  # fmt: skip
 """Seconds in the units of times."""
+SIZES = {  # units at the end of a name: the SI unit, and how many of it
+    "deg/s": ("rad/s", math.pi / 180), "°/s": ("rad/s", math.pi / 180), "deg": ("rad", math.pi / 180),
+    "°": ("rad", math.pi / 180), "rpm": ("rad/s", math.pi / 30), "mm/s": ("m/s", 1e-3), "mm": ("m", 1e-3),
+    "mnm": ("N m", 1e-3), "nmm": ("N m", 1e-3), "rad/s": ("rad/s", 1.0), "rad": ("rad", 1.0), "m/s": ("m/s", 1.0),
+    "nm": ("N m", 1.0), "n m": ("N m", 1.0), "n": ("N", 1.0), "m": ("m", 1.0),
+    **{unit: ("s", size) for unit, size in UNITS.items()},
+}  # fmt: skip
+_TIME = re.compile(r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|zeit|zeitstempel)", re.IGNORECASE)
+"""Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""
 _UNIT = re.compile(rf"(.+?)(?:[ _,]*[\[(]|[ _,]+)({'|'.join(SIZES)})[\])]?$", re.IGNORECASE)
-_BRACKETS = re.compile(rf"(.+?)[ _,]*[\[(]({'|'.join(SIZES)})[\])]$", re.IGNORECASE)
 
 
 def named_unit(name: str, *, brackets: bool = False) -> tuple[str, str]:
     """A name without the unit at its end, and that unit as in `SIZES`, or nothing; `brackets`: only in such."""
-    match = (_BRACKETS if brackets else _UNIT).match(name)
+    match = None if brackets and name[-1:] not in ("]", ")") else _UNIT.match(name)
     return (match[1], match[2].lower()) if match else (name, "")
+
+
+def is_time(name: str) -> bool:
+    """True for the name of a column of times, which may end in a unit of times."""
+    word, unit = named_unit(name)
+    return bool(_TIME.fullmatch(word)) and (not unit or unit in UNITS)
 
 
 def parameter_unit(name: str) -> str:
@@ -47,10 +48,11 @@ def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parame
     return ", ".join(f"{name} = {number} {unit(name)}" for name, number in numbers.items())
 
 
-def unit_between(ratio: float) -> str:
-    """Unit of one of two intervals that should be the same, of which the other is in s; empty where there is none."""
+def other_unit(ratio: float, otherwise: str) -> str:
+    """The hint where of two intervals that should be the same one is in s, the other in ms, us, ns or days."""
     units = ("ms", "us", "ns", "days")
-    return next((unit for unit in units for x in (ratio, 1 / ratio) if 0.99 < x * UNITS[unit] < 1.01), "")
+    sizes = ((unit, x * UNITS[unit]) for unit in units for x in (ratio, 1 / ratio if ratio else 0.0))
+    return next((f"one of the two is in {unit}: write s" for unit, size in sizes if 0.99 < size < 1.01), otherwise)
 
 
 def joint_called(coordinates: Sequence[str], joint: int) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.formats import csv_fields, header_hint, place, refuse
+from ..data.formats import csv_fields, header_hint, number, place, refuse
 from ..data.rig import SystemSpec, toml_text
-from ..data.units import SIZES, named_unit, parameter_unit
+from ..data.units import SIZES, UNITS, named_unit, parameter_unit
 from ..em.readings import reading_noise
 
 _NAMES = {  # what people call a column, its number apart
@@ -107,9 +107,9 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
     names, rows = csv_fields(path)
     columns = {}
     for name, texts in zip(names, zip(*rows, strict=True), strict=True):
-        try:
-            columns[name] = np.array([float(text.strip() or "nan") for text in texts])
-        except ValueError:
+        columns[name] = np.array([number(text) for text in texts])
+        if np.isinf(columns[name]).any():
+            del columns[name]
             if meaning(name).kind == "time":
                 refuse(path, place(path, name), "holds texts", "write seconds")
     return columns
@@ -189,7 +189,7 @@ def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Ite
     """The interval of the rows, where they have one, and the clock."""
     yield from ("", "[sampling]")
     time = next((column for column in columns if column.kind == "time"), None)
-    t = table[time.name] * {"ms": 1e-3, "us": 1e-6}.get(time.unit, 1.0) if time else np.zeros(2)
+    t = table[time.name] * UNITS.get(time.unit, 1.0) if time else np.zeros(2)
     steps = np.diff(t)
     dt = float(f"{np.median(steps):.6g}")
     if dt > 0 and np.max(np.abs(steps - dt)) <= 0.01 * dt:

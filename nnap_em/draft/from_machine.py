@@ -17,7 +17,7 @@ from ..machines.mjcf import read_machine
 from ..machines.source import parse
 from ..machines.urdf import stuck
 from ..recordings.files import reader
-from ..recordings.recording import Address, Topic, word_of
+from ..recordings.recording import Address, Topic, places
 from ..recordings.text_file import foreign
 from .from_log import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
 from .from_topics import COMMAND, columns_table, commands, others
@@ -29,7 +29,7 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
     Raises DataError where the log cannot be read or no joint of the machine is in it, MachineError for `model`.
     """
     topics = reader(path).topics(path)
-    words = {word for _, field in _fields(topics) for word in re.split(r"[][]", field)}
+    words = {word for _, field in places(topics) for word in re.split(r"[][]", field)}
     held = stuck(parse(model), words)
     machine = read_machine(model, Part(locked=held))
     columns, inputs = _joints(machine, topics), _inputs(machine, topics)
@@ -62,11 +62,6 @@ def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _fields(topics: Sequence[Topic]) -> list[tuple[Address, str]]:
-    """Everything that is there, with its last word."""
-    return [(Address(t.name, field, word_of(field)[1]), word_of(field)[0]) for t in topics for field in t.fields]
-
-
 def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
     """Address of the first name that exists."""
     return next((at for name in names for at, word in fields if word == name), None)
@@ -74,7 +69,7 @@ def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Addre
 
 def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     """Columns of angles and rates, and where they are: by name, or else as theta1 or q0 in the order of the joints."""
-    fields, out = _fields(topics), {}
+    fields, out = places(topics), {}
     kinds = _kinds(fields)
     for rate, (d, array, kind) in enumerate((("", "position", "theta"), ("d", "velocity", "dtheta"))):
         for i, joint in enumerate(machine.joints):
@@ -120,7 +115,7 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
 
     A measured effort is the torque of a motor, and no command of a servo.
     """
-    fields, order = _fields(topics), commands(topics)
+    fields, order = places(topics), commands(topics)
     kinds, servos = _kinds(fields), {motor.name for motor in machine.motors if motor.kind != TORQUE}
     motors = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
     motors = motors or [(f"tau_{joint.name}", joint.name) for joint in machine.joints]

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from ..data.dataset import DataError
 from ..data.rig import SystemSpec, toml_text
 from ..data.units import SIZES, named_unit
-from ..recordings.files import reader
-from ..recordings.recording import UNTIMED, Address, Topic, last_word, word_of
+from ..recordings.files import read, reader
+from ..recordings.recording import UNTIMED, Address, Topic, last_word, places
 from .from_log import Draft, drafted, meaning
 
 ROWS = 100_000
@@ -28,7 +28,7 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
     topics = reader(path).topics(path)
     columns = found_columns(topics)
     if not columns:
-        every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
+        every = [str(at) for at, _ in places(topics)]
         names = ", ".join(topic.name for topic in topics if topic.name) or ", ".join(every[:12]) or "none"
         hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text((*every, 'topic:field')[0])}"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
@@ -54,26 +54,24 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
 
 def joints_of(topic: Topic) -> list[str]:
     """The joints that a topic names, in its order."""
-    return [match[1] for field in topic.fields if (match := re.fullmatch(r"position\[(.+)\]", word_of(field)[0]))]
+    return [match[1] for _, word in places([topic]) if (match := re.fullmatch(r"position\[(.+)\]", word))]
 
 
 def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Address]:
     """Angles and rates of joints, called as a machine calls them; `coordinates` are by the joints' names in the log."""
     fields = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
     fields += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
-    there = {word_of(field)[0]: (field, word_of(field)[1]) for field in reversed(topic.fields)}
-    return {column: Address(topic.name, *there[field]) for column, field in fields if field in there}
+    there = {word: at for at, word in reversed(places([topic]))}
+    return {column: there[field] for column, field in fields if field in there}
 
 
 def commands(topics: Sequence[Topic]) -> list[Address]:
     """Entries of an array on a topic whose name is that of torques."""
-    return [Address(t.name, field) for t in topics for field in t.fields
-            if re.fullmatch(r"data(\[\d+\])?", last_word(field)) and COMMAND.search(f"{t.name}/{field}")]  # fmt: skip
+    return [at for at, word in places(topics) if re.fullmatch(r"data(\[\d+\])?", word) and COMMAND.search(str(at))]
 
 
 def _efforts(topics: Sequence[Topic]) -> list[Address]:
-    return [Address(t.name, field, word_of(field)[1]) for t in topics for field in t.fields if
-            word_of(field)[0].startswith("effort[")]  # fmt: skip
+    return [at for at, word in places(topics) if word.startswith("effort[")]
 
 
 def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
@@ -88,19 +86,15 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
 
 def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
     """Topics of numbers that no column is from; of tables, the columns."""
-    used, places = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
-    rest = [t._replace(fields=tuple(f for f in t.fields if (t.name, f) not in places)) for t in topics]
-    tables = [str(Address(t.name, field)) for t in rest if not t.name.startswith("/") for field in t.fields]
-    named = [t for t in rest if t.name.startswith("/") and t.fields and t.name not in used]
+    used, there = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
+    tables = [str(at) for at, _ in places(topics) if at.topic[:1] != "/" and (at.topic, at.path) not in there]
+    named = [t for t in topics if t.name[:1] == "/" and t.fields and t.name not in used]
     return [*(f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named), *tables][:10]
 
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
-    fields: dict[str, list[str]] = {}
-    for at in columns.values():
-        fields.setdefault(at.topic, []).append(at.path)
-    tracks = reader(path).read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()}).tracks
+    tracks = read(path, columns.values()).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
     dt = min(float(f"{np.median(np.diff(track.t)) * 1e-9:.3g}") for track in tracks.values() if track.t.size > 1)
     end = min(int(track.t[-1]) for track in tracks.values())
@@ -112,8 +106,6 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     for name, place in columns.items():
         track = tracks[place.topic]
         y = track.values[place.path]
-        finite = np.isfinite(y)
-        table[name] = (
-            np.interp(at, (track.t[finite] - origin) * 1e-9, place.scale * y[finite]) if finite.any() else 0 * at
-        )
+        t, y = (track.t - origin)[np.isfinite(y)] * 1e-9, y[np.isfinite(y)]
+        table[name] = place.scale * np.interp(at, t, y) if y.size else 0 * at
     return table

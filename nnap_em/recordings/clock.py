@@ -1,5 +1,6 @@
 """The times of a topic: their order, stamps of other clocks, and which clock to take."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ from jaxtyping import Float, Int, Real
 
 from ..data.units import UNITS
 from ..numerics.digits import counted
-from .recording import Lag, refuse
+from .recording import SECOND, Lag, Track, refuse
 
 APART = 10.0
 """Seconds between stamp and log time from which on they are those of two clocks."""
@@ -26,12 +27,11 @@ PARTS = 20
 """Parts of a topic for each of which its stamps are compared with the log times."""
 PART = 50
 """Messages of such a part at least, so that its median is no chance."""
-NS = 1_000_000_000
 SINCE_1970 = (1.0e9, 4.1e9)
 """Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms, ..."""
 UPTIME = 1e14
 """Numbers from which on times are in ns: 28 hours of uptime, or 3 years in us."""
-LATEST = 4_600_000_000 * NS
+LATEST = 4_600_000_000 * SECOND
 """ns within which times are held, so that their differences are no overflow: a wild stamp is wild there too."""
 
 
@@ -47,6 +47,10 @@ class Clock(NamedTuple):
     name: str
     notes: tuple[str, ...]
     lag: Lag = ()
+
+    def track(self, columns: Iterable[tuple[str, Float[np.ndarray, " every"]]]) -> Track:
+        """These columns at these times."""
+        return Track(self.t, {name: self.take(y) for name, y in columns}, self.name, self.notes, self.lag)
 
     def take(self, values: Float[np.ndarray, " every"]) -> Float[np.ndarray, " kept"]:
         """A column at these times: the last number of the messages at one time, NaN where none has one."""
@@ -64,25 +68,35 @@ def choose(
 
     Raises DataError where there is no time at all, or it runs backwards.
     """
-    notes = []
+    notes: tuple[str, ...] = ()
     if stamp is not None:
         order = np.argsort(log, kind="stable")
         kept = trusted(stamp[order])
         used = order if kept is None else order[kept]
         reason = _odd(stamp[used], log[used])
         if reason is None:
-            return _clock(stamp, used, "header stamp", (), "message", lags(stamp[used], log[used]))
-        notes.append(f"header stamps {reason}: log times are taken")
-    return _sorted(path, f"topic {topic!r}", log, "log time", tuple(notes), "message", ((int(log[0]), 0),))
+            return _clock(stamp, used, "header stamp", "message")._replace(lag=lags(stamp[used], log[used]))
+        notes = (f"header stamps {reason}: log times are taken",)
+    clock = rising(path, f"topic {topic!r}", log, "log time", "message")
+    return clock._replace(notes=notes + clock.notes, lag=((int(log[0]), 0),))
 
 
-def rising(path: Path, where: str, t: Int[np.ndarray, " row"], name: str) -> Clock:
-    """The times of a table [ns], which may stand but not run backwards by much."""
-    return _sorted(path, where, t, name, (), "row", ())
+def rising(path: Path, where: str, t: Int[np.ndarray, " m"], name: str, noun: str = "row") -> Clock:
+    """Times [ns] in their order, where they stand or are a little out of it; refused where they are no clock."""
+    kept = trusted(t)
+    if kept is None:
+        k = int(np.argmin(np.diff(t)))
+        hint = "the clock was set back there: cut the file at that place"
+        amount = float(t[: k + 1].max() - t[k + 1]) * 1e-9
+        refuse(path, where, f"time runs backwards at {noun} {k + 2}, by {amount:.6g} s", hint)
+    if t.size > 1 and t[kept].min() == t[kept].max():
+        hint = "record with stamps, or write the time [s] of each"
+        refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {t[kept[0]] * 1e-9:g} s", hint)
+    return _clock(t, kept, name, noun)
 
 
 def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) -> Int[np.ndarray, " row"]:
-    """Times in ns, of a unit (a key of `UNITS`) or, without one, that which their size shows.
+    """Times in ns, of a unit in `UNITS` or else of that which their size shows.
 
     Raises DataError, with the unit, where they are too large for the unit.
     """
@@ -91,15 +105,15 @@ def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) 
     low, high = SINCE_1970
     size = float(np.median(np.abs(t.astype(np.float64)), overwrite_input=True))
     shown = next((name for name in ("s", "ms", "us", "ns") if low <= size * UNITS[name] < high), "")
-    if not unit:
+    if unit not in UNITS:
         unit = shown or ("ns" if size > UPTIME else "s")
     if size * UNITS[unit] > high:
         problem = f"holds times of {size:.4g}, too large for {unit}: they look like times in {shown or 'us or ns'}"
         refuse(path, where, problem, f"name it {f'time_{shown}' if shown else 'time_us or time_ns'}")
     if t.dtype.kind in "iu":
-        each = round(UNITS[unit] * NS)
+        each = round(UNITS[unit] * SECOND)
         return np.clip(t.astype(np.int64), -LATEST // each, LATEST // each) * each
-    t = t * (UNITS[unit] * NS)
+    t = t * (UNITS[unit] * SECOND)
     return np.round(np.clip(t, -LATEST, LATEST, out=t), out=t).astype(np.int64)
 
 
@@ -110,8 +124,8 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     and lie `FAR` from the others: zeros before a clock was set, a wild stamp.
     """
     steps = np.diff(t)
-    first = np.append(0, np.flatnonzero((steps > BACK * NS) | (steps < -BACK * NS)) + 1)
-    back = _behind(t) > BACK * NS
+    first = np.append(0, np.flatnonzero((steps > BACK * SECOND) | (steps < -BACK * SECOND)) + 1)
+    back = _behind(t) > BACK * SECOND
     if first.size == 1 or (back and first.size > RUNS):
         return None if back else np.arange(t.size)
     rises = np.append(True, steps > 0)
@@ -122,7 +136,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     budget = max(FEW * weight.sum(), 1)
     if weight.sum() - weight[chain].sum() > budget:
         return None
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > FAR * NS))
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > FAR * SECOND))
     size = np.bincount(groups, weight[chain])
     few = (size < LITTLE) & (size <= budget)
     if few.any() and not few.all() and size[few].sum() <= budget:
@@ -130,7 +144,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     keep = np.zeros(first.size, bool)
     keep[chain] = True
     kept = np.flatnonzero(np.repeat(keep, np.diff(np.append(first, t.size))))
-    return kept if _behind(t[kept]) <= BACK * NS else None
+    return kept if _behind(t[kept]) <= BACK * SECOND else None
 
 
 def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:
@@ -139,43 +153,26 @@ def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -
     return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
 
 
-def _sorted(
-    path: Path, where: str, t: Int[np.ndarray, " m"], name: str, notes: tuple[str, ...], noun: str, lag: Lag
-) -> Clock:
-    """Times in their order, where they are a little out of it; refused where they are no clock."""
-    kept = trusted(t)
-    if kept is None:
-        k = int(np.argmin(np.diff(t)))
-        hint = "the clock was set back there: cut the file at that place"
-        amount = float(t[: k + 1].max() - t[k + 1]) * 1e-9
-        refuse(path, where, f"time runs backwards at {noun} {k + 2}, by {amount:.6g} s", hint)
-    if t.size > 1 and t[kept].min() == t[kept].max():
-        hint = "record with stamps, or write the time [s] of each"
-        refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {t[kept[0]] * 1e-9:g} s", hint)
-    if amount := _behind(t[kept]):
-        back = counted(int(np.sum(np.diff(t[kept]) < 0)), noun)
-        notes = (*notes, f"{back} out of order by up to {amount * 1e-9:.2g} s: sorted")
-        kept = kept[np.argsort(t[kept], kind="stable")]
-    return _clock(t, kept, name, notes, noun, lag)
-
-
-def _clock(
-    t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], name: str, notes: tuple[str, ...], noun: str, lag: Lag
-) -> Clock:
-    """One time for the messages of each time; notes about those that are left out."""
+def _clock(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], name: str, noun: str) -> Clock:
+    """One time for the messages of each time, in their order; notes about those that are moved or left out."""
+    notes: list[str] = []
+    if amount := _behind(t[order]):
+        back = counted(int(np.sum(np.diff(t[order]) < 0)), noun)
+        notes.append(f"{back} out of order by up to {amount * 1e-9:.2g} s: sorted")
+        order = order[np.argsort(t[order], kind="stable")]
     if order.size < t.size:
         wild = np.delete(t, order)
         amount, middle = counted(wild.size, noun), float(np.median(t[order])) * 1e-9
         place = f"the first at {wild[0] * 1e-9:.10g} s, {abs(wild[0] * 1e-9 - middle):.3g} s from the others"
-        notes = (*notes, f"{amount} with a stamp of another clock dropped ({place})")
+        notes.append(f"{amount} with a stamp of another clock dropped ({place})")
     as_is = order.size == t.size and bool((order[1:] > order[:-1]).all())
     t, places = (t, None) if as_is else (t[order], order)
     if (t[1:] > t[:-1]).all():
-        return Clock(t, places, None, name, notes, lag)
+        return Clock(t, places, None, name, tuple(notes))
     first = np.append(0, np.flatnonzero(np.diff(t) > 0) + 1)
     same = counted(t.size - first.size, noun)
-    notes = (*notes, f"{same} with the time of the next one: the last value of each column is taken")
-    return Clock(t[first], places, first, name, notes, lag)
+    notes.append(f"{same} with the time of the next one: the last value of each column is taken")
+    return Clock(t[first], places, first, name, tuple(notes))
 
 
 def _behind(t: Int[np.ndarray, " message"]) -> int:
@@ -189,7 +186,7 @@ def _longest(
     """The runs, one after the other in time as in the file, that have the most messages."""
     best, before = weight.copy(), np.full(low.size, -1)
     for k in range(1, low.size):
-        possible = np.where(high[:k] - low[k] <= BACK * NS, best[:k], 0)
+        possible = np.where(high[:k] - low[k] <= BACK * SECOND, best[:k], 0)
         i = int(np.argmax(possible))
         if possible[i]:
             best[k], before[k] = best[k] + possible[i], i

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..data.dataset import DataError
-from .recording import Address, Topic, field_of, near, word_of
+from .recording import Address, Topic, field_of, near, places
 
 _PARTS = (("", "position"), ("d", "velocity"))
 """Prefix of the name of a joint for its angle and its rate, and the array that holds them."""
@@ -40,17 +40,14 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
     names = set(_names(column, is_input))
-    addresses: list[Address] = []
-    for reading in (lambda field: (field, 1.0), word_of):
-        every = [(Address(topic.name, field), *reading(field)) for topic in topics for field in topic.fields]
-        addresses = addresses or [at._replace(scale=scale) for at, word, scale in every if word in names]
+    every = [Address(topic.name, field) for topic in topics for field in topic.fields]
+    addresses = [at for at in every if at.path in names] or [at for at, word in places(topics) if word in names]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
-        every = [str(Address(topic.name, field)) for topic in topics for field in topic.fields]
         raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {_nearest(column, every)}")
     if len(addresses) > 1:
-        places = " and ".join(repr(str(each)) for each in addresses[:4])
-        raise DataError(f"{path}: column {column!r}: may be {places}; {hint}")
+        several = " and ".join(repr(str(each)) for each in addresses[:4])
+        raise DataError(f"{path}: column {column!r}: may be {several}; {hint}")
     return addresses[0]
 
 
@@ -60,8 +57,9 @@ def _names(column: str, is_input: bool) -> list[str]:
     return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in _PARTS if column.startswith(d))]
 
 
-def _nearest(column: str, every: Sequence[str]) -> str:
+def _nearest(column: str, addresses: Sequence[Address]) -> str:
     """The hint by the last word of each address, which is what a column is called by."""
+    every = [str(at) for at in addresses]
     words = {re.split(r"[:.\[]", name.rstrip("]"))[-1]: name for name in every}
     text = near(column, list(words))
     match = re.match(r"did you mean '([^']*)'\? ", text)

@@ -35,12 +35,10 @@ def on_one_clock(recording: Recording, dt: float, shifted: Collection[str]) -> R
     }
     stamps = f"header stamps of {', those of '.join(words.values())} the clock of the log"
     if late.min() < -dt or late.max() > REACH or np.ptp(apart) > dt:
-        tracks = {
-            topic: track._replace(t=track.t - np.round(np.interp(track.t, *lags[topic])).astype(np.int64))
-            if topic in words
-            else track
-            for topic, track in recording.tracks.items()
-        }
+        tracks = dict(recording.tracks)
+        for topic in words:
+            t = tracks[topic].t
+            tracks[topic] = tracks[topic]._replace(t=t - np.round(np.interp(t, *lags[topic])).astype(np.int64))
         note = f"{stamps}: taken out, all topics are on the clock of the log"
         return recording._replace(tracks=tracks, notes=(*recording.notes, note))
     if set(words) <= set(shifted):

@@ -1,10 +1,11 @@
 """Readers by kind of file."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..data.dataset import DataError
 from . import hdf5_file, mcap_file, table_file, text_file
-from .recording import Reader
+from .recording import Address, Reader, Recording
 
 readers: dict[str, Reader] = {
     ".mcap": mcap_file,
@@ -45,3 +46,11 @@ def reader(path: Path) -> Reader:
     if suffix not in readers:
         raise DataError(f"{path}: logs end in {', '.join(readers)}; rename it, or write one of these")
     return text_file if suffix == ".csv" and text_file.foreign(path) else readers[suffix]
+
+
+def read(path: Path, addresses: Iterable[Address]) -> Recording:
+    """The numbers at these addresses."""
+    fields: dict[str, dict[str, None]] = {}
+    for at in addresses:
+        fields.setdefault(at.topic, {})[at.path] = None
+    return reader(path).read(path, {topic: tuple(paths) for topic, paths in fields.items()})

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
 from ..data.formats import dated
-from ..data.units import TIME, UNITS
+from ..data.units import UNITS, is_time, named_unit
 from .clock import nanoseconds, rising
 from .objects import MOST
 from .recording import EXTRA, Recording, Topic, Track, refuse
@@ -54,8 +54,7 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
         hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
         refuse(path, where, f"has no time axis (holds {names})", hint)
     clock = rising(path, f"data set {axis.name!r}", _nanoseconds(path, axis), axis.name.rpartition("/")[2])
-    values = {each: clock.take(_column(group, each)) for each in paths}
-    return Track(clock.t, values, clock.name, clock.notes)
+    return clock.track((each, _column(group, each)) for each in paths)
 
 
 def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
@@ -73,9 +72,8 @@ def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
     t, where = axis[:], f"data set {axis.name!r}"
     if t.dtype.kind in "OS":
         t = dated(t)
-    named = TIME.match(axis.name.rpartition("/")[2])
     unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).lower().partition(" since ")[0].strip()
-    return nanoseconds(path, where, t, unit if unit in UNITS else (named and named[1]) or "")
+    return nanoseconds(path, where, t, unit if unit in UNITS else named_unit(axis.name.rpartition("/")[2])[1])
 
 
 def _axis(group: Any) -> Any | None:
@@ -84,7 +82,7 @@ def _axis(group: Any) -> Any | None:
     for _, data in inside:
         if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in MARKS):
             return data
-    named = [(name, data) for name, data in inside if data.ndim == 1 and TIME.match(name)]
+    named = [(name, data) for name, data in inside if data.ndim == 1 and is_time(name)]
     if named:  # the stamp of a sensor may be of another clock than the times of other groups
         return min(named, key=lambda pair: "stamp" in pair[0].lower())[1]
     above = None if group.name == "/" else _axis(group.parent)

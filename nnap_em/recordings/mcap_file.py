@@ -114,8 +114,7 @@ def _track(path: Path, topic: str, paths: Sequence[str], parts: list[_Part]) -> 
     columns = np.concatenate([part.values for part in parts], axis=1)
     parts.clear()
     clock = choose(path, topic, log, np.concatenate(stamps) if sum(map(len, stamps)) == log.size else None)
-    values = {name: clock.take(column) for name, column in zip(paths, columns, strict=True)}
-    return Track(clock.t, values, clock.name, clock.notes, clock.lag)
+    return clock.track(zip(paths, columns, strict=True))
 
 
 def _nanoseconds(values: Float[np.ndarray, "message two"]) -> Int[np.ndarray, " message"] | None:

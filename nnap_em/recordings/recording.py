@@ -1,7 +1,7 @@
 """Content of a recording, whatever file it came from: topics with numbers at times of their own."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -119,6 +119,11 @@ def word_of(field: str) -> tuple[str, float]:
     """The end of the path, and the SI units in the unit that stands behind it in brackets."""
     name, unit = named_unit(field, brackets=True)
     return last_word(name), SIZES.get(unit, ("", 1.0))[1]
+
+
+def places(topics: Iterable[Topic]) -> list[tuple[Address, str]]:
+    """All numbers of a log, in SI units where these are known, with the last words of their paths."""
+    return [(Address(t.name, field, word_of(field)[1]), word_of(field)[0]) for t in topics for field in t.fields]
 
 
 def steps(path: str) -> Iterator[str | int]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,13 +11,13 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.rig import Rig, nearest
-from ..data.units import unit_between
+from ..data.units import other_unit
 from ..numerics.digits import counted
 from .columns import declared_at, resolve
 from .common_clock import on_one_clock
 from .declared import LONGEST, Plan
 from .delays import Delay, delay, pairs
-from .files import reader
+from .files import read, reader
 from .readings import as_taken
 from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
 from .segments import (
@@ -76,6 +77,9 @@ class Stretch(NamedTuple):
     """Reason why it is dropped."""
 
 
+_Rows = tuple[Stretch, Mapping[str, Float[np.ndarray, " row"]]]
+
+
 class Resampled(NamedTuple):
     """One log on the grid."""
 
@@ -109,36 +113,14 @@ def resample(
     for name in unwrap:
         if name not in (known := (*rig.logged_inputs, *rig.measured)):
             raise DataError(f"{path}: --unwrap {name}: no column of this rig; {nearest(name, known)}")
-    return _gridded(_columns(path, rig, plan, shifts, unwrap), rig, states, plan)
-
-
-class _Columns(NamedTuple):
-    """Columns of a log at times of their own, and duplicates of some."""
-
-    path: Path
-    origin: int
-    addresses: Mapping[str, Address]
-    signals: Mapping[str, Signal]
-    longest: Mapping[str, float]
-    """Silence of each from which on it has a gap [s]; infinite for commands that hold until the next."""
-    topics: tuple[TopicFacts, ...]
-    notes: tuple[str, ...]
-
-
-def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str]) -> _Columns:
-    source = reader(path)
-    topics = source.topics(path)
+    topics = reader(path).topics(path)
     addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
     twins = {f"{name}'": declared_at(path, topics, at, name) for name, at in plan.duplicates.items()}
     every = addresses | twins
     for topic in shifts:
-        if topic not in {at.topic for at in every.values()}:
-            known = nearest(topic, sorted({at.topic for at in every.values()}))
-            raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {known}")
-    fields: dict[str, list[str]] = {}
-    for at in every.values():
-        fields.setdefault(at.topic, []).append(at.path)
-    recording = source.read(path, {topic: tuple(dict.fromkeys(paths)) for topic, paths in fields.items()})
+        if topic not in (used := sorted({at.topic for at in every.values()})):
+            raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {nearest(topic, used)}")
+    recording = read(path, every.values())
     tracks = {topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()}
     recording = on_one_clock(recording._replace(tracks=tracks), rig.dt, shifts)
     origin = min(int(track.t[0]) for track in recording.tracks.values())
@@ -146,13 +128,23 @@ def _columns(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
     least = {name: 1 if name in rig.logged_inputs else 2 for name in every}
     signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in every.items()}
     signals, notes = as_taken(signals, rig, unwrap)
-    longest = {name: longest_silence(s, rig.dt, plan.gap) for name, s in signals.items()}
-    longest |= {name: math.inf for name in rig.logged_inputs if sent_on_change(signals[name], rig.dt)}
-    facts = tuple(
-        _facts(topic, recording.tracks.get(topic.name), clocks.get(topic.name), addresses, signals, longest)
-        for topic in topics
+    for name, s in signals.items():
+        on_change = name in rig.logged_inputs and sent_on_change(s, rig.dt)
+        signals[name] = replace(s, longest=math.inf if on_change else longest_silence(s, rig.dt, plan.gap))
+    rows, sequences = _gridded(path, rig, plan, signals)
+    joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
+    causes = pairs(joints, states, signals, tuple(plan.duplicates))
+    return Resampled(
+        path,
+        origin,
+        addresses,
+        tuple(_facts(each, recording.tracks, clocks, addresses, signals) for each in topics),
+        tuple(delay(pair, signals, rig.measured if pair.held else ()) for pair in causes),
+        rows,
+        tuple(stretch for stretch, _ in sequences),
+        tuple(columns for stretch, columns in sequences if not stretch.why),
+        (*recording.notes, *notes, *_notes(rig, signals)),
     )
-    return _Columns(path, origin, addresses, signals, longest, facts, (*recording.notes, *notes))
 
 
 def _timed(track: Track, dt: float) -> Track:
@@ -175,47 +167,31 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
     return Signal(at.topic, t[finite], y[finite] * at.scale)
 
 
-def _gridded(log: _Columns, rig: Rig, states: Sequence[str], plan: Plan) -> Resampled:
-    dt, signals, longest = rig.dt, log.signals, log.longest
-    inputs = {name: signals[name] for name in rig.logged_inputs}
-    readings = {name: signals[name] for name in rig.measured}
+def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> tuple[int, list[_Rows]]:
+    """Number of rows for which there are readings, and the sequences."""
+    dt, readings = rig.dt, {name: signals[name] for name in rig.measured}
     end = max(float(s.t[-1]) for s in readings.values())
-    watched = {name: present(s, longest[name]) for name, s in _one_each(readings)}
+    watched = {name: present(s) for name, s in _one_each(readings)}
     commanded = {
-        name: present(s, longest[name], hold(s, dt) if longest[name] < math.inf else max(end - s.t[-1], 0.0))
-        for name, s in _one_each(inputs)
+        name: present(s, hold(s, dt) if s.longest < math.inf else max(end - s.t[-1], 0.0))
+        for name, s in _one_each({name: signals[name] for name in rig.logged_inputs})
     }
-    common = _common(log.path, signals, watched | commanded)
-    _fine(log.path, readings, dt)
+    common = _common(path, signals, watched | commanded)
+    _fine(path, readings, dt)
     fastest = min(readings.values(), key=lambda s: s.interval)
     spans = covered([*watched.values()], 1)
-    _sparse(log.path, spans, fastest, dt)
+    _sparse(path, spans, fastest, dt)
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
     shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
-    most = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * LEAST)
-    segments = cut(pieces, dt, shortest, most)
-    sequences = [_sequence(segment, rig, plan, signals) for segment in segments]
+    longest = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * LEAST)
+    sequences = [_sequence(segment, rig, plan, signals) for segment in cut(pieces, dt, shortest, longest)]
     if all(stretch.why for stretch, _ in sequences):
         most = max((piece.rows for piece in pieces), default=0)
-        problem = f"the longest stretch with all topics has {counted(most, 'row')}, a sequence needs {shortest}"
-        unit = unit_between(fastest.interval / dt)
+        problem = f"the longest stretch with all topics has {counted(most, 'row')}, a sequence needs {shortest} "
+        problem += f"(dt = {dt:g} s, the fastest readings are {fastest.interval:.4g} s apart)"
         other = "record longer, or lower [import] shortest, or raise [import] gap"
-        hint = f"the times, or dt, are in {unit}: write s" if unit else other
-        refuse(log.path, "the log", problem, hint)
-    around = tuple(rig.measured)
-    joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
-    causes = pairs(joints, states, signals, tuple(plan.duplicates))
-    return Resampled(
-        log.path,
-        log.origin,
-        log.addresses,
-        log.topics,
-        tuple(delay(pair, signals, around if pair.held else ()) for pair in causes),
-        sum(run.rows for run in runs(spans, fastest, dt)),
-        tuple(stretch for stretch, _ in sequences),
-        tuple(columns for stretch, columns in sequences if not stretch.why),
-        (*log.notes, *_notes(rig, signals, longest)),
-    )
+        refuse(path, "the log", problem, other_unit(fastest.interval / dt, other))
+    return sum(run.rows for run in runs(spans, fastest, dt)), sequences
 
 
 def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans]) -> Spans:
@@ -249,9 +225,7 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
         place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
         problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
         other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"
-        unit = unit_between(best.interval / dt)
-        hint = f"one of the two is in {unit}: write s" if unit else other
-        refuse(path, "[sampling] dt", problem, hint)
+        refuse(path, "[sampling] dt", problem, other_unit(best.interval / dt, other))
 
 
 def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
@@ -263,9 +237,7 @@ def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
             yield name, s
 
 
-def _sequence(
-    segment: Segment, rig: Rig, plan: Plan, signals: Mapping[str, Signal]
-) -> tuple[Stretch, Mapping[str, Float[np.ndarray, " row"]]]:
+def _sequence(segment: Segment, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> _Rows:
     """Columns of a segment; dropped is one in which a column of readings is empty, which no other command accepts."""
     if segment.why:
         return Stretch(segment.start, segment.rows, {}, segment.why), {}
@@ -280,20 +252,20 @@ def _sequence(
 
 def _facts(
     topic: Topic,
-    track: Track | None,
-    t: Float[np.ndarray, " message"] | None,
+    tracks: Mapping[str, Track],
+    clocks: Mapping[str, Float[np.ndarray, " message"]],
     addresses: Mapping[str, Address],
     signals: Mapping[str, Signal],
-    longest: Mapping[str, float],
 ) -> TopicFacts:
     """Rate, jitter and gaps of a topic that was read; of others, the entries of the file."""
     used = tuple(name for name, at in addresses.items() if at.topic == topic.name)
-    if track is None or t is None:
+    if topic.name not in tracks:
         return TopicFacts(topic.name, topic.kind, used, topic.messages)
     columns = {name: s for name, s in signals.items() if s.topic == topic.name}
+    t, track = clocks[topic.name], tracks[topic.name]
     steps = np.diff(t)
     typical = float(np.median(steps)) if steps.size else math.nan
-    silent = steps > min(longest[name] for name in columns)
+    silent = steps > min(s.longest for s in columns.values())
     usual = steps[~silent] if silent.any() else steps
     return TopicFacts(
         topic.name,
@@ -306,19 +278,19 @@ def _facts(
         1 / typical if typical > 0 else math.nan,
         float(np.std(usual)) if usual.size else math.nan,
         float(max(usual.max() - typical, typical - usual.min())) if usual.size else 0.0,
-        tuple(sorted({gap for name, s in _one_each(columns) for gap in gaps(s, longest[name])})),
+        tuple(sorted({gap for _, s in _one_each(columns) for gap in gaps(s)})),
         track.notes,
     )
 
 
-def _notes(rig: Rig, signals: Mapping[str, Signal], longest: Mapping[str, float]) -> Iterator[str]:
+def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
     """Messages about commands that are held, and readings lost or interpolated between topics and rows."""
     end = max(float(signals[name].t[-1]) for name in rig.measured)
     for name in rig.logged_inputs:
-        if longest[name] == math.inf:
-            amount = counted(signals[name].t.size, "value")
+        if (s := signals[name]).longest == math.inf and sent_on_change(s, rig.dt):
+            amount = counted(s.t.size, "value")
             yield f"{name} is sent on change ({amount}, no rate): each is held until the next, the last to the end"
-        elif (late := end - float(signals[name].t[-1])) > longest[name]:
+        elif (late := end - float(s.t[-1])) > s.longest:
             hint = "where the drive holds its last command, write [import] gap = inf"
             yield f"{name} ends {late:.3g} s before the readings: rows from there on are left out; {hint}"
     reported = set()

@@ -82,15 +82,15 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     return near ** int(np.count_nonzero(silent)) < CHANCE
 
 
-def gaps(signal: Signal, longest: float) -> list[Gap]:
+def gaps(signal: Signal) -> list[Gap]:
     """The silences that are longer [s]."""
-    spans = present(signal, longest)
+    spans = present(signal)
     return [Gap(start, end) for start, end in zip(spans[:-1, 1].tolist(), spans[1:, 0].tolist(), strict=True)]
 
 
-def present(signal: Signal, longest: float, hold: float = 0.0) -> Spans:
+def present(signal: Signal, hold: float = 0.0) -> Spans:
     """Stretches without a gap; a command is held for `hold` [s] after the last value of each, not to its end."""
-    places = np.flatnonzero(np.diff(signal.t) > longest)
+    places = np.flatnonzero(np.diff(signal.t) > signal.longest)
     ends = signal.t[np.append(places, signal.t.size - 1)]
     return np.stack([signal.t[np.append(0, places + 1)], ends + hold], axis=1)
 

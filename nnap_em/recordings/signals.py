@@ -21,6 +21,8 @@ class Signal:
     y: Float[np.ndarray, " message"]
     jumps: Int[np.ndarray, " jump"] = field(default_factory=lambda: np.zeros(0, int))
     """Values before which a counter has started over."""
+    longest: float = np.inf
+    """Silence from which on it has a gap [s]; infinite for commands that hold until the next."""
 
     @cached_property
     def interval(self) -> float:

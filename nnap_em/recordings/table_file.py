@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.formats import column_names, read_log, refuse, untimed
-from ..data.units import TIME
+from ..data.units import is_time, named_unit
 from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
@@ -34,11 +34,10 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     values = dict(zip(fields[""], table[:, table.shape[1] - len(fields[""]) :].T, strict=True))
     if name is None:
         return Recording(path, {"": Track(SECOND * np.arange(len(table)), values, UNTIMED, ())})
-    match, where = TIME.match(name), f"column {name!r}"
-    t = nanoseconds(path, where, table[:, 0], ((match and match[1]) or "").lower())
+    where = f"column {name!r}"
+    t = nanoseconds(path, where, table[:, 0], named_unit(name)[1])
     clock = rising(path, where, _in_a_row(t, table[:, 1]) if episode else t, name)
-    values = {column: clock.take(y) for column, y in values.items()}
-    return Recording(path, {"": Track(clock.t, values, clock.name, clock.notes)})
+    return Recording(path, {"": clock.track(values.items())})
 
 
 def _in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> Int[np.ndarray, " row"]:
@@ -51,7 +50,7 @@ def _in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) ->
 
 def _clock(path: Path, names: Sequence[str]) -> str | None:
     """The column that is the time; None where no name is like one."""
-    column = next((name for name in names if TIME.match(name)), None)
+    column = next((name for name in names if is_time(name)), None)
     if column is None and (hint := untimed(path, names)):
         refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", hint)
     return column

@@ -5,14 +5,15 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from ..data.formats import check_size, read_bytes, refuse, seconds, split
-from ..data.units import SIZES, TIME
+from ..data.formats import check_size, number, numbers, read_bytes, refuse, split
+from ..data.units import SIZES, is_time, named_unit
 from ..numerics.digits import counted
 from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
@@ -27,8 +28,8 @@ TICKS_1970 = 116_444_736_000_000_000
 CODESYS = "[key]"
 """First word of a CODESYS trace."""
 _TRUTHS = {"TRUE": "1", "FALSE": "0"}
-Cells = Sequence[tuple[int, str]]
-"""Fields of a column, with their lines in the file, counted from 1."""
+Cells = tuple[Sequence[int], Sequence[str]]
+"""Lines in the file, counted from 1, and the fields of a column in them."""
 
 
 class Layout(NamedTuple):
@@ -40,8 +41,8 @@ class Layout(NamedTuple):
     names: tuple[str, ...]
     clocks: tuple[int, ...]
     """Columns of times; each counts for the columns up to the next one."""
-    unit: str = "s"
-    """Unit of the times."""
+    unit: str = ""
+    """Unit of the times; empty: by their name or size."""
     dt: float = math.nan
     """Interval of the rows [s], of a table without times that states it."""
 
@@ -79,21 +80,19 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     blocks, tracks = _blocks(path), {}
     for topic, names in fields.items():
-        block, values = blocks[topic], {}
-        for name in names:
-            values[name] = _floats(path, name, block.columns[name], block.decimal)
+        block = blocks[topic]
+        values = {name: numbers(path, name, *block.columns[name], True, False, block.decimal) for name in names}
         if block.t is None:
             tracks[topic] = Track(SECOND * np.arange(len(values[names[0]])), values, UNTIMED, ())
         else:
-            clock = rising(path, f"column {block.clock!r}", block.t, block.clock)
-            tracks[topic] = Track(clock.t, {n: clock.take(y) for n, y in values.items()}, clock.name, clock.notes)
+            tracks[topic] = rising(path, f"column {block.clock!r}", block.t, block.clock).track(values.items())
     return Recording(path, tracks)
 
 
 def layout(lines: Sequence[str]) -> Layout | None:
     """The layout that the first lines of a file show; None where no row of numbers stands under names."""
     lines = lines[:LINES][:-1] or lines  # the last one may be cut
-    every = {marks: [[_kind(text, marks[1]) for text in split(line, marks[0])] for line in lines] for marks in MARKS}
+    every = {marks: [[_kind(text, marks[1]) for text in _split(line, marks[0])] for line in lines] for marks in MARKS}
     marks = max(MARKS, key=lambda each: sum(sum(row) for row in every[each] if len(row) - row.count(0) > 1))
     kinds, widths = every[marks], Counter(map(len, every[marks]))
     full = max(reversed(kinds), key=lambda row: row.count(1) * (widths[len(row)] > 1))
@@ -103,8 +102,8 @@ def layout(lines: Sequence[str]) -> Layout | None:
         return len(row) == len(full) and 1 in row and all(a >= 0 or b < 0 for a, b in zip(row, full, strict=True))
 
     first = next((k for k, row in enumerate(kinds) if alike(row)), 0)
-    head = [split(re.sub(r"^\s*[#%]\s*", "", line), marks[0]) for line in lines[:first]]
-    row = split(lines[first], marks[0])
+    head = [_split(re.sub(r"^\s*[#%]\s*", "", line), marks[0]) for line in lines[:first]]
+    row = _split(lines[first], marks[0])
     return next((found for dialect in DIALECTS if (found := dialect(head, row, marks))), None)
 
 
@@ -116,7 +115,7 @@ def _twincat(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) 
     if len(names) < 2 or not clocks:
         return None
     units = [re.sub(r"\s*\(.*", "", unit) for unit in rows.get("Unit", ())]
-    unit = "ticks" if _number(row[0], marks[1]) > TICKS else "ms"
+    unit = "ticks" if number(row[0], marks[1]) > TICKS else "ms"
     return Layout(marks, len(head), _with_units(names, units), clocks, unit)
 
 
@@ -128,25 +127,21 @@ def _labview(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) 
     names = _with_units(["" if name == "Comment" else name for name in head[-1]], rows.get("Y_Unit_Label", ()))
     clocks = tuple(i for i, name in enumerate(names) if name == "X_Value")
     if row[0]:
-        return Layout(marks, len(head), names, clocks)
-    dt = _number(next((text for text in rows["Delta_X"] if _kind(text, marks[1]) == 1), ""), marks[1])
+        return Layout(marks, len(head), names, clocks, "s")
+    dt = number(next((text for text in rows["Delta_X"] if _kind(text, marks[1]) == 1), ""), marks[1])
     return Layout(marks, len(head), tuple("" if name == "X_Value" else name for name in names), (), dt=dt)
 
 
 def _header(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -> Layout | None:
     """A header, maybe with a row of units under it, below lines of any kind."""
-    widths, block = {len(row), len(_trimmed(row))}, []
-    for fields in reversed([fields for fields in head if any(fields)]):
-        if len(_trimmed(fields)) not in widths:
-            break
-        block.insert(0, _trimmed(fields))
+    widths = {len(row), len(_trimmed(row))}
+    above = (fields for fields in map(_trimmed, reversed(head)) if fields)
+    block = [*takewhile(lambda fields: len(fields) in widths, above)]
     if not block:
         return None
-    names = _with_units(*block[:2]) if len(block) > 1 else tuple(block[0])
-    times = [i for i, name in enumerate(names) if TIME.match(name)]
-    match = TIME.match(names[times[0]]) if times else None
-    clocks = tuple(i for i in times if names[i] == names[times[0]])
-    return Layout(marks, len(head), names, clocks, ((match and match[1]) or "").lower())
+    names = _with_units(block[-1], block[-2] if len(block) > 1 else ())
+    times = [i for i, name in enumerate(names) if is_time(name)]
+    return Layout(marks, len(head), names, tuple(i for i in times if names[i] == names[times[0]]))
 
 
 DIALECTS = (_twincat, _labview, _header)
@@ -175,28 +170,29 @@ def _table(path: Path, lines: Sequence[str]) -> Iterator[Block]:
     if found is None:
         return
     width, rows = len(found.names), []
-    for number, line in enumerate(lines[found.first :], found.first + 1):
-        fields = _trimmed(split(line, found.marks[0]))
+    for at, line in enumerate(lines[found.first :], found.first + 1):
+        fields = _trimmed(_split(line, found.marks[0]))
         if fields == ["EOF"]:
             break
         if len(fields) > width:
             problem = f"found {counted(len(fields), 'field')} under {counted(width, 'name')}"
-            refuse(path, f"line {number}", problem, "name every column; mark columns and decimals differently")
-        rows += [[(number, text) for text in [*fields, *[""] * (width - len(fields))]]] if fields else []
-    named = [i for i, name in enumerate(found.names) if name and i not in found.clocks]
-    for clock in found.clocks or (None,):
-        inside = [
-            i for i in named if clock == max((c for c in found.clocks if c < i), default=(*found.clocks, None)[0])
-        ]
-        columns: dict[str, Cells] = {}
-        # a slower clock has fewer rows
-        full = [row for row in rows if clock is None or any(row[i][1] for i in (clock, *inside))]
-        for i in inside:
-            again = sum(found.names[i] == found.names[j] for j in named if j < i)
-            columns[found.names[i] + f" ({again})" * (again > 0)] = [row[i] for row in full]
-        if clock is not None:
-            t = _nanoseconds(path, found.names[clock], [row[clock] for row in full], found.unit, found.marks[1])
-            yield Block(found.names[clock], t, columns, found.marks[1])
+            refuse(path, f"line {at}", problem, "name every column; mark columns and decimals differently")
+        rows += [(at, fields + [""] * (width - len(fields)))] if fields else []
+    twice = Counter[str]()
+    names = list(found.names)
+    for i, name in enumerate(names):
+        twice[name] += 1
+        names[i] += f" ({twice[name] - 1})" * bool(name and twice[name] > 1)
+    for k, (start, end) in enumerate(pairwise((0, *found.clocks[1:], width))):
+        clock = found.clocks[k : k + 1]
+        inside = [i for i in range(start, end) if names[i] and i not in found.clocks]
+        full = [row for row in rows if not clock or any(row[1][i] for i in (*clock, *inside))]  # fewer of a slower one
+        column = {i: ([at for at, _ in full], [fields[i] for _, fields in full]) for i in (*clock, *inside)}
+        columns = {names[i]: column[i] for i in inside}
+        if clock:
+            name = found.names[clock[0]]
+            t = _nanoseconds(path, name, column[clock[0]], found.unit, found.marks[1])
+            yield Block(name, t, columns, found.marks[1])
         else:
             t = None if math.isnan(found.dt) else np.round(found.dt * SECOND * np.arange(len(rows))).astype(np.int64)
             yield Block("Delta_X", t, columns, found.marks[1])
@@ -205,20 +201,20 @@ def _table(path: Path, lines: Sequence[str]) -> Iterator[Block]:
 def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
     """CODESYS trace: for each variable `0.Variable; name`, then rows `; time; value`; bit 5 of `Flags`: us, else ms."""
     name, unit = "", "ms"
-    t: list[tuple[int, str]] = []
-    y: list[tuple[int, str]] = []
-    for number, line in enumerate([*lines, "end"], 1):
-        key, _, rest = line.partition(";")
-        if not key.strip() and ";" in rest:
-            at, _, value = rest.partition(";")
-            t.append((number, at.strip()))
-            y.append((number, value.strip()))
-            continue
-        if t:
-            yield Block("time", _nanoseconds(path, "time", t, unit, "."), {name: y}, ".")
-            t, y = [], []
-        name = rest.strip() if key.endswith("Variable") else name
-        unit = "us" if key == "Flags" and rest.strip().isdecimal() and int(rest) & 32 else unit
+    parts: dict[str, tuple[list[int], list[str], list[str]]] = {}
+    for at, line in enumerate(lines, 1):
+        key, *rest = _split(line, ";")
+        if not key and len(rest) == 2:
+            numbered, t, y = parts.setdefault(name, ([], [], []))
+            numbered.append(at)
+            t.append(rest[0])
+            y.append(rest[1])
+        elif key.endswith("Variable"):
+            name = " ".join(rest)
+        elif key == "Flags" and rest[0].isdecimal() and int(rest[0]) & 32:
+            unit = "us"
+    for name, (numbered, t, y) in parts.items():
+        yield Block("time", _nanoseconds(path, "time", (numbered, t), unit, "."), {name: (numbered, y)}, ".")
 
 
 def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
@@ -231,41 +227,22 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
 
 def _nanoseconds(path: Path, name: str, cells: Cells, unit: str, decimal: str) -> Int[np.ndarray, " row"]:
     """The times; ticks in whole numbers, of which floating point holds 16 digits."""
-    if empty := [line for line, text in cells if not text]:
-        refuse(path, f"line {empty[0]}, column {name!r}", "holds no time", "write it, or cut the row")
-    if cells and not math.isinf(seconds(cells[0][1])):
-        cells, unit = [(line, str(seconds(text))) for line, text in cells], "s"
-    t = _floats(path, name, cells, decimal)
+    t = numbers(path, name, *cells, False, True, decimal)
     if unit == "ticks":
-        whole = [int(text) if text.isdecimal() else int(x) for (_, text), x in zip(cells, t, strict=True)]
+        whole = [int(text) if text.isdecimal() else int(x) for text, x in zip(cells[1], t, strict=True)]
         return np.array([100 * (ticks - TICKS_1970) for ticks in whole])
-    return nanoseconds(path, f"column {name!r}", t, unit)
+    return nanoseconds(path, f"column {name!r}", t, unit or named_unit(name)[1])
 
 
-def _floats(path: Path, name: str, cells: Cells, decimal: str) -> Float[np.ndarray, " row"]:
-    out = np.empty(len(cells))
-    for k, (line, text) in enumerate(cells):
-        try:
-            out[k] = _number(text, decimal)
-        except ValueError:
-            hint = "write a number such as -0.125, or leave the field empty: a missing sample"
-            refuse(path, f"line {line}, column {name!r}", f"found {text!r}", hint)
-    return out
-
-
-def _number(text: str, decimal: str) -> float:
-    """A number, or a truth value of a PLC; NaN for an empty field."""
-    if decimal == ",":
-        text = text.replace(".", "?").replace(",", ".")
-    return float(_TRUTHS.get(text.upper(), text.replace("_", "?")) or "nan")
+def _split(line: str, mark: str) -> list[str]:
+    """The fields of a line, truth values of a PLC as numbers."""
+    return [_TRUTHS.get(text.upper(), text) for text in split(line, mark)]
 
 
 def _kind(text: str, decimal: str) -> int:
     """1 for a number, 0 for an empty field, -1 for a text."""
-    try:
-        return int(not math.isnan(_number(text, decimal)))
-    except ValueError:
-        return -1
+    value = number(text, decimal)
+    return -1 if math.isinf(value) else int(not math.isnan(value))
 
 
 def _trimmed(fields: Sequence[str]) -> list[str]:

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from ..data.dataset import Array, Dataset, horizon
+from ..data.dataset import Array, Dataset
 from ..data.logs import HELD, Logs
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
-from ..em.readings import reading_noise, resolution
+from ..em.readings import onset, reading_noise, resolution
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
 from ..fit.identify import begin
@@ -78,7 +78,7 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
     rows = min(data.valid.shape[1], _window(rig.dt) + 1)
-    head = Dataset(*(part[:SEQUENCES, :rows] for part in horizon(data, rows)))
+    head = _first(data, rows)
     along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
     return [
         *amount,
@@ -95,6 +95,14 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
 def _window(dt: float) -> int:
     """Rows that are smoothed with the first model."""
     return max(round(SECONDS / dt), LEAST)
+
+
+def _first(data: Dataset, rows: int) -> Dataset:
+    """The first rows of some sequences, from shortly before they move on."""
+    at = onset(np.asarray(data.y))[:SEQUENCES, None] + np.arange(rows)
+    inside, at = at < data.t.shape[1], np.minimum(at, data.t.shape[1] - 1)
+    head = Dataset(*(part[np.arange(len(at))[:, None], at] for part in data))
+    return head._replace(valid=head.valid & inside)
 
 
 def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:

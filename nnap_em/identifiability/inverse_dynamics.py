@@ -23,7 +23,7 @@ from scipy.optimize import lsq_linear
 from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..data.servo import TORQUE
-from ..em.build import reading_noise
+from ..em.readings import reading_noise
 from ..systems import AbstractSystem
 
 WIDTH, ORDER = 7, 4

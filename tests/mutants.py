@@ -343,8 +343,8 @@ MUTANTS = (
     Mutant(
         "prior missing from the posterior precision",
         "em/weights.py",
-        "jac + jnp.diag(self.precision(w)), jac",
-        "jac, jac",
+        "return self.symmetry(unknown, w) + own",
+        "return self.symmetry(unknown, w)",
         LEFT_OUT,
     ),
     Mutant(
@@ -988,8 +988,8 @@ MUTANTS = (
     Mutant(
         "the least likely of even laws is first",
         "diagnose/rounds.py",
-        "fit.model), case.gain))",
-        "fit.model), -case.gain))",
+        "return case.gain - PRICE",
+        "return -case.gain - PRICE",
         "test_rounds.py::test_refits_decide_between_laws_that_the_screen_cannot_tell_apart",
     ),
     Mutant(

@@ -90,7 +90,7 @@ def fit(bench) -> Path:
 def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys
-from nnap_em.commands import cli, common
+from nnap_em.commands import cli
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])

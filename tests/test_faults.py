@@ -40,6 +40,8 @@ from nnap_em.storage.journal import HERE, Journal, digest, keeping, step
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
 FOUND = {"identify": [], "diagnose": ["torsional_spring"]}
+DONE = (0, identify_command.MISFIT)
+"""A spring is missing: friction alone may not describe the motion."""
 IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
 
 
@@ -149,7 +151,7 @@ FAULTS: list[tuple[str, int | str]] = [
 def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, capsys):
     """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
     monkeypatch.setattr(identify_command, "identify", _toy_identify(load(whole["identify"] / "model.npz")))
-    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) == 0
+    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) in DONE
     capsys.readouterr()
     out, more, kept = tmp_path / "broken", (), 0
     for kind, when in FAULTS:
@@ -174,7 +176,7 @@ def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, ca
         assert steps >= kept  # nothing is lost
         more, kept = ("--resume",), steps
     assert kept == 12
-    assert cli.main(_order(IDENTIFY, rig, out, "--resume")) == 0
+    assert cli.main(_order(IDENTIFY, rig, out, "--resume")) in DONE
     assert "resumed with 12 finished steps" in capsys.readouterr().err
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
@@ -200,7 +202,7 @@ def whole(rig) -> dict[str, Path]:
     """Unbroken runs by the name of the command."""
     outs = {command[0]: rig.parent / f"whole {command[0]}" for command in (IDENTIFY, DIAGNOSE)}
     for command in (IDENTIFY, DIAGNOSE):
-        assert cli.main(_order(command, rig, outs[command[0]], "--quiet")) == 0
+        assert cli.main(_order(command, rig, outs[command[0]], "--quiet")) in DONE
     return outs
 
 
@@ -235,7 +237,7 @@ def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, w
     if command is DIAGNOSE:
         _answered_in_time(rig, out, capsys)
     code, said = _called(_order(command, rig, out, "--resume"), capsys)
-    assert code == 0 and "resumed" in said, said
+    assert code in DONE and "resumed" in said, said
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
     assert left == numbers(whole[command[0]])
@@ -253,7 +255,7 @@ def _answered_in_time(rig: Path, out: Path, capsys) -> None:
     """An answer after the first fit, since no more time is left, and what goes on from there."""
     steps = len(_steps(out))
     code, said = _called(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"), capsys)
-    assert code == 0 and re.search(r"\[\d+:\d\d over\] ", said), said
+    assert code in DONE and re.search(r"\[\d+:\d\d over\] ", said), said
     assert re.search(r"finished steps? kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
     report = json.loads((out / "report.json").read_text())
     assert not report["complete"] and not report["effects"]

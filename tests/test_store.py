@@ -18,7 +18,6 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.fit.identify import Identified, begin
-from nnap_em.fit.predict import smooth
 from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
@@ -114,20 +113,6 @@ def test_a_payload_of_a_file_from_before_it_had_a_centre_is_read(tmp_path):
     assert float(effect.values()["mass"]) == 0.04 and effect.moment is None
 
 
-def test_the_size_of_the_discrepancy_is_read_under_its_old_name(tmp_path):
-    path, rig = tmp_path / "model.npz", RIGS["slide"]
-    save(path, begin(rig, _data(rig), key=jax.random.key(5))._replace(discrepancy=0.25))
-
-    def older(header, arrays):
-        header["leaves"]["/unsaid"] = header["leaves"].pop("/discrepancy")
-
-    _rewrite(path, older)
-    fitted = load(path)
-    assert fitted.discrepancy == 0.25
-    with pytest.warns(DeprecationWarning, match="discrepancy"):
-        assert fitted.unsaid == 0.25
-
-
 @pytest.mark.parametrize("name", RIGS)
 def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     fitted = _fitted(name)
@@ -140,19 +125,6 @@ def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     assert (stored.fingerprint, stored.notes) == ("abc", notes)
     v = jnp.linspace(-3.0, 3.0, len(fitted.model.log_q) // 2)
     np.testing.assert_array_equal(stored.fitted.model.unknown(v), fitted.model.unknown(v))
-
-
-OLD = Path(__file__).parent / "data" / "model_of_91424ac.npz"
-"""Written by the code of commit 91424ac, before smoothers were kept; its notes hold what that code smoothed."""
-
-
-def test_a_model_of_an_older_version_smooths_as_it_did():
-    stored = read(OLD)
-    t = stored.fitted.rig.dt * np.arange(40)
-    data = Dataset(t[None], 0.1 * np.cos(t)[None, :, None], np.sin(3 * t)[None, :, None], np.ones((1, 40), bool))
-    mean = smooth(stored.fitted, data).state.mean[0, ::13]
-    np.testing.assert_allclose(mean, stored.notes["smoothed"], rtol=1e-9, atol=1e-12)  # other programs round otherwise
-    assert (stored.fitted.smoother.inflations, stored.fitted.state.epoch) == ((1.0,), 7)
 
 
 SMOOTHERS = {
@@ -316,8 +288,8 @@ def _lost_setting(header, arrays):
 
 
 MISFITS = {
-    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 1"),
-    "newer": (_set(format=2), "format 2"),
+    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 2"),
+    "newer": (_set(format=3), "format 3"),
     "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
     "header": (lambda header, _: header.pop("notes"), "lacks something"),
     "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),

@@ -64,12 +64,14 @@ def constant_readings(
             yield "late start" if late else "stuck", np.arange(run.first + (not late), run.end)
 
 
-def runs(y: Float[np.ndarray, " time"]) -> list[Run]:
-    """All readings as runs of equal ones, missing samples among them left out."""
+def runs(y: Float[np.ndarray, " time"], least: int = 1) -> list[Run]:
+    """All readings as runs of equal ones, missing samples among them left out; those of `least` rows or more."""
     k = np.flatnonzero(np.isfinite(y))
     new = np.append(True, np.diff(y[k]) != 0)[: k.size]
     last = np.append(new[1:], True)[: k.size]
-    return [Run(int(a), int(b) + 1) for a, b in zip(k[new], k[last], strict=True)]
+    first, end = k[new], k[last] + 1
+    long = end - first >= least
+    return [Run(a, b) for a, b in zip(first[long].tolist(), end[long].tolist(), strict=True)]
 
 
 def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, " time"]:
@@ -182,7 +184,7 @@ def quantum(y: Float[np.ndarray, " time"]) -> float:
     """
     step = np.abs(np.diff(y[np.isfinite(y)]))
     least = float(np.min(step, where=step > 0, initial=math.inf))
-    plateaus = [run for run in runs(y) if run.length >= 3]
+    plateaus = runs(y, least=3)
     near = [(a, b) for a, b in pairwise(plateaus) if b.first - a.end <= 3]
     steps = np.array([abs(y[b.first] - y[a.first]) for a, b in near])
     steps = steps[steps > 0]

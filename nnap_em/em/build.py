@@ -16,7 +16,7 @@ from ..model.state_space import MOST_STEPS, SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
-from .mstep import COARSE, ScoringMStep
+from .mstep import COARSE, STEP, ScoringMStep
 from .prior import ParameterPrior
 from .readings import RESTS, at_rest, reading_noise
 from .servos import LAG, build_servos, steps_of_sample, torque_along
@@ -191,9 +191,17 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
     y = np.asarray(data.y)
     rests = max((at_rest(y[..., i]) for i, name in enumerate(rig.measured) if name in system.coordinates), default=0.0)
-    coarse = COARSE if rests > RESTS else math.inf
-    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, coarse=coarse, shape=model.log_q, least=least)
+    coarse, reach = (COARSE, STEP * _driven(system, scales)) if rests > RESTS else (math.inf, math.inf)
+    mstep = ScoringMStep(
+        prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, shape=model.log_q, least=least
+    )
     return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
+
+
+def _driven(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " dof"]:
+    """Typical torque of the drive of each joint, or of what moves it where none does [N m, or N]."""
+    torque = scales.torque - loads(system)[1]
+    return np.where(torque > 1e-3 * scales.torque, torque, scales.torque)
 
 
 def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:

@@ -144,8 +144,7 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
     first = jax.tree.map(pick, first)
-    near = jnp.where(jnp.isfinite(rule.coarse), (STEP * core.unknown.scale) ** -2.0, 0.0)
-    near = jnp.repeat(near, weights.nodes.shape[1])
+    near = jnp.repeat(jnp.broadcast_to(rule.reach, core.unknown.scale.shape) ** -2.0, weights.nodes.shape[1])
     near = jnp.diag(jnp.concatenate([near, jnp.zeros(weights.prior.size, near.dtype)]))
     w = weights.fit(core.unknown, core.w, total.score, total.information + near, rule.iterations)
     hessian = _definite(total.information + weights.prior_precision(core.unknown))
@@ -159,7 +158,7 @@ def _definite(precision: Float[Array, "phi phi"]) -> Float[Array, "phi phi"]:
 
 
 STEP = 0.1
-"""Standard deviation of the change of a node's torque in one M-step on logs that rest [scales of the map].
+"""Standard deviation of the change of a node's torque in one M-step on logs that rest, in the torque of the drive.
 
 There only the slope of the map is determined, and a step by it alone would make friction a peak of many times its size,
 which no later step leaves. No fixed point moves.
@@ -198,6 +197,8 @@ class ScoringMStep(AbstractMStep):
     """`Weights.departure`: free."""
     coarse: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
     """The same while the horizon grows; finite where logs rest, which then do not determine more."""
+    reach: Float[Array, "*dof"] = eqx.field(default=math.inf, converter=jnp.asarray)
+    """Standard deviation of the change of a node's torque in one M-step [N m]; infinite but on logs that rest."""
     shape: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
@@ -222,10 +223,8 @@ class ScoringMStep(AbstractMStep):
         return (*(eqx.tree_at(lambda m: m.departure, self, width) for width in widths), self)
 
     def no_hessian(self, model) -> Float[Array, "phi phi"]:
-        """Zero precision of the torques at the nodes and the parameters."""
-        weights = self.weights(model)
-        size = weights.nodes.size + weights.prior.size
-        return jnp.zeros((size, size), weights.nodes.dtype)
+        """Prior precision of the torques at the nodes and the parameters."""
+        return self.weights(model).prior_precision(model.unknown)
 
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         """One step of Fisher scoring."""

@@ -1,6 +1,5 @@
 """Identification: from a declared rig and its logs to a fitted model in one call."""
 
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple, cast
 
@@ -49,12 +48,6 @@ class Identified(NamedTuple):
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
     rise: float = 0.0
     """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
-
-    @property
-    def unsaid(self) -> float:
-        """Old name of `discrepancy`."""
-        warnings.warn("Identified.unsaid is now Identified.discrepancy", DeprecationWarning, stacklevel=2)
-        return self.discrepancy
 
     @property
     def model(self) -> StateSpaceModel:

@@ -1,6 +1,5 @@
 """Signs that a fitted model does not describe its machine: random forces as large as the motion, numbers far off."""
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -75,11 +74,11 @@ def moved(fitted: Identified) -> list[Moved]:
 
 def misfits(fitted: Identified, data: Dataset, error: Mapping[str, Any] | None, test: Dataset | None) -> list[Misfit]:
     """Joints whose motion the fit takes for random; none where it predicts the test sequences all the same, or where
-    its epochs ended before it saw them whole.
+    its epochs ended before it came to rest.
 
     The random acceleration is the process noise of a rate in a step over the length of the step.
     """
-    if math.isinf(fitted.rise):
+    if fitted.rise:
         return []
     rig, system, dof = fitted.rig, fitted.model.system, len(fitted.model.system.rates)
     moving = measure_scales(rig, system, data).acceleration

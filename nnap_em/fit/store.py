@@ -31,21 +31,13 @@ from .identify import Identified, begin
 _GIVE = "give the model.npz that `nnap-em identify` wrote"
 KIND = Kind(
     "nnap_em fitted model",
-    1,
+    2,  # 1 had the precision of the network's weights in place of that of torques
     "model",
     _GIVE,
     f"{_GIVE}, from a copy that is whole",
     "identify again, or use the version that wrote it",
     "use another copy, or identify again",
 )
-
-
-LATER = ("/discrepancy", "/m_step/rough", "/m_step/least", "/memory", "/rise")
-"""Numbers that files from before they were kept do not have: as a new fit begins with."""
-
-
-RENAMED = {"/unsaid": "/discrepancy"}
-"""Plain numbers that files of before hold under another name."""
 
 
 MODEL, AFTER = "model.npz", "after.npz"
@@ -170,9 +162,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     rig = _rig(header["rig"])
     if rig.system not in systems:
         refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
-    stored: Mapping[str, Any] = header["leaves"]
-    leaves = {RENAMED.get(place, place): entry for place, entry in stored.items()}
-    arrays = {RENAMED.get(place, place): array for place, array in arrays.items()}
+    leaves: Mapping[str, Any] = header["leaves"]
     settings = header["settings"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
@@ -189,8 +179,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         if place not in leaves:
             # numbers that effects and models have had since
             since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest"))
-            later = place in LATER or (since and value is None)
-            return value if later else differs(place, "missing in the file")
+            return value if since and value is None else differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":

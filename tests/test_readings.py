@@ -1,8 +1,13 @@
 """Noise, codes and motion of readings, from logs whose truth is known."""
 
+import jax
 import numpy as np
 import pytest
 
+from nnap_em.data.dataset import pad
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.em.build import build
+from nnap_em.em.mstep import COARSE, RELEASES
 from nnap_em.em.readings import BEFORE, RESTS, at_rest, onset, reading_noise, resolution
 
 T = 0.01 * np.arange(600)
@@ -57,3 +62,20 @@ def test_a_horizon_begins_shortly_before_the_first_motion_of_any_sensor():
     moving, still = onset(y), onset(y[..., 1:])
     assert np.all(np.abs(moving - (300 - BEFORE)) <= 6)  # five rows ahead, and the first millimetres
     assert np.all(still == 0) and np.all(onset(_motion(0.0)[..., None]) == 0)
+
+
+def test_a_fit_of_logs_that_rest_begins_coarse_and_one_of_logs_that_move_does_not():
+    """Both are stored alike."""
+    slide = {"m": Declared(1.0, 0.0)}
+    rig = Rig("slide", "slide", slide, True, ("u",), (1,), 0.01, "sequence", ("x",), {}, {})
+    rules = []
+    for rest in (0.0, 4.5):
+        y = _motion(rest) + 1e-4 * np.random.default_rng(0).standard_normal((4, 600))
+        data = pad([(T, np.ones((600, 1)), each[:, None]) for each in y])
+        rules.append(build(rig, data, key=jax.random.key(0)).mstep)
+    moving, resting = rules
+    assert moving.stages() == (moving,) and np.all(np.isinf(moving.reach))
+    widths = [float(rule.departure) for rule in resting.stages()]
+    np.testing.assert_allclose(widths[:-1], COARSE * np.asarray(RELEASES))
+    assert np.isinf(widths[-1]) and 0 < float(resting.reach[0]) < 1.0  # a tenth of the drive, 1 N
+    assert moving.reach.shape == resting.reach.shape == (1,)

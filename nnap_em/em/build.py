@@ -191,7 +191,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
     y = np.asarray(data.y)
     rests = max((at_rest(y[..., i]) for i, name in enumerate(rig.measured) if name in system.coordinates), default=0.0)
-    coarse, reach = (COARSE, STEP * _driven(system, scales)) if rests > RESTS else (math.inf, math.inf)
+    coarse = COARSE if rests > RESTS else math.inf
+    reach = np.where(rests > RESTS, STEP * _driven(system, scales), math.inf)
     mstep = ScoringMStep(
         prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, shape=model.log_q, least=least
     )

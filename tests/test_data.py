@@ -172,8 +172,7 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path, columns):
 
 @pytest.mark.slow
 def test_every_shared_log_is_read_without_a_word(shared):
-    rests = "kr300"  # its joints lose some readings while they rest
-    paths = [path for path in data_sets(shared) if path.parent.name != rests]
+    paths = data_sets(shared)
     assert len(paths) > 10
     for path in paths:
         rig = read_rig(path, specs)

@@ -4,7 +4,7 @@ A joint that rests repeats a reading as well: only its motion contradicts the se
 """
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,7 +21,9 @@ _AHEAD = 3  # rows that a parabola through `_SIDE` rows is trusted beyond its en
 _SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
 _MORE = 4.0  # times a usual step, or a usual disagreement of two columns, that one must be to contradict a sensor
 _DELAY = 5  # rows by which a filtered rate may be late
-_REPEATS = 0.01  # share of other readings that repeat from which a column is coarse
+_SHORT = 0.002  # runs of two to four rows, per row, above which a column is coarse
+_SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
+_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise .2 % of the runs have as many
 _USUAL = 95  # percentile of the steps of a column
 
 
@@ -38,9 +40,9 @@ class Run(NamedTuple):
 
 
 def constant_readings(
-    name: str, readings: Columns, dt: float, limits: Collection[float]
+    name: str, readings: Columns, as_read: Columns, dt: float, limits: Collection[float]
 ) -> Iterator[tuple[str, Int[np.ndarray, " row"]]]:
-    """Saturated, stuck and late: kinds and rows."""
+    """Saturated, stuck and late: kinds and rows.  `as_read` has spikes, which may be motion."""
     y = readings[name]
     every = runs(y)
     first, end = np.array(every, int).reshape(-1, 2).T
@@ -49,7 +51,9 @@ def constant_readings(
         return
     others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
     usual = float(np.median(np.repeat(others, others)))
-    apart = _disagreement(name, readings, dt)
+    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= _SHORT * y.size
+    both = [_disagreement(name, columns, dt) for columns in (readings, as_read)]
+    apart = [each for each in both if each is not None]
     full = np.zeros(y.size, bool)
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
         at_limit = [every[i] for i in np.flatnonzero((y[first] == limit) & (lengths >= max(3, 2 * usual)))]
@@ -59,7 +63,8 @@ def constant_readings(
         yield FULL, np.flatnonzero(full)
     y = np.where(full, np.nan, y)
     for run in (every[i] for i in np.flatnonzero((lengths >= max(STILL, 3 * usual)) & ~full[first])):
-        if _jumps(y, run) or (_alive(y, run) if apart is None else _moves(y, run, apart, dt)):
+        silent = _dead(run, apart) or (noisy and _held(run, apart) and _alive(y, run))
+        if silent or _moves(y, run, apart, dt) or _jumps(y, run):
             late = run.first == np.flatnonzero(np.isfinite(readings[name]))[0]
             yield "late start" if late else "stuck", np.arange(run.first + (not late), run.end)
 
@@ -93,6 +98,8 @@ class _Apart(NamedTuple):
     """Way that shows no motion in a run from each row: steps, noise and delay."""
     walk: float
     """Standard deviation of the noise of an integrated rate over one row."""
+    other: Float[np.ndarray, " time"]
+    """The other column."""
     rate: bool
     """True where this column is the rate."""
 
@@ -101,12 +108,12 @@ def _disagreement(name: str, readings: Columns, dt: float) -> _Apart | None:
     """Integral of the rate against the coordinate; None where one of the two is missing."""
     rate = name.startswith("d") and name[1:] in readings
     q, w = (readings.get(other) for other in ((name[1:], name) if rate else (name, f"d{name}")))
-    if q is None or w is None or min(np.isfinite(q).mean(), np.isfinite(w).mean()) < 0.5:
+    if q is None or w is None or min(np.isfinite(q).sum(), np.isfinite(w).sum()) < 2:
         return None
     way, step = travel(w, dt) - bridge(q), 3 * quantum(q)
     if rate:
-        return _Apart(-way, np.full(q.size, step + 9 * noise(q)), 0.0, rate)
-    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), noise(w) * dt, rate)
+        return _Apart(-way, np.full(q.size, step + 9 * noise(q)), 0.0, q, rate)
+    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), noise(w) * dt, w, rate)
 
 
 def travel(rate: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " time"]:
@@ -115,14 +122,19 @@ def travel(rate: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " t
     return np.append(0.0, np.cumsum(dt * (w[1:] + w[:-1]) / 2))
 
 
-def _moves(y: Float[np.ndarray, " time"], run: Run, apart: _Apart, dt: float, sign: float = 0.0) -> bool:
-    """True where the other column shows that the joint moved meanwhile, more than the two usually disagree."""
+def _moves(y: Float[np.ndarray, " time"], run: Run, apart: Sequence[_Apart], dt: float, sign: float = 0.0) -> bool:
+    """True where the other column shows that the joint moved meanwhile, with and without its spikes."""
+    return len(apart) > 0 and all(_contradicts(y, run, each, dt, sign) for each in apart)
+
+
+def _contradicts(y: Float[np.ndarray, " time"], run: Run, apart: _Apart, dt: float, sign: float) -> bool:
+    """True where the two columns disagree within the run, far more than they usually do."""
     length = min(run.length, (y.size - run.length) // 2)
     if length < 2:
         return False
     away = _away(apart.way, _places(run.first, run.end - length), length)
     outside = np.append(_places(0, run.first - length), _places(run.end, y.size - length))
-    usual = float(np.percentile(np.abs(_away(apart.way, outside, length)).max(axis=1), 80)) if outside.size else 0.0
+    usual = float(np.median(np.abs(_away(apart.way, outside, length)).max(axis=1))) if outside.size else 0.0
     hole = _hole(y, run) * dt * length if apart.rate else 0.0
     least = float(apart.least[run.first]) + 6 * apart.walk * math.sqrt(length) + hole
     return float(np.max(sign * away if sign else np.abs(away))) > _MORE * usual + least
@@ -138,6 +150,20 @@ def _away(
 ) -> Float[np.ndarray, "place row"]:
     """The way within `length` rows from each place."""
     return way[first[:, None] + np.arange(length)] - way[first][:, None]
+
+
+def _held(run: Run, apart: Sequence[_Apart]) -> bool:
+    """True where the other column shows nothing: it is missing or, as a rate, held as well."""
+    other = apart[0].other[run.first : run.end] if apart else np.zeros(0)
+    return np.unique(other[np.isfinite(other)]).size <= (not apart or not apart[0].rate)
+
+
+def _dead(run: Run, apart: Sequence[_Apart]) -> bool:
+    """True where the coordinate of this rate was read and is masked: one sensor gives both."""
+    if not apart or not apart[0].rate:
+        return False
+    seen, read = (np.isfinite(each.other[run.first : run.end]) for each in apart)
+    return bool(2 * np.sum(read & ~seen) > run.length)
 
 
 def _hole(y: Float[np.ndarray, " time"], run: Run) -> float:
@@ -164,17 +190,23 @@ def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
 
 
 def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
-    """True where the readings right before and right after the run are noise, as elsewhere, far above their steps.
+    """True where the readings right before and right after the run are noise, as elsewhere: no creep, no steps.
 
-    A column in which other readings repeat is coarse, and silent at rest.
+    A value that is held again near by is that of an encoder between two steps.
     """
-    usual, step = noise(y), np.diff(np.delete(y, slice(run.first, run.end)))
-    if np.mean(step == 0) > _REPEATS or usual < 3 * quantum(y):
+    usual = noise(y)
+    around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
+    if usual < 3 * quantum(y) or np.sum(around < _SAME * usual) >= _REPEATS:
         return False
     sides = [part[np.isfinite(part)][:_SIDE] for part in (y[: run.first][::-1], y[run.end :])]
     sides = [side for side in sides if side.size >= 8]
     bend, turn = (np.array([np.std(np.diff(side, n)) for side in sides]) for n in (2, 3))
     return len(sides) > 0 and bool(np.all((bend > usual / 3) & (turn > bend)))
+
+
+def _steps(side: Float[np.ndarray, " row"]) -> Float[np.ndarray, " step"]:
+    """Sizes of the first steps of a side."""
+    return np.abs(np.diff(side[np.isfinite(side)][: _SIDE + 1]))
 
 
 def quantum(y: Float[np.ndarray, " time"]) -> float:
@@ -192,7 +224,7 @@ def quantum(y: Float[np.ndarray, " time"]) -> float:
     return max(least, usual) if math.isfinite(least) else 0.0
 
 
-def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apart: _Apart | None) -> bool:
+def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apart: Sequence[_Apart]) -> bool:
     """True where it went beyond its limit: by the other column, or by the motion before and after.
 
     A rate decides against the motion of its coordinate: a machine at a stop comes and goes as fast.
@@ -200,9 +232,9 @@ def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apa
     before, after = y[max(run.first - _SIDE, 0) : run.first], y[run.end : run.end + _SIDE]
     if np.isfinite(before).sum() < 5 or np.isfinite(after).sum() < 5:
         return False
-    if apart is not None:
+    if apart:
         moves = _moves(y, run, apart, dt, sign)
-        if moves or not apart.rate:
+        if moves or not apart[0].rate:
             return moves
     rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
     spread, coarse = noise(y), 4 * quantum(y)

@@ -1,9 +1,10 @@
-"""Every place of `tests/mutants.py` broken in turn: the table of docs/results/mutants.md.
+"""Every place of `tests/mutants.py` broken in turn: the list of docs/results/mutants.csv.
 
 python benchmarks/mutation.py [--share 1/1]
 """
 
 import argparse
+import csv
 import os
 import platform
 import sys
@@ -18,7 +19,7 @@ from mutants import MUTANTS, copy, run
 
 
 def main() -> None:
-    """Run the unbroken package, then every mutant, and print the table."""
+    """Run the unbroken package, then every mutant, and print the list."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--share", default="1/1", help="i/n: every n-th mutant from the i-th on")
     first, every = map(int, parser.parse_args().share.split("/"))
@@ -32,7 +33,8 @@ def main() -> None:
         sound = run(copy(Path(folder)), *tests)
     assert sound.passed >= len(tests) and not sound.failed, sound.said  # one of many cases counts as many
     print(f"Unbroken: {len(tests)} tests pass, {sound.passed} cases.\n")
-    print("| broken | in | test | |\n| --- | --- | --- | --- |", flush=True)
+    rows = csv.writer(sys.stdout, lineterminator="\n")
+    rows.writerow(["broken", "in", "test", "state"])
     killed = 0
     for mutant in share:
         with tempfile.TemporaryDirectory() as folder:
@@ -41,7 +43,8 @@ def main() -> None:
         killed += dead
         state = "red" if dead else "green" if outcome.passed else "does not run"
         test = mutant.test.removeprefix("test_").replace(".py::test_", ": ").replace("_", " ")
-        print(f"| {mutant.what} | `{mutant.file}` | {test} | {state} |", flush=True)
+        rows.writerow([mutant.what, mutant.file, test, state])
+        sys.stdout.flush()
         if not dead:
             print(outcome.said[-3000:], file=sys.stderr, flush=True)
     print(f"\n{killed} of {len(share)} turn their test red.")

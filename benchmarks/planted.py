@@ -25,7 +25,7 @@ from typing import Any
 
 from planted_cases import CASES, split
 from planted_make import ROOT, make
-from planted_table import score, table
+from planted_table import cases, score, table
 
 from nnap_em.storage.files import replace_text
 
@@ -103,7 +103,7 @@ def main() -> None:
     running.add_argument("--split", default="all", choices=("look", "kept", "all"))
     running.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th, for several processes")
     running.add_argument("--limit", type=float, default=1200.0, help="seconds for a case (1200)")
-    writing = commands.add_parser("table", help="what the records say, as Markdown")
+    writing = commands.add_parser("table", help="what the records say: sums as Markdown, every case as CSV beside it")
     writing.add_argument("folder", type=Path)
     writing.add_argument("--out", type=Path, help="write it here instead of printing it")
     args = arguments.parse_args()
@@ -125,8 +125,10 @@ def _do(args: argparse.Namespace) -> None:
                 done = score(run(name, args.out, args.limit), {})
                 print(f"{name}: {done.named} of {done.truths}, {done.extras} extra; {done.effects}", flush=True)
     if args.command == "table":
-        text = table(records(args.folder))
-        print(text) if args.out is None else replace_text(args.out, text)
+        every = records(args.folder)
+        print(table(every)) if args.out is None else replace_text(args.out, table(every))
+        if args.out is not None:
+            replace_text(args.out.with_suffix(".csv"), cases(every))
 
 
 if __name__ == "__main__":

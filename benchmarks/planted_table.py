@@ -7,6 +7,8 @@ Parameters are scored where the law has its own name: right within 15 % (angles:
 standard deviations.  An error is that of all measured angles together, root of the sum of squares [rad].
 """
 
+import csv
+import io
 import math
 import os
 import platform
@@ -274,7 +276,7 @@ def _head(names: Sequence[str]) -> list[str]:
 
 
 def table(records: Sequence[Entry]) -> str:
-    """All cases as Markdown: a summary by strength, the rigs as recorded, and every case."""
+    """Sums of all cases as Markdown: by strength, and of the rigs as recorded."""
     controls = {r["truth"]["rig"]: r for r in records if r["truth"]["strength"] == "none"}
     scores = {r["case"]: score(r, controls) for r in records}
     planted = [s for s in scores.values() if s.strength != "none"]
@@ -310,27 +312,34 @@ def table(records: Sequence[Entry]) -> str:
     for state, kept in (("as recorded", as_recorded), ("with planted effects", planted)):
         span = sum(r["log_seconds"] for r in records if scores[r["case"]] in kept)
         lines.append(f"- {state}: {sum(s.touches[2] for s in kept)} in {span:.0f} s of training recordings")
-    lines.append("")
-    lines += _head(CASE_COLUMNS)
-    for record in sorted(records, key=lambda r: (r["truth"]["strength"] == "none", r["case"])):
-        lines.append(_line(record, scores[record["case"]]))
     return "\n".join([*lines, ""])
 
 
-def _line(record: Entry, s: Score) -> str:
+def cases(records: Sequence[Entry]) -> str:
+    """Every case as CSV, those as recorded last."""
+    controls = {r["truth"]["rig"]: r for r in records if r["truth"]["strength"] == "none"}
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(CASE_COLUMNS)
+    for record in sorted(records, key=lambda r: (r["truth"]["strength"] == "none", r["case"])):
+        writer.writerow(_cells(record, score(record, controls)))
+    return out.getvalue()
+
+
+def _cells(record: Entry, s: Score) -> Sequence[str]:
     truth = "; ".join(
         f"{words(t)} ({_numbers(t['parameters'])}; {100 * t['share']:.0f} %)" for t in record["truth"]["effects"]
     )
     effects = record["report"]["effects"] if "report" in record else []
     reported = "; ".join(f"{words(e)} ({_numbers(e['parameters'])})" if e["parameters"] else words(e) for e in effects)
-    mark = "yes" if s.right and not s.extras else "with extras" if s.right else f"**{s.named} of {s.truths}**"
+    mark = "yes" if s.right and not s.extras else "with extras" if s.right else f"{s.named} of {s.truths}"
     if not s.truths:
-        mark = "**false**" if s.extras else "yes"
+        mark = "false" if s.extras else "yes"
     nothing = (math.nan,) * len(HORIZONS)
     sides = zip(*(side or nothing for side in (s.before, s.after, s.unplanted)), strict=True)
     error = ", ".join(" / ".join(f"{e:.3g}" for e in three) for three in sides)
     ratio = f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-"
-    cells = (
+    return (
         s.case,
         s.split,
         record["code"],
@@ -341,4 +350,3 @@ def _line(record: Entry, s: Score) -> str:
         ratio,
         f"{s.seconds:.0f}",
     )
-    return _row(cells)

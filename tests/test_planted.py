@@ -1,5 +1,7 @@
 """Planted effects: a model with the effect makes of the written log the motion that the real torque made."""
 
+import csv
+import io
 import tomllib
 from typing import ClassVar
 
@@ -10,7 +12,7 @@ import numpy as np
 import planted_make
 import pytest
 from planted_cases import CASES, CONTROLS, LAWS, PLANTED, REST, Plant, case_of, split
-from planted_table import score, table
+from planted_table import cases, score, table
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import check_split, read_logs
@@ -361,9 +363,13 @@ def test_the_table_counts_what_was_and_what_was_not_reported():
     true, entry = _true("spring", 2, k=0.3, theta0=0.1), _entry("torsional_spring", 2, k=0.3, theta0=0.1)
     failed = _record([true], []) | {"case": "r-y-strong", "failed": "not done after 1200 s"}
     del failed["report"]
-    text = table([_record([true], [entry]), failed, _record([], [_entry("dead_zone", 1, width=0.1)])])
+    every = [_record([true], [entry]), failed, _record([], [_entry("dead_zone", 1, width=0.1)])]
+    text = table(every)
     assert (
         "| strong | 2 | 1 of 2 | 1 of 2 | 0 of 2 | 1 of 1 | 1.00 (1) |" not in text
     )  # the control's error is the same
     assert "| strong | 2 | 1 of 2 | 1 of 2 | 0 of 2 | 1 of 1 | - | 2 of 2 | 2 of 2 | 1 of 2 | 1 |" in text
-    assert "not done after 1200 s" in text and "1 rigs, something reported on 1" in text
+    assert "1 rigs, something reported on 1" in text
+    rows = list(csv.DictReader(io.StringIO(cases(every))))
+    assert [row["right"] for row in rows] == ["yes", "0 of 1", "false"]
+    assert rows[1]["found"] == "not done after 1200 s"

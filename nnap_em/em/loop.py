@@ -226,7 +226,7 @@ def fit(
                 break
             state = _released(state)
         elif seen > schedule.horizon(max(state.epoch - 1, 0), longest):
-            state = _afresh(state) if state.stride < 1 else state._replace(top=np.full(state.top.size, -np.inf))
+            state = state._replace(top=np.full(state.top.size, -np.inf), stride=1.0)
         if seen == longest and state.stage < min(1, last):
             state = _released(state)
         rule, key = stages[state.stage], jax.random.fold_in(state.key, state.epoch)

@@ -37,7 +37,7 @@ def test_a_folder_imports_only_from_those_above_it(folder):
 def test_every_folder_is_in_the_order():
     folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
     assert folders == set(FOLDERS)
-    assert tuple(re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "README.md").read_text())) == FOLDERS
+    assert tuple(re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "CONTRIBUTING.md").read_text())) == FOLDERS
 
 
 def test_no_folder_has_the_name_of_a_public_function():

@@ -15,7 +15,7 @@ from nnap_em.em.local import local, locals_along, readings_along, readings_at
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import Quadratic, quadratic, spread
-from nnap_em.em.weights import AT_REST, COULOMB, Weights
+from nnap_em.em.weights import AT_REST, COULOMB, VISCOUS, Weights
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, FrictionNetwork, NoFriction
 from nnap_em.model.simulate import simulate
@@ -305,7 +305,7 @@ def test_the_symmetry_prior_is_that_of_an_offset_and_a_number_at_every_node_that
     assert even @ precision @ even == pytest.approx(even @ np.linalg.solve(covariance, even), rel=1e-9)
 
 
-def test_a_coarse_prior_lets_viscous_coulomb_and_constant_friction_be_and_holds_the_rest():
+def test_a_coarse_prior_lets_coulomb_and_constant_friction_be_hardly_holds_viscous_and_holds_the_rest():
     nodes = jnp.linspace(-2.0, 2.0, 11)[None]
     law = FixedFriction(lambda v: -jnp.sign(v), jnp.ones(1))
     free, held = (
@@ -315,12 +315,15 @@ def test_a_coarse_prior_lets_viscous_coulomb_and_constant_friction_be_and_holds_
         for departure in (jnp.asarray(np.inf), jnp.asarray(0.1))
     )
     v = np.asarray(nodes[0])
-    engineer = 0.3 * v + 2.0 * np.tanh(v / (COULOMB * 2.0)) - 0.7
-    np.testing.assert_allclose((held - free) @ engineer, 0.0, atol=1e-8)
+    coulomb = 2.0 * np.tanh(v / (COULOMB * 2.0)) - 0.7
+    np.testing.assert_allclose((held - free) @ coulomb, 0.0, atol=1e-8)
+    unit = np.linalg.qr(np.stack([np.ones(11), np.sign(v), v], axis=1))[0][:, 2]  # tanh is the sign at these nodes
+    assert unit @ (held - free) @ unit == pytest.approx(VISCOUS / 0.03**2, rel=1e-6)
     bump = np.exp(-((v - 1.2) ** 2)) - np.exp(-((v + 1.2) ** 2))
     base = np.linalg.qr(np.stack([v, np.sign(v), np.ones(11)], axis=1))[0]
     beside = bump - base @ (base.T @ bump)
-    assert bump @ (held - free) @ bump == pytest.approx(beside @ beside / 0.03**2, rel=1e-6)
+    expected = beside @ beside + VISCOUS * (unit @ bump) ** 2
+    assert bump @ (held - free) @ bump == pytest.approx(expected / 0.03**2, rel=1e-6)
 
 
 def test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows():

@@ -155,7 +155,12 @@ SMOOTHERS = {
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    top = _new(argparse.ArgumentParser, "Find which physical effect the model of a machine lacks, from its logs; identify friction, noise and numbers.", _MAIN, prog="nnap-em")
+    top = _new(
+        argparse.ArgumentParser,
+        "Find which physical effect the model of a machine lacks, from its logs; identify friction, noise and numbers.",
+        _MAIN,
+        prog="nnap-em",
+    )
     top.add_argument("--version", action="version", version=f"nnap-em {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
 

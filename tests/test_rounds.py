@@ -17,7 +17,7 @@ from nnap_em.diagnose.losses import MultiStep, OneStep
 from nnap_em.diagnose.rounds import screening_round
 from nnap_em.diagnose.screen import Screen, Screened
 from nnap_em.diagnose.smoothed import SmoothedFit
-from nnap_em.diagnose.trial import Refit
+from nnap_em.diagnose.trial import Trial
 from nnap_em.diagnose.verdict import Share
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
@@ -60,7 +60,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MU
         tried.append(law.name)
         removed = 1 - (errors or {}).get(law.name, 1 - screened.share.least)
         after = hypothesis.plus(law, screened.candidate)
-        return Refit(screened, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
+        return Trial(screened, after, removed, (gains or {}).get(law.name, 100.0), 12.0, np.inf)
 
     size = sum(len(s.candidate.probes) for s in entries)
     seen = Screen(tuple(entries), (np.eye(size),) * 2, (np.eye(3, 6, dtype=bool) if members is None else members,) * 2)

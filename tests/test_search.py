@@ -21,11 +21,11 @@ from nnap_em.diagnose.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnose.losses import MultiStep, OneStep, readings
 from nnap_em.diagnose.outcome import Step
 from nnap_em.diagnose.propose import seeded
-from nnap_em.diagnose.refit import Trial
+from nnap_em.diagnose.refit import Refit
 from nnap_em.diagnose.rounds import Round
 from nnap_em.diagnose.screen import Screened
 from nnap_em.diagnose.smoothed import SmoothedFit
-from nnap_em.diagnose.trial import Refit, certainty
+from nnap_em.diagnose.trial import Trial, certainty
 from nnap_em.diagnose.verdict import Share
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
@@ -214,7 +214,7 @@ def _pretend(monkeypatch, worth: dict[str, float]):
         "smooth",
         lambda context, hypothesis, length: (smoothed._replace(hypothesis=hypothesis), np.ones(6, bool)),
     )
-    monkeypatch.setattr(search, "fitted", lambda hypothesis, *_: Trial(hypothesis.model, RULE, None, np.zeros(6), None))
+    monkeypatch.setattr(search, "fitted", lambda hypothesis, *_: Refit(hypothesis.model, RULE, None, np.zeros(6), None))
     monkeypatch.setattr(MultiStep, "ratio", lambda self, null, full, *_: left(full.model) / left(null.model))
     monkeypatch.setattr(search, "extend", lambda context, hypothesis, length: _emstate(hypothesis.model, 1.0))
 
@@ -239,9 +239,9 @@ def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
     assert search._backward(_context(), hypothesis).found == ()
 
 
-def _case(law, removed: float = 0.5) -> Refit:
+def _case(law, removed: float = 0.5) -> Trial:
     screened = Screened(Candidate(law, (law,), law), np.ones(1), 1, Share(0.5, 0.4, (0.5,) * 3), 0, 0.15, 0.0, 100.0)
-    return Refit(screened, BARE.plus(law, screened.candidate), removed, 80.0, 12.0, np.inf)
+    return Trial(screened, BARE.plus(law, screened.candidate), removed, 80.0, 12.0, np.inf)
 
 
 def _rounds(monkeypatch, *laws):
@@ -270,7 +270,8 @@ def test_laws_are_added_until_none_is_accepted(monkeypatch):
     assert _names(hypothesis.model) == ["motor_gain", "air_drag"] and state is not None and complete
     assert [step.accepted is not None for step in steps] == [True, True, False]
     record = hypothesis.found[0]
-    assert (record.gain, record.removed, record.share) == (80.0, 0.5, 0.4) and np.isnan(record.held_out)
+    assert (record.removed, record.share, record.chance, record.parts) == (0.5, 0.4, 0.0, (3, 3))
+    assert np.isnan([record.gain, record.held_out, record.p_value]).all()  # a likelihood proves nothing there
 
 
 def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
@@ -392,7 +393,7 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
 def test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings():
     """Five nats in each of four sequences of 18 readings; a sequence that one of both loses does not count."""
     fit = SmoothedFit(BARE, BARE, None, DATA, np.array([1, 1, 1, 1, 1, 0], bool), 9)
-    null, full = (Trial(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
+    null, full = (Refit(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
     full.loglik[0] = np.nan
     assert readings(DATA, fit.used) == 90
     assert OneStep().ratio(null, full, fit, 0) == pytest.approx(1 - 2 * 20 / 72)

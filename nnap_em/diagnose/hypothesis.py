@@ -1,5 +1,6 @@
 """A model with what was added to it: every addition is one record of law, prior and evidence."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,17 +18,22 @@ from .keys import Key
 class Found(NamedTuple):
     """Evidence for an added effect."""
 
-    gain: float
-    """Log-likelihood over the model without it, where it was found [nat]."""
-    held_out: float
-    """Expected gain on parts left out of the fit of its strengths [nat]; NaN where many steps decided."""
-    p_value: float
+    gain: float = math.nan
+    """Log-likelihood over the model without it, where it was found [nat]; NaN where many steps decided, as the next."""
+    held_out: float = math.nan
+    """Expected gain on parts left out of the fit of its strengths [nat]."""
+    p_value: float = math.nan
     """P-value of the likelihood ratio, times the number of candidates tried."""
     equivalent: tuple[Key, ...] = ()
     """Effects that the data cannot distinguish from it."""
-    share: float = float("nan")
-    """Share of the multi-step error that it removes on recordings left out of its fit."""
-    removed: float = float("nan")
+    share: float = math.nan
+    """Share of the multi-step error that it removes on recordings left out of its fit; NaN where one step decided, as
+    the next."""
+    chance: float = math.nan
+    """Largest such share of any law whose columns are shifted in time."""
+    parts: tuple[int, ...] = ()
+    """Number of parts left out on which the error fell, and of all."""
+    removed: float = math.nan
     """Share of the squared error that its refit removed where it was found."""
 
 

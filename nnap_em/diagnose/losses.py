@@ -40,7 +40,7 @@ from ..prediction_error.multistep import (
 )
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
-from .refit import Trial
+from .refit import Refit
 from .smoothed import SmoothedFit
 from .verdict import MULTI_STEP, ONE_STEP, Bars
 
@@ -78,12 +78,12 @@ class AbstractLoss(eqx.Module):
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+    def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """A `trial` after what its fit by likelihood leaves to do."""
         return trial
 
     @abstractmethod
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Squared error of one fit over that of another, on the sequences that `fit` uses, at a band of horizons."""
 
 
@@ -132,12 +132,12 @@ class MultiStep(AbstractLoss):
             for band in bands
         )
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+    def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """The trial after Gauss-Newton steps on the multi-step errors."""
         along = finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
         return trial._replace(model=along.model, along=along)
 
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Ratio of robust squares, each fit along its own smoothed paths."""
         before, after = (errors(cast(Followed, t.along), self.judged[band]) for t in (null, full))
         return ratio(before, after, fit.used)
@@ -169,7 +169,7 @@ class OneStep(AbstractLoss):
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
 
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""
         gain = full.loglik - null.loglik
         both = fit.used & np.isfinite(gain)

@@ -28,7 +28,7 @@ HELD = 3
 """Passes with the noise as it is."""
 
 
-class Trial(NamedTuple):
+class Refit(NamedTuple):
     """A model after some passes."""
 
     model: StateSpaceModel
@@ -52,7 +52,7 @@ def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Ga
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
 
-@step(lambda model, m_step, path, *_, **__: Trial(model, m_step, path, HERE, HERE))
+@step(lambda model, m_step, path, *_, **__: Refit(model, m_step, path, HERE, HERE))
 def refit(
     model: StateSpaceModel,
     m_step: ScoringMStep,
@@ -61,7 +61,7 @@ def refit(
     used: Bool[np.ndarray, " seq"],
     *,
     passes: int = 5,
-) -> Trial:
+) -> Refit:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
 
     The process and reading noise stay as they are in the first passes, while the path finds its place: they would fit
@@ -91,4 +91,4 @@ def refit(
         core = between(base, goal, stride)
     assert best is not None
     _, core, loglik, hessian, path = best
-    return Trial(m_step.whole(model, core), m_step, path, loglik, hessian)
+    return Refit(m_step.whole(model, core), m_step, path, loglik, hessian)

@@ -16,7 +16,7 @@ from .keys import key_of
 from .losses import OneStep
 from .outcome import Closed
 from .propose import proposals, seeded, surroundings
-from .refit import Trial, refit
+from .refit import Refit, refit
 from .screen import screen
 from .smoothed import SmoothedFit
 from .verdict import EQUIVALENT_NATS, PRICE
@@ -110,7 +110,7 @@ def _total(fitted: Identified) -> float:
     return float(np.nansum(np.asarray(fitted.state.top))) - PRICE * numbers
 
 
-def _with(fitted: Identified, trial: Trial) -> Identified:
+def _with(fitted: Identified, trial: Refit) -> Identified:
     """The fit with the numbers of a trial."""
     state = fitted.state._replace(model=trial.model, best=trial.model, hessian=trial.hessian, top=trial.loglik)
     return fitted._replace(state=state, m_step=trial.m_step)

@@ -7,19 +7,20 @@ import numpy as np
 
 from ..effects import AbstractEffect, flat
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import share_of
 from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
 from .context import SearchContext
 from .keys import Key, completed, contains, free_signals, key_of, remainder_of, replaced, words
 from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
-from .refit import Trial
+from .refit import Refit
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
-from .trial import Refit, fitted, with_candidate
+from .trial import Trial, fitted, with_candidate
 from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, odds, required, suspected
 
-_Law = TypeVar("_Law", Screened, Refit)
+_Law = TypeVar("_Law", Screened, Trial)
 
 SUSPECTS = 4
 """Suspects that are listed: the right law was the fourth on a real arm with three recordings."""
@@ -30,7 +31,7 @@ class Round(NamedTuple):
 
     step: Step
     screen: Screen
-    accepted: Refit | None
+    accepted: Trial | None
     equivalent: tuple[Key, ...] = ()
     """Named laws that the data cannot distinguish from the accepted one."""
 
@@ -47,7 +48,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     disputed = _disputed(fresh, seen) if context.loss.predicts else ()
     step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, disputed)
     admitted = [s for s in ranked if s.reached]
-    tried: list[Refit] = []
+    tried: list[Trial] = []
     fitting = fit, context.loss, context.effort.passes
     try:
         null = fitted(fit.hypothesis, fit.path, *fitting) if admitted else None
@@ -59,7 +60,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             group = tied + _inside(tied, admitted, model)
             cases = []
             for s in group:
-                cases.append(with_candidate(s, cast(Trial, null), *fitting))
+                cases.append(with_candidate(s, cast(Refit, null), *fitting))
                 _log(cases[-1], context)
             tried += cases
             admissible = [case for case in cases if case.rejection is None]
@@ -73,7 +74,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
-def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
     """Choose among laws that the screen cannot distinguish.
 
     The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
@@ -99,7 +100,7 @@ def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
 
 
-def _priced(case: Refit) -> float:
+def _priced(case: Trial) -> float:
     """Gain in log-likelihood less the price of the law's numbers [nat]."""
     return case.gain - PRICE * flat(case.effect).size
 
@@ -172,19 +173,20 @@ def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
     return sorted(best.values(), key=_listed, reverse=True)
 
 
-def _log(case: Refit, context: SearchContext) -> None:
+def _log(case: Trial, context: SearchContext) -> None:
     """One line on a refit."""
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
-    share, reason = case.screened.share.least, case.rejection
+    share, reason, error = case.screened.share.least, case.rejection, "the squared error"
+    nats = "" if context.loss.predicts else f" ({case.gain:.0f} nat)"
     context.log(
-        f"  refitted {words(key_of(case.effect))} {values}: {share:.1%} of the squared error before the refit, "
-        f"{case.removed:.1%} after it ({case.gain:.0f} nat); bar {case.screened.bar:.1%}"
+        f"  refitted {words(key_of(case.effect))} {values}: {share_of(share, error, 1)} before the refit, "
+        f"{share_of(case.removed, error, 1)} after it{nats}; bar {case.screened.bar:.1%}"
     )
     if reason is not None:
         context.log(f"  {words(key_of(case.effect))} {reason.sentence}")
 
 
-def _removals(tried: Sequence[Refit]) -> tuple[tuple[Key, float], ...]:
+def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
     best: dict[Key, float] = {}
     for case in tried:
         key = key_of(case.effect)

@@ -5,7 +5,6 @@ import math
 import time
 from typing import Any, NamedTuple, cast
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
@@ -16,7 +15,7 @@ from ..data.rig import Rig
 from ..em.loop import EMState, FitError
 from ..fit.identify import Identified, finished, identify
 from ..model.state_space import StateSpaceModel
-from ..numerics.digits import counted
+from ..numerics.digits import counted, share_of
 from ..numerics.programs import release_programs
 from ..prediction_error.noise import white_readings
 from ..residual.innovations import white_innovations
@@ -33,8 +32,8 @@ from .outcome import Closed, Step
 from .quantised import quantised
 from .rivals import compare_equivalents
 from .rounds import Round, screening_round
-from .trial import Refit, fitted
-from .verdict import KEEP, Rejection, explains, needed
+from .trial import Trial, fitted
+from .verdict import FOLLOWED, KEEP, Rejection, explains, needed
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -55,17 +54,16 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     return _with(hypothesis, outcome.accepted, _evidence(outcome, context.loss), context)
 
 
-def _with(hypothesis: Hypothesis, case: Refit, evidence: Found, context: SearchContext) -> Hypothesis:
+def _with(hypothesis: Hypothesis, case: Trial, evidence: Found, context: SearchContext) -> Hypothesis:
     """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
-    m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, hypothesis.m_step.tie)  # under the old hold on noise
     remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
     place = remainder if form is None else form
     law = None if place is None else hypothesis.found[place]
     stays = law is None or (form is None and explains(law.removed, case.removed))
     if law is not None and not stays:  # over the model without the older law
         evidence = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))
-    following = case.after._replace(m_step=m_step, found=(*case.after.found[:-1], evidence))
+    following = case.after._replace(found=(*case.after.found[:-1], evidence))
     if stays or form is not None:  # its place is taken already
         return following
     context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
@@ -79,12 +77,15 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[Key, Any]]:
 
 def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
-    case = cast(Refit, outcome.accepted)
-    screened, directions = case.screened, max(case.screened.directions, 1)
-    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * outcome.step.tried)
-    left_out = screened.share.left_out
-    held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
-    return Found(case.gain, held_out, p_value, outcome.equivalent, share, case.removed)
+    case = cast(Trial, outcome.accepted)
+    screened, share = case.screened, case.screened.share
+    evidence = Found(equivalent=outcome.equivalent, removed=case.removed)
+    if loss.predicts:  # a likelihood proves nothing there
+        parts = sum(part > 0 for part in share.folds), len(share.folds)
+        return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
+    p_value = float(stats.chi2.sf(2 * max(case.gain, 0.0), max(screened.directions, 1))) * outcome.step.tried
+    held_out = 0.5 * share.left_out * screened.independent
+    return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
 def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
@@ -103,7 +104,8 @@ def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
         if needed(losses[least], floor):
             break
         name = words(key_of(hypothesis.model.effects[least]))
-        reason = f"without it {losses[least]:.1%} of the squared error is lost, {KEEP * floor:.1%} counts"
+        lost = share_of(losses[least], "the squared error", 1)
+        reason = f"without it {lost} is lost, {KEEP * floor:.1%} counts"
         context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
         hypothesis = hypothesis.without(least)
     return hypothesis
@@ -179,7 +181,7 @@ def _ladder(context: SearchContext) -> list[int]:
 def _first(context: SearchContext) -> int:
     """Rows of the first round by multi-step errors: all, or if most sequences diverge before, as many as most keep."""
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
-    most = [length for length, share in followed.items() if share >= 0.5]
+    most = [length for length, share in followed.items() if share >= FOLLOWED]
     return max(most, default=min(followed, default=context.longest))
 
 

@@ -14,13 +14,13 @@ from .hypothesis import Hypothesis, covariances
 from .keys import free_signals, replaced
 from .losses import AbstractLoss
 from .propose import seeded
-from .refit import Trial, refit
+from .refit import Refit, refit
 from .screen import Screened
 from .smoothed import SmoothedFit
 from .verdict import Rejection, veto
 
 
-class Refit(NamedTuple):
+class Trial(NamedTuple):
     """A hypothesis with one effect more (or another in the place of one), and the error that it removes."""
 
     screened: Screened
@@ -54,14 +54,14 @@ class Refit(NamedTuple):
         )
 
 
-def fitted(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
+def fitted(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
     """`hypothesis` after some passes from a path, finished before and after on the data of the loss."""
-    begun = Trial(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
+    begun = Refit(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
     begun = loss.finish(fit, begun)
     return loss.finish(fit, refit(begun.model, hypothesis.m_step.early(), path, fit.data, fit.used, passes=passes))
 
 
-def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
+def with_candidate(screened: Screened, null: Refit, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
     """A candidate in the model, or in the place of the law that it is another form of, refitted."""
     candidate, hypothesis = screened.candidate, fit.hypothesis
     effect = seeded(candidate, screened.coefficients)
@@ -72,7 +72,7 @@ def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: Abst
     gain = np.nan_to_num(trial.loglik, nan=-1e3) - np.nan_to_num(null.loglik, nan=-1e3)
     effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, trial.hessian)[-1]
     reported = estimates(effect, cov, after.model.system).get("amplitude")
-    return Refit(
+    return Trial(
         screened,
         after,
         1 - loss.ratio(null, trial, fit, screened.band),

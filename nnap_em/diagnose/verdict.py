@@ -1,12 +1,16 @@
-"""Every number that decides whether an effect enters a model or leaves it, and the decisions.
+"""Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
 The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
 candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
+Elsewhere, since folders before this one use them: READINGS (`prediction_error/noise.py`) and WHITE
+(`residual/innovations.py`), which choose the loss, and the bars of memory (`fit/memory.py`).
 """
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+
+from ..numerics.digits import share_of
 
 CHANCE = 2.0
 """Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three rounds."""
@@ -39,6 +43,16 @@ refit, which is not linear, differs from the screen by less than the rest."""
 SUSPECT = 0.5
 """Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
 candidates removed .02 and .07 of the multi-step error."""
+
+FOLLOWED = 0.5
+"""Share of the sequences that the first round follows: over the whole length, or as many rows as so many keep."""
+REPEATS = 0.2
+"""Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
+differ by up to .13, others by .25 and more."""
+COARSE = 0.1
+"""Variance of rounding to the steps of a reading, over that of its noise, from which on steps are an effect."""
+FINEST = 0.25
+"""Smallest share of an estimated variance of a reading that is noise beside the rounding in it."""
 
 
 class Bars(NamedTuple):
@@ -113,14 +127,15 @@ class Rejection(NamedTuple):
     @property
     def sentence(self) -> str:
         """The reason as a clause whose subject is the effect."""
-        return REASONS[self.code].format(self.value)
+        value = share_of(self.value, "the squared error", 1) if self.code == "small" else self.value
+        return REASONS[self.code].format(value)
 
 
 REASONS = {
     "impossible": "has a value without physical meaning after its refit",
     "uncertain": "is {:.1f} standard deviations from none after its refit",
     "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
-    "small": "removes {:.1%} of the squared error after its refit",
+    "small": "removes {} after its refit",
 }
 
 

@@ -14,7 +14,7 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
+from ..em.loop import AFTERWARDS, EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
 from ..em.mstep import ScoringMStep, kept
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
@@ -159,9 +159,10 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
-        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
+        top = np.where(np.asarray(info.used), np.asarray(posterior.loglik), np.nan)
+        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian, top=top))
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, 1))
+    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, AFTERWARDS))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 

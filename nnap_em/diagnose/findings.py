@@ -222,8 +222,9 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
     out = []
     for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
+        share = share_of(dispute.share, "the prediction error")
         text = (
-            f"{words(dispute.key)} would remove {share_of(dispute.share, 'the prediction error')}, but {listed(against)} "
+            f"{words(dispute.key)} would remove {share}, but {listed(against)} "
             f"{'shows' if len(against) == 1 else 'show'} the opposite ({_more(dispute.harm)})"
         )
         place, share = place_of(dispute.key), dispute.share

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..data.dataset import Dataset
-from ..effects import Candidate
+from ..effects import Candidate, flat
 from ..em.local import locals_along
 from ..em.quadratic import whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
@@ -42,7 +42,7 @@ from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
 from .refit import Refit
 from .smoothed import SmoothedFit
-from .verdict import MULTI_STEP, ONE_STEP, Bars
+from .verdict import EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, ONE_STEP, PRICE, Bars
 
 
 class Linearised(NamedTuple):
@@ -85,6 +85,12 @@ class AbstractLoss(eqx.Module):
     @abstractmethod
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Squared error of one fit over that of another, on the sequences that `fit` uses, at a band of horizons."""
+
+    @abstractmethod
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """Distance by which one law explains more than another in its place, both beside a fit without either, over
+        that within which they explain the same.
+        """
 
 
 class MultiStep(AbstractLoss):
@@ -142,6 +148,11 @@ class MultiStep(AbstractLoss):
         before, after = (errors(cast(Followed, t.along), self.judged[band]) for t in (null, full))
         return ratio(before, after, fit.used)
 
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """By the shares that both remove."""
+        own, its = (1 - self.ratio(null, one, fit, 0) for one in (full, other))
+        return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
+
 
 class OneStep(AbstractLoss):
     """Whitened innovations: efficient where they are white, as modelled."""
@@ -174,6 +185,12 @@ class OneStep(AbstractLoss):
         gain = full.loglik - null.loglik
         both = fit.used & np.isfinite(gain)
         return 1.0 - 2.0 * float(np.sum(gain[both])) / max(readings(fit.data, both), 1)
+
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """By likelihood, less the price of the numbers of a law."""
+        own, its = (sum(flat(effect).size for effect in one.model.effects) for one in (full, other))
+        gain = float(np.nansum((other.loglik - full.loglik)[fit.used]))
+        return (gain - PRICE * (its - own)) / EQUIVALENT_NATS
 
 
 def readings(data: Dataset, used) -> int:

@@ -15,7 +15,7 @@ from ..data.rig import Rig
 from ..em.loop import EMState, FitError
 from ..fit.identify import Identified, finished, identify
 from ..model.state_space import StateSpaceModel
-from ..numerics.digits import counted, share_of
+from ..numerics.digits import counted
 from ..numerics.programs import release_programs
 from ..prediction_error.noise import white_readings
 from ..residual.innovations import white_innovations
@@ -24,16 +24,16 @@ from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
 from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, renamed, silent
+from .backward import backward
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, remainder_of, replaced, words
-from .losses import AbstractLoss, MultiStep, OneStep, readings
+from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Closed, Step
 from .quantised import quantised
-from .rivals import compare_equivalents
 from .rounds import Round, screening_round
-from .trial import Trial, fitted
-from .verdict import FOLLOWED, KEEP, Rejection, explains, needed
+from .trial import Trial
+from .verdict import FOLLOWED, even
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -60,9 +60,10 @@ def _with(hypothesis: Hypothesis, case: Trial, evidence: Found, context: SearchC
     remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
     place = remainder if form is None else form
     law = None if place is None else hypothesis.found[place]
-    stays = law is None or (form is None and explains(law.removed, case.removed))
-    if law is not None and not stays:  # over the model without the older law
-        evidence = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))
+    both = None if law is None else 1 - (1 - law.removed) * (1 - case.removed)
+    stays = law is None or (form is None and 0 in even([law.removed, cast(float, both)]))
+    if not stays:  # over the model without the older law
+        evidence = evidence._replace(removed=cast(float, both))
     following = case.after._replace(found=(*case.after.found[:-1], evidence))
     if stays or form is not None:  # its place is taken already
         return following
@@ -88,45 +89,6 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
-    """Backward elimination: remove laws, the least needed first, without which a fit loses too little to count.
-
-    The models with and without a law are fitted in the same way, from their own smoothed paths.
-    """
-    while hypothesis.found:
-        fit, _ = smooth(context, hypothesis, context.longest)
-        if not fit.used.any():
-            break
-        full = fitted(hypothesis, fit.path, fit, context.loss, context.effort.passes)
-        losses = [_share_without(context, hypothesis, full, fit, place) for place in range(len(hypothesis.found))]
-        least = int(np.argmin(losses))
-        floor = context.loss.bars.floor(float(readings(fit.data, fit.used)))
-        if needed(losses[least], floor):
-            break
-        name = words(key_of(hypothesis.model.effects[least]))
-        lost = share_of(losses[least], "the squared error", 1)
-        reason = f"without it {lost} is lost, {KEEP * floor:.1%} counts"
-        context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
-        hypothesis = hypothesis.without(least)
-    return hypothesis
-
-
-def _share_without(context: SearchContext, hypothesis: Hypothesis, full, fit, place: int) -> float:
-    """Share of the squared error of a fit without an effect that the fit with it removes, at its best band."""
-    effect = hypothesis.model.effects[place]
-    if effect.read_off or any(remainder_of(other, hypothesis.model) == place for other in hypothesis.model.effects):
-        return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
-    if not effect.possible():
-        return -math.inf
-    reduced = hypothesis.without(place)
-    smoothed, _ = smooth(context, reduced, context.longest)
-    both = fit._replace(used=fit.used & smoothed.used)
-    if not both.used.any():  # without it no sequence is followed
-        return math.inf
-    trial = fitted(reduced, smoothed.path, both._replace(hypothesis=reduced), context.loss, context.effort.passes)
-    return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
-
-
 def search(context: SearchContext, *, white: bool) -> Closed:
     """Search for what the declared model lacks.
 
@@ -145,14 +107,7 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     if not hypothesis.found or state is None:
         return Closed(before, before, (), tuple(steps), complete=complete)
     outcome = finished(_outcome(before, hypothesis, state), data)
-    closed = Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
-    if one_step is None or not complete:  # to compare equivalents takes a fit for each
-        return closed
-    try:
-        return compare_equivalents(closed, data)
-    except FitError as error:
-        context.log(f"  equivalent laws could not be compared over the whole length ({error})")
-        return closed
+    return Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
 
 
 def _by_one_step(context: SearchContext, hypothesis: Hypothesis, state: EMState | None) -> "_Searched | None":
@@ -221,9 +176,9 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
                 searched.add(_names(hypothesis))
                 if _names(proposed) in searched:  # nothing new, or one law in the place of another and back
                     steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
-                    proposed = _backward(context, hypothesis)
-                    if proposed.found is hypothesis.found:
-                        return _Searched(hypothesis, state, steps)
+                    proposed = backward(context, hypothesis)
+                    if _names(proposed) == _names(hypothesis):
+                        return _Searched(hypothesis._replace(found=proposed.found), state, steps)
         except TimeUp:
             context.log("the time is up: the search is not finished")
             return _Searched(hypothesis, state, steps, complete=False)

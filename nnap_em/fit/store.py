@@ -179,7 +179,9 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         if place not in leaves:
             # numbers that effects and models have had since
             since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest", "/stop"))
-            return value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
+            return (
+                value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
+            )
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":

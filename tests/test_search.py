@@ -346,20 +346,22 @@ def test_one_step_errors_are_searched_where_the_fit_was_short():
 @pytest.mark.parametrize(
     ("white", "innovations", "losses", "complete"),
     [
-        (True, True, [OneStep], True),
-        (True, True, [OneStep], False),
-        (True, False, [OneStep, MultiStep], True),
+        (True, True, [MultiStep, OneStep], True),
+        (True, True, [MultiStep], False),  # the time was up before
+        (True, False, [MultiStep], True),
         (False, True, [MultiStep], True),
     ],
 )
-def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, white, innovations, losses, complete):
+def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
+    monkeypatch, white, innovations, losses, complete
+):
+    """They go on from what the errors of many steps found, and add the second law."""
     ran, cut = [], []
 
     def run(context, hypothesis, state, lengths):
         ran.append(type(context.loss))
-        one_step = isinstance(context.loss, OneStep)
-        laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (hypothesis, state)
-        return search._Searched(*laws, [], complete)
+        names = ("motor_gain", "dead_zone")[: len(ran)]
+        return search._Searched(_with(*names), _emstate(MODEL, 1.0), [], complete)
 
     def white_innovations(fitted, data):
         assert fitted.smoother.second() is None  # branches are not chosen by a model that may lack something
@@ -382,9 +384,8 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     outcome = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
-    assert ran == losses and len(outcome.found) == (white and innovations)
+    assert ran == losses and len(outcome.found) == len(losses) and outcome.complete == complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
-    assert outcome.complete == complete
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
 

@@ -90,11 +90,10 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
 
 
 def search(context: SearchContext, *, white: bool) -> Closed:
-    """Search for what the declared model lacks.
+    """Search for what the declared model lacks, by multi-step errors.
 
-    Where readings carry `white` noise, one-step errors are searched first, and the outcome is kept if its innovations
-    are white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors
-    decide, from the declared model on.
+    Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
+    many steps: of a model that lacks more they prove nothing.
     """
     before, data = context.before, context.data
     try:  # steps of readings as noise: they spoil the noise that all else leans on
@@ -102,23 +101,14 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
-    one_step = _by_one_step(context, *begun) if white else None
-    hypothesis, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
+    hypothesis, state, steps, complete = _search(context, *begun, [_first(context)])
+    if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
+        last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
+        hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     if not hypothesis.found or state is None:
         return Closed(before, before, (), tuple(steps), complete=complete)
     outcome = finished(_outcome(before, hypothesis, state), data)
     return Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
-
-
-def _by_one_step(context: SearchContext, hypothesis: Hypothesis, state: EMState | None) -> "_Searched | None":
-    """Outcome of a search by one-step errors; None where its innovations are not white, so that it proves nothing."""
-    searched = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
-    white = white_innovations(_outcome(context.before, searched.hypothesis, searched.state), context.data)
-    if not white:
-        context.log(
-            "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
-        )
-    return searched if white else None
 
 
 def _ladder(context: SearchContext) -> list[int]:

@@ -140,12 +140,10 @@ PARTS = 2
 def finished(fitted: Identified, data: Dataset) -> Identified:
     """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
 
-    Only where the noise of the readings is not that of the model: elsewhere one-step likelihood is efficient, and its
+    Where it does not and the noise of the readings is that of the model, one-step likelihood is efficient, and its
     curvature is its precision.
     """
     data = jax.device_put(data)
-    if white_readings(data, fitted.model):
-        return fitted
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
     if used.sum() < PARTS:
@@ -161,6 +159,8 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         top = np.where(np.asarray(info.used), np.asarray(posterior.loglik), np.nan)
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian, top=top))
+    elif white_readings(data, fitted.model):
+        return fitted
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
     stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, AFTERWARDS))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)

@@ -30,6 +30,7 @@ from nnap_em.diagnose.verdict import Share
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.loop import EMState
+from nnap_em.em.mstep import MStepInfo
 from nnap_em.fit.identify import Identified
 from nnap_em.model.state_space import with_effects
 from nnap_em.smoother.start import StartBank
@@ -441,3 +442,24 @@ def test_ratios_of_noise_are_held_at_those_of_the_first_model():
     moved = eqx.tree_at(lambda m: m.log_q, MODEL, jnp.asarray([-1.0, -9.0]))
     hypothesis = Hypothesis(moved, rule).plus(_law("motor_gain", 1.0), _candidate("motor_gain"))
     np.testing.assert_array_equal(hypothesis.m_step.shape, [-3.0, -4.0])
+
+
+def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
+    """A fifth of the declared standard deviation, and the declared one for all that is reported."""
+    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
+    held = search._held(rig)
+    assert held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
+    before = _context().before._replace(rig=held, smoother=search._unbranched(StartBank((1, 1), (0,))))
+    stds = []
+
+    def step(rule, model, posterior, data):
+        stds.append(float(rule.prior.std[0]))
+        return model, MStepInfo(jnp.full((1, 1), 7.0), np.ones(6, bool))
+
+    monkeypatch.setattr(search, "e_step", lambda *_, **__: None)
+    monkeypatch.setattr(type(RULE), "__call__", step)
+    monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
+    after = search._released(rig)(before, DATA)
+    assert stds == [pytest.approx(float(RULE.prior.std[0]) / 0.2)] and after.rig is rig
+    assert float(after.m_step.prior.std[0]) == stds[0] and float(after.state.hessian[0, 0]) == 7.0
+    assert after.model is before.model

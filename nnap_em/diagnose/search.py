@@ -3,17 +3,20 @@
 import dataclasses
 import math
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..em.loop import EMState, FitError
-from ..fit.identify import Identified, finished, identify
+from ..em.loop import EMState, FitError, e_step
+from ..fit.identify import Identified, begin, finished, identify
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.programs import release_programs
@@ -33,7 +36,7 @@ from .outcome import Closed, Step
 from .quantised import quantised
 from .rounds import Round, screening_round
 from .trial import Trial
-from .verdict import FOLLOWED, even
+from .verdict import FOLLOWED, HELD, even
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -89,8 +92,10 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def search(context: SearchContext, *, white: bool) -> Closed:
-    """Search for what the declared model lacks, by multi-step errors.
+def search(
+    context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified] = finished
+) -> Closed:
+    """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
 
     Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
     many steps: of a model that lacks more they prove nothing.
@@ -101,13 +106,15 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
-    hypothesis, state, steps, complete = _search(context, *begun, [_first(context)])
+    hidden = not set(before.model.system.coordinates) <= set(before.rig.measured)
+    lengths = _ladder(context) if hidden else [_first(context)]
+    hypothesis, state, steps, complete = _search(context, *begun, lengths)
     if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     if not hypothesis.found or state is None:
         return Closed(before, before, (), tuple(steps), complete=complete)
-    outcome = finished(_outcome(before, hypothesis, state), data)
+    outcome = release(_outcome(before, hypothesis, state), data)
     return Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
 
 
@@ -207,6 +214,9 @@ def close_the_loop(
     data = jax.device_put(data)
     stages: Stages = {}
 
+    white = white_readings(data, begin(rig, data, key=key).model)
+    held = rig if white else _held(rig)
+
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}
 
@@ -214,7 +224,7 @@ def close_the_loop(
             seen[rows] = (state, used)
             log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
-        outcome = identify(rig, part, key=key, smoother=_unbranched, watch=watch)
+        outcome = identify(held, part, key=key, smoother=_unbranched, watch=watch)
         stages.clear()  # a fit that fails leaves the stages of the one before
         stages.update(seen)
         return outcome
@@ -222,13 +232,38 @@ def close_the_loop(
     if len(data.t) < 2:
         log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
-    if white_readings(data, before.model):
+    if white:
         return _branching(search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True))
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
-    closed = search(SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), white=False)
+    context, release = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), _released(rig)
+    closed = search(context, white=False, release=release)
+    before = release(before, data)
+    closed = closed._replace(before=before, after=closed.after if closed.found else before)
     return _branching(closed._replace(interventions=disturbances, pieces=pieces))
+
+
+def _held(rig: Rig) -> Rig:
+    """The rig with its declared numbers nearly held: as they stand if nothing speaks against them."""
+    narrow = {name: dataclasses.replace(number, std=HELD * number.std) for name, number in rig.parameters.items()}
+    return dataclasses.replace(rig, parameters=narrow)
+
+
+def _released(rig: Rig) -> Callable[[Identified, Dataset], Identified]:
+    """End of fits whose numbers were held: they move under what is declared where that predicts what is left out."""
+
+    def release(fitted: Identified, data: Dataset) -> Identified:
+        rule, model = fitted.m_step, fitted.model
+        own = np.arange(rule.prior.size) < len(rule.prior.declared)
+        std = jnp.where(own, rule.prior.std / HELD, rule.prior.std)
+        rule = eqx.tree_at(lambda r: (r.prior.std, r.least), rule, (std, HELD * rule.least))
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+        _, info = rule(model, posterior, data)
+        state = fitted.state._replace(hessian=info.hessian)
+        return finished(fitted._replace(rig=rig, m_step=rule, state=state), data)
+
+    return release
 
 
 def _unbranched(bank: StartBank) -> GaussianSmoother:

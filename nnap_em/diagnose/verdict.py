@@ -51,6 +51,9 @@ SUSPECT = 0.5
 """Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
 candidates removed .02 and .07 of the multi-step error."""
 
+HELD = 0.2
+"""Standard deviation of declared numbers in a search by multi-step errors over the declared one: likelihood counts rows
+that follow each other as independent, and would bend the numbers by many of them to stand for what is missing."""
 FOLLOWED = 0.5
 """Share of the sequences that the first round follows: over the whole length, or as many rows as so many keep."""
 REPEATS = 0.2

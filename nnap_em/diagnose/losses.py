@@ -149,7 +149,7 @@ class MultiStep(AbstractLoss):
         return ratio(before, after, fit.used)
 
     def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
-        """By the shares that both remove."""
+        """Difference of the shares that both remove."""
         own, its = (1 - self.ratio(null, one, fit, 0) for one in (full, other))
         return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
 
@@ -187,7 +187,7 @@ class OneStep(AbstractLoss):
         return 1.0 - 2.0 * float(np.sum(gain[both])) / max(readings(fit.data, both), 1)
 
     def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
-        """By likelihood, less the price of the numbers of a law."""
+        """Difference in log-likelihood, less the price of the numbers of a law."""
         own, its = (sum(flat(effect).size for effect in one.model.effects) for one in (full, other))
         gain = float(np.nansum((other.loglik - full.loglik)[fit.used]))
         return (gain - PRICE * (its - own)) / EQUIVALENT_NATS

@@ -245,7 +245,7 @@ def close_the_loop(
 
 
 def _held(rig: Rig) -> Rig:
-    """The rig with its declared numbers nearly held: as they stand if nothing speaks against them."""
+    """The rig with its declared numbers nearly held."""
     narrow = {name: dataclasses.replace(number, std=HELD * number.std) for name, number in rig.parameters.items()}
     return dataclasses.replace(rig, parameters=narrow)
 

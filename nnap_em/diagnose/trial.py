@@ -71,7 +71,7 @@ def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: Abstra
 
 
 def fitted(start: Refit, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
-    """What was begun after some passes, and finished again."""
+    """A refit after some passes from where it was begun, finished again."""
     return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used, passes=passes))
 
 

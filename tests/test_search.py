@@ -383,6 +383,8 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
+    monkeypatch.setattr(search, "_released", lambda rig: search.finished)
+    monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     outcome = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
     assert ran == losses and len(outcome.found) == len(losses) and outcome.complete == complete
@@ -463,3 +465,14 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     assert stds == [pytest.approx(float(RULE.prior.std[0]) / 0.2)] and after.rig is rig
     assert float(after.m_step.prior.std[0]) == stds[0] and float(after.state.hessian[0, 0]) == 7.0
     assert after.model is before.model
+
+
+@pytest.mark.parametrize(("measured", "lengths"), [(("x", "dx"), [9]), (("dx",), [4, 6])])
+def test_where_a_joint_is_hidden_rounds_begin_at_short_horizons(monkeypatch, measured, lengths):
+    seen, context = [], _context()
+    context = context._replace(before=context.before._replace(rig=dataclasses.replace(RIG, measured=measured)))
+    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
+    monkeypatch.setattr(search, "_ladder", lambda _: [4, 6])
+    monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
+    search.search(context, white=False, release=lambda fitted, data: fitted)
+    assert seen == [lengths]

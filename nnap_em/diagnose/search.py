@@ -92,9 +92,7 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def search(
-    context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified] = finished
-) -> Closed:
+def search(context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified]) -> Closed:
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
 
     Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
@@ -233,7 +231,8 @@ def close_the_loop(
         log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
     if white:
-        return _branching(search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True))
+        context = SearchContext(before, stages, data, MultiStep(), effort, log, until=end)
+        return _branching(search(context, white=True, release=finished))
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")

@@ -91,10 +91,13 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
 
 
 def _in_place(context: SearchContext, law: Key, evidence: Found, fit: SmoothedFit, null: Null) -> Iterator[Trial]:
-    """Refits, in the place of a law, of its equivalents and of the same law elsewhere; of each the best candidate."""
+    """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: alone, it was
+    compared when the law was found.  Of each the best candidate.
+    """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows)
     keyed = [(key_of(candidate.start), candidate) for candidate in proposals(around, fit.model.effects)]
-    some = [candidate for key, candidate in keyed if key in evidence.equivalent or elsewhere(key, law)]
+    moved = bool(fit.model.effects)
+    some = [c for key, c in keyed if key in evidence.equivalent or (moved and elsewhere(key, law))]
     best: dict[Key, Screened] = {}
     for entry in screen(context.loss, fit, some, shifts=0).screened if some else ():
         key = key_of(entry.candidate.start)

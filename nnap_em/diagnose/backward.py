@@ -91,8 +91,8 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
 
 
 def _in_place(context: SearchContext, law: Key, evidence: Found, fit: SmoothedFit, null: Null) -> Iterator[Trial]:
-    """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: alone, it was
-    compared when the law was found.  Of each the best candidate.
+    """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: a law alone
+    was compared with that when it was found.  Of each the best candidate.
     """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows)
     keyed = [(key_of(candidate.start), candidate) for candidate in proposals(around, fit.model.effects)]

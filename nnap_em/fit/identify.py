@@ -43,7 +43,7 @@ class Identified(NamedTuple):
     smoother: AbstractSmoother
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     discrepancy: float = 0.0
-    """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
+    """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
     memory: str = ""
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
     rise: float = 0.0

@@ -297,7 +297,7 @@ class _CurvatureRule(NamedTuple):
         return None, SimpleNamespace(hessian=jnp.full((1, 1), _mass(model)), used=np.arange(4) < 3)
 
 
-def _finished(monkeypatch, error):
+def _finished(monkeypatch, error, white=False):
     """The outcome, `error` being that of a sequence by whether its model was fitted to it; the last one is lost."""
     used, masks = np.array([True, True, True, False]), []
 
@@ -310,7 +310,7 @@ def _finished(monkeypatch, error):
         each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
-    fakes = {"white_readings": lambda *_: False, "kept": lambda *_: used, "finish": finish, "errors": errors}
+    fakes = {"white_readings": lambda *_: white, "kept": lambda *_: used, "finish": finish, "errors": errors}
     fakes["followed"] = _followed
     fakes["e_step"] = lambda model, *_, **__: SimpleNamespace(state=PATH, loglik=np.full(4, _mass(model)))
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
@@ -329,8 +329,15 @@ def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch)
     np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
 
 
-def test_a_finish_that_helps_what_is_left_out_is_done_on_all(monkeypatch):
-    _, after, masks = _finished(monkeypatch, lambda fitted: 0.5)
+def test_white_readings_spare_the_wider_posterior_and_no_finish(monkeypatch):
+    """Where no finish helps, likelihood is efficient; they do not prove the physics."""
+    fitted, after, _ = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2, white=True)
+    assert after is fitted
+
+
+@pytest.mark.parametrize("white", [False, True])
+def test_a_finish_that_helps_what_is_left_out_is_done_on_all(monkeypatch, white):
+    _, after, masks = _finished(monkeypatch, lambda fitted: 0.5, white)
     np.testing.assert_array_equal(masks[-1], [True, True, True, False])
     assert _mass(after.model) == 10.0 + len(masks)
     assert float(after.state.hessian[0, 0]) == 2 * _mass(after.model), "the curvature is that of other weights"

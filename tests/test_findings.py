@@ -12,7 +12,7 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.findings import advice, disputes, entry, findings, suspected, undecided, verdict
+from nnap_em.diagnose.findings import advice, disputes, entry, estimates, findings, suspected, undecided, verdict
 from nnap_em.diagnose.hypothesis import Found, Hypothesis
 from nnap_em.diagnose.keys import key_of
 from nnap_em.diagnose.outcome import Closed, Disputed, Step, Suspect
@@ -95,6 +95,25 @@ def test_a_curve_has_the_units_of_its_machine():
 def test_a_tilted_base_and_a_biased_first_angle_are_listed_with_each_other(law, same):
     (finding,) = findings(_closed(ARM, law))
     assert set(finding.equivalent) == same
+
+
+def test_a_law_names_its_headline_number_first():
+    """The mass of a payload, before its centre, which may be surer."""
+    load = catalogue["payload"](jnp.asarray(0.4), jnp.zeros(3), (0.1, 0.0, 0.0), joint=2)
+    system = begin(ARM, _data(ARM), key=jax.random.key(0)).model.system
+    assert list(estimates(load, np.eye(4), system)) == ["mass", "centre_x", "centre_y", "centre_z"]
+
+
+def test_a_law_by_many_steps_has_shares_and_one_by_one_step_has_nats():
+    nats, shares = Found(100.0, 50.0, 1e-20), Found(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
+    for found, known in (
+        (nats, {"log_likelihood_gain", "held_out_gain", "p_value"}),
+        (shares, {"share_of_error", "chance"}),
+    ):
+        closed = _closed(ARM, _spring(2))
+        (finding,) = findings(closed._replace(found=(found,)))
+        numbers = {name for name, value in finding.evidence.items() if name != "parts" and np.isfinite(value)}
+        assert numbers == known and finding.evidence["parts"] == list(found.parts)
 
 
 def test_a_law_of_known_form_has_no_shape():

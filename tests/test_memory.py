@@ -1,6 +1,8 @@
 """Friction with memory: passive, odd, the static map in its limits; found and recovered where it is, and only there."""
 
+import inspect
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -12,6 +14,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
 from nnap_em.effects import Scene
 from nnap_em.em.build import build_system, measure_scales
+from nnap_em.fit import memory as memories
 from nnap_em.fit.identify import begin, friction_table, identify
 from nnap_em.fit.store import load, save
 from nnap_em.identifiability.check import Along, memory
@@ -234,3 +237,33 @@ def test_dynamic_friction_is_declared_and_written(tmp_path):
     write_rig(_rig(), tmp_path / "rig.toml")
     assert 'friction = "dynamic"' in (tmp_path / "rig.toml").read_text()
     assert read_rig(tmp_path / "rig.toml", specs) == _rig()
+
+
+def test_the_other_joints_are_tried_where_the_best_is_refused(monkeypatch):
+    """The second joint shows memory best and its contact predicts no better; the first still gets one."""
+    tried = []
+
+    def screen(model, rule, path, data, used, scales, distance, joints):
+        wald = np.zeros(3)
+        wald[list(joints)] = np.array([8.0, 9.0, 1.0])[list(joints)]
+        return memories.Screen(np.full(3, 0.1), wald, np.full(3, 0.5), np.full(3, 0.1))
+
+    def with_contact(fitted, bristle, *_, **__):
+        tried.append(bristle)
+        return fitted
+
+    system = SimpleNamespace(coordinates=("a", "b", "c"), force_unit=lambda j: "N m", unit=lambda name: "rad")
+    fit = SimpleNamespace(model=SimpleNamespace(system=system), rule=None, path=None, used=None, state=None)
+    one = np.ones(3)
+    monkeypatch.setattr(memories, "_smoothed", lambda *_: fit)
+    monkeypatch.setattr(memories, "sizes", lambda *_: memories.Sizes(one, 2 * one, one, one, one))
+    monkeypatch.setattr(memories, "screen", screen)
+    monkeypatch.setattr(memories, "contact", lambda model, scales, joint, level, distance: joint)
+    monkeypatch.setattr(memories, "_unseen", lambda *_: "the static map is kept, no memory")
+    monkeypatch.setattr(memories, "_with", with_contact)
+    monkeypatch.setattr(memories, "_judged", lambda fitted, trial, data: (tried[-1] == 1, "evidence"))
+    remember = inspect.unwrap(memories.remember)
+    out = remember(None, None, None, None, epochs=1, watch=None)
+    assert tried == [2, 1]
+    starts = ("memory (evidence)", memories.REFUSED, "the static map is kept, no")
+    assert [line.partition(": ")[2][: len(text)] for line, text in zip(out.sentences, starts, strict=True)] == [*starts]

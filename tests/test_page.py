@@ -170,6 +170,25 @@ def test_page_says_what_was_found_in_order():
     assert places == sorted(places)
 
 
+def test_tiles_show_what_changed_most_and_what_grows_is_no_success():
+    """Three joints, of which the third falls most and the second grows."""
+    before, after = (
+        {name: [x] for name, x in zip("abc", sizes, strict=True)} for sizes in ((1, 1, 1), (0.9, 1.4, 0.2))
+    )
+    error = {"given_s": 1.0, "horizons_s": [1.0], "before": before, "after": after}
+    html = page(WHOLE | {"error": error})
+    tiles = re.findall("error of ([abc]), 1 s ahead", html)
+    assert tiles == ["c", "b"]
+    assert '<td class="worse">1.4 × larger</td>' in html and '<td class="ratio">5.0 ×</td>' in html
+
+
+def test_evidence_by_many_steps_is_a_share_beside_chance():
+    evidence = {"share_of_error": 0.42, "chance": 0.031, "parts": [4, 5], "p_value": None, "log_likelihood_gain": None}
+    text = " ".join("".join(_parsed(page(WHOLE | {"effects": [EFFECT | {"evidence": evidence}]})).text).split())
+    assert "it removes 42 % of the error, on 4 of 5 parts of them. Columns shifted in time remove up to 3.1 %." in text
+    assert "by luck" not in text and "log-likelihood of" not in text
+
+
 def test_of_many_tests_all_that_fail_are_listed_and_of_the_others_a_part():
     bad, good = TEST | {"meaning": "It fails."}, TEST | {"p_value": 0.9, "meaning": "It holds."}
     text = "".join(_parsed(page(WHOLE | {"tests": {"before": 50 * [good, bad], "after": 60 * [good]}})).text)

@@ -13,23 +13,24 @@ from helpers import around, declared_model, slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.diagnose import backward, search
 from nnap_em.diagnose import context as context_of
-from nnap_em.diagnose import search
 from nnap_em.diagnose.context import EFFORT, SearchContext, ahead
 from nnap_em.diagnose.hypothesis import Found, Hypothesis, covariances
 from nnap_em.diagnose.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnose.losses import MultiStep, OneStep, readings
 from nnap_em.diagnose.outcome import Step
 from nnap_em.diagnose.propose import seeded
-from nnap_em.diagnose.refit import Trial
+from nnap_em.diagnose.refit import Refit
 from nnap_em.diagnose.rounds import Round
 from nnap_em.diagnose.screen import Screened
 from nnap_em.diagnose.smoothed import SmoothedFit
-from nnap_em.diagnose.trial import Refit, certainty
+from nnap_em.diagnose.trial import Null, Trial, certainty
 from nnap_em.diagnose.verdict import Share
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.loop import EMState
+from nnap_em.em.mstep import MStepInfo
 from nnap_em.fit.identify import Identified
 from nnap_em.model.state_space import with_effects
 from nnap_em.smoother.start import StartBank
@@ -205,16 +206,16 @@ def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypat
     assert context_of.extend(_context(loss), _with("motor_gain"), 9).top[0] == kept
 
 
-def _pretend(monkeypatch, worth: dict[str, float]):
-    """Fits whose squared error is one, less what each law of theirs is worth."""
+def _pretend(monkeypatch, worth: dict[str, float], others=()):
+    """Fits whose squared error is one, less what each law of theirs is worth; `others` come in the place of laws."""
     left = lambda model: 1 - sum(worth[name] for name in _names(model))  # noqa: E731
     smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
-    monkeypatch.setattr(
-        search,
-        "smooth",
-        lambda context, hypothesis, length: (smoothed._replace(hypothesis=hypothesis), np.ones(6, bool)),
-    )
-    monkeypatch.setattr(search, "fitted", lambda hypothesis, *_: Trial(hypothesis.model, RULE, None, np.zeros(6), None))
+    fit_of = lambda _, hypothesis, __: (smoothed._replace(hypothesis=hypothesis), np.ones(6, bool))  # noqa: E731
+    refit_of = lambda hypothesis, *_: Refit(hypothesis.model, RULE, None, np.zeros(6), None)  # noqa: E731
+    for module in (search, backward):
+        monkeypatch.setattr(module, "smooth", fit_of)
+    monkeypatch.setattr(backward, "null_of", lambda *arguments: Null(*2 * [refit_of(*arguments)]))
+    monkeypatch.setattr(backward, "_in_place", lambda *_: iter(others))
     monkeypatch.setattr(MultiStep, "ratio", lambda self, null, full, *_: left(full.model) / left(null.model))
     monkeypatch.setattr(search, "extend", lambda context, hypothesis, length: _emstate(hypothesis.model, 1.0))
 
@@ -224,24 +225,24 @@ def _pretend(monkeypatch, worth: dict[str, float]):
 def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, names, least, stays):
     """Of an error of one half .09, the smallest share that counts, are .045; without either the other is worth more."""
     _pretend(monkeypatch, {"motor_gain": 0.5, "dead_zone": least})
-    left = search._backward(_context(), _with(*names))
+    left = backward.backward(_context(), _with(*names))
     assert set(_names(left.model)) == {"motor_gain"} | ({"dead_zone"} if stays else set())
 
 
 def test_both_of_two_laws_go_that_are_worth_nothing(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.01, "dead_zone": 0.02})
-    assert search._backward(_context(), _with("motor_gain", "dead_zone")).found == ()
+    assert backward.backward(_context(), _with("motor_gain", "dead_zone")).found == ()
 
 
 def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
     _pretend(monkeypatch, {"dead_zone": 0.5})
     hypothesis = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
-    assert search._backward(_context(), hypothesis).found == ()
+    assert backward.backward(_context(), hypothesis).found == ()
 
 
-def _case(law, removed: float = 0.5) -> Refit:
+def _case(law, removed: float = 0.5) -> Trial:
     screened = Screened(Candidate(law, (law,), law), np.ones(1), 1, Share(0.5, 0.4, (0.5,) * 3), 0, 0.15, 0.0, 100.0)
-    return Refit(screened, BARE.plus(law, screened.candidate), removed, 80.0, 12.0, np.inf)
+    return Trial(screened, BARE.plus(law, screened.candidate), removed, 80.0, 12.0, np.inf)
 
 
 def _rounds(monkeypatch, *laws):
@@ -270,7 +271,8 @@ def test_laws_are_added_until_none_is_accepted(monkeypatch):
     assert _names(hypothesis.model) == ["motor_gain", "air_drag"] and state is not None and complete
     assert [step.accepted is not None for step in steps] == [True, True, False]
     record = hypothesis.found[0]
-    assert (record.gain, record.removed, record.share) == (80.0, 0.5, 0.4) and np.isnan(record.held_out)
+    assert (record.removed, record.share, record.chance, record.parts) == (0.5, 0.4, 0.0, (3, 3))
+    assert np.isnan([record.gain, record.held_out, record.p_value]).all()  # a likelihood proves nothing there
 
 
 def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
@@ -345,21 +347,22 @@ def test_one_step_errors_are_searched_where_the_fit_was_short():
 @pytest.mark.parametrize(
     ("white", "innovations", "losses", "complete"),
     [
-        (True, True, [OneStep], True),
-        (True, True, [OneStep], False),
-        (True, False, [OneStep, MultiStep], True),
+        (True, True, [MultiStep, OneStep], True),
+        (True, True, [MultiStep], False),  # the time was up before
+        (True, False, [MultiStep], True),
         (False, True, [MultiStep], True),
     ],
 )
-def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, white, innovations, losses, complete):
-    """Equivalent laws are compared where they decided, and there was time to end the search."""
-    ran, cut, compared = [], [], []
+def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
+    monkeypatch, white, innovations, losses, complete
+):
+    """They go on from what the errors of many steps found, and add the second law."""
+    ran, cut = [], []
 
     def run(context, hypothesis, state, lengths):
         ran.append(type(context.loss))
-        one_step = isinstance(context.loss, OneStep)
-        laws = (_with("motor_gain"), _emstate(MODEL, 1.0)) if one_step else (hypothesis, state)
-        return search._Searched(*laws, [], complete)
+        names = ("motor_gain", "dead_zone")[: len(ran)]
+        return search._Searched(_with(*names), _emstate(MODEL, 1.0), [], complete)
 
     def white_innovations(fitted, data):
         assert fitted.smoother.second() is None  # branches are not chosen by a model that may lack something
@@ -380,19 +383,96 @@ def test_one_step_errors_decide_where_noise_is_what_the_model_says(monkeypatch, 
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
-    monkeypatch.setattr(search, "compare_equivalents", lambda closed, data: compared.append(data) or closed)
+    monkeypatch.setattr(search, "_released", lambda rig: search.finished)
+    monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     outcome = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
-    assert ran == losses and len(outcome.found) == (white and innovations)
+    assert ran == losses and len(outcome.found) == len(losses) and outcome.complete == complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
-    assert bool(compared) == (white and innovations and complete) and outcome.complete == complete
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
 
 def test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings():
     """Five nats in each of four sequences of 18 readings; a sequence that one of both loses does not count."""
     fit = SmoothedFit(BARE, BARE, None, DATA, np.array([1, 1, 1, 1, 1, 0], bool), 9)
-    null, full = (Trial(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
+    null, full = (Refit(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
     full.loglik[0] = np.nan
     assert readings(DATA, fit.used) == 90
     assert OneStep().ratio(null, full, fit, 0) == pytest.approx(1 - 2 * 20 / 72)
+
+
+@pytest.mark.parametrize(("worth", "name"), [(0.5, "air_drag"), (0.55, "air_drag"), (0.56, "dead_zone")])
+def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth, name):
+    """Of a law that removes half of the error, by what removes more than ten ninths of that."""
+    law = _law("dead_zone", 1.0)
+    other = _case(law, worth)._replace(after=BARE.plus(law, _candidate("dead_zone")))
+    other = other._replace(refit=Refit(other.after.model, RULE, None, np.zeros(6), None))
+    _pretend(monkeypatch, {"air_drag": 0.5, "dead_zone": worth}, [other])
+    evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
+    hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
+    after = backward.backward(_context(), hypothesis)
+    assert _names(after.model) == [name]
+    same = () if name == "dead_zone" else evidence.equivalent
+    assert after.found[0].equivalent == same
+
+
+def test_an_equivalent_that_explains_clearly_less_is_none(monkeypatch):
+    law = _law("dead_zone", 1.0)
+    other = _case(law)._replace(
+        refit=Refit(BARE.plus(law, _candidate("dead_zone")).model, RULE, None, np.zeros(6), None)
+    )
+    _pretend(monkeypatch, {"air_drag": 0.5, "dead_zone": 0.4}, [other])
+    evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
+    hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
+    after = backward.backward(_context(), hypothesis)
+    assert after.found[0].equivalent == (key_of(_law("motor_gain")),)  # one that was not fitted stays
+
+
+def test_a_likelihood_pays_for_the_numbers_of_a_law_that_takes_a_place():
+    """Six nats in all, less three for three numbers more, over five."""
+    fit = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
+    models = [BARE.plus(law, Candidate(law, (law,), law)).model for law in (_law("motor_gain", 1.0), _spring())]
+    full, other = (
+        Refit(model, RULE, None, np.full(6, top), None) for model, top in zip(models, (1.0, 2.0), strict=True)
+    )
+    assert OneStep().lead(full, full, other, fit) == pytest.approx((6 - 3) / 5)
+
+
+def test_ratios_of_noise_are_held_at_those_of_the_first_model():
+    """A law that joins a fitted model does not make its noise the reference."""
+    rule = eqx.tree_at(lambda r: r.shape, RULE, jnp.asarray([-3.0, -4.0]), is_leaf=lambda leaf: leaf is None)
+    moved = eqx.tree_at(lambda m: m.log_q, MODEL, jnp.asarray([-1.0, -9.0]))
+    hypothesis = Hypothesis(moved, rule).plus(_law("motor_gain", 1.0), _candidate("motor_gain"))
+    np.testing.assert_array_equal(hypothesis.m_step.shape, [-3.0, -4.0])
+
+
+def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
+    """A fifth of the declared standard deviation, and the declared one for all that is reported."""
+    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
+    held = search._held(rig)
+    assert held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
+    before = _context().before._replace(rig=held, smoother=search._unbranched(StartBank((1, 1), (0,))))
+    stds = []
+
+    def step(rule, model, posterior, data):
+        stds.append(float(rule.prior.std[0]))
+        return model, MStepInfo(jnp.full((1, 1), 7.0), np.ones(6, bool))
+
+    monkeypatch.setattr(search, "e_step", lambda *_, **__: None)
+    monkeypatch.setattr(type(RULE), "__call__", step)
+    monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
+    after = search._released(rig)(before, DATA)
+    assert stds == [pytest.approx(float(RULE.prior.std[0]) / 0.2)] and after.rig is rig
+    assert float(after.m_step.prior.std[0]) == stds[0] and float(after.state.hessian[0, 0]) == 7.0
+    assert after.model is before.model
+
+
+@pytest.mark.parametrize(("measured", "lengths"), [(("x", "dx"), [9]), (("dx",), [4, 6])])
+def test_where_a_joint_is_hidden_rounds_begin_at_short_horizons(monkeypatch, measured, lengths):
+    seen, context = [], _context()
+    context = context._replace(before=context.before._replace(rig=dataclasses.replace(RIG, measured=measured)))
+    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
+    monkeypatch.setattr(search, "_ladder", lambda _: [4, 6])
+    monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
+    search.search(context, white=False, release=lambda fitted, data: fitted)
+    assert seen == [lengths]

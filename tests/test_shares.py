@@ -26,7 +26,7 @@ def _rows(error, columns, fold, block=None, overlap=1.0) -> Rows:
     block = fold if block is None else block
     count = int(np.max(block, initial=0)) + 1
     order = np.argsort(fold * count + block, kind="stable")
-    return Rows(error[order], columns[order], (fold * count + block)[order], count, overlap)
+    return Rows(error[order], columns[order], (fold * count + block)[order], count, overlap, np.ones(columns.shape[1]))
 
 
 def _share(rows: Rows, size: int, timed: bool = False):

@@ -43,8 +43,9 @@ def test_a_draw_of_a_parameter_moves_states_as_smoothing_with_it_does(case):
 def test_forces_unsaid_move_states_as_the_same_input_does(case):
     model, rule, data, path = case
     size = 0.4
-    every = stated.discrepancy_columns(model, rule.weights(model), path, data, np.ones(2, bool), key=KEY).force
-    draw = size * jax.random.normal(jax.random.fold_in(KEY, 1), (1, every.shape[1]))[0]
+    columns, kicks = jax.random.split(KEY)
+    every = stated.discrepancy_columns(model, rule.weights(model), path, data, np.ones(2, bool), key=columns).force
+    draw = size * jax.random.normal(kicks, (1, every.shape[1]))[0]
     pushed = data._replace(u=data.u + jnp.einsum("c,sctd->std", draw, every))
     moved = _path(model, pushed).mean - path.mean
     still = jnp.zeros((1, rule.weights(model).nodes.size + 1))

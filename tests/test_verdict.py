@@ -1,4 +1,4 @@
-"""Every number that decides whether an effect enters a model or leaves it, from both sides."""
+"""Numbers that decide whether an effect enters a model or leaves it, from both sides."""
 
 import math
 
@@ -15,16 +15,19 @@ from nnap_em.diagnose.verdict import (
     ONE_STEP,
     REASONS,
     SUSPECT,
+    Rejection,
     Share,
-    admissible,
     agreed,
-    explains,
+    even,
     needed,
     odds,
     required,
+    sensible,
+    simplest,
     suspected,
     veto,
 )
+from nnap_em.numerics.digits import share_of
 
 FALLS = (0.3, 0.3, 0.3, 0.3)
 
@@ -77,15 +80,37 @@ def test_a_function_that_answers_a_disturbance_removes_the_floor_on_every_part(l
     ],
 )
 def test_a_multiple_of_a_law_that_is_not_linear_is_near_its_probe(multiple, linear, fine):
-    assert admissible(Share(0.3, 0.3, FALLS), 0.15, multiple, linear=linear, answers=False) == fine
+    assert sensible(multiple, 0.0, 1.0, linear=linear) == fine
+
+
+@pytest.mark.parametrize(("far", "survived", "fine"), [(2.9, 0.06, True), (3.1, 0.06, False), (2.9, 0.04, False)])
+def test_a_law_far_beyond_its_prior_or_within_the_span_of_the_nuisance_is_none(far, survived, fine):
+    """A scale of a sensor of 3.07 is 4.1 standard deviations of its prior from 1."""
+    assert sensible(1.0, far, survived, linear=True) == fine
 
 
 def test_a_remainder_comes_before_a_named_law_and_that_before_a_free_one():
-    remainder, named, one, two = odds(1, remainder=True), *(odds(n, remainder=False) for n in range(3))
+    remainder, named, one, two = map(odds, (-1, 0, 1, 2))
     assert NAMED == 0.6
     assert named == pytest.approx(NAMED * remainder)
     assert one == pytest.approx(NAMED * named)
     assert two == pytest.approx(NAMED * one)
+
+
+@pytest.mark.parametrize(
+    ("values", "chosen"),
+    [
+        ((0.5, 0.46, 0.4), 1),  # nine tenths of the best, and simpler
+        ((0.5, 0.44, 0.4), 0),
+        ((0.5, 0.46, 0.45), 1),  # the simplest of three
+        ((0.5, 0.1, 0.1), 0),
+    ],
+)
+def test_the_simplest_law_counts_that_explains_nine_tenths_of_the_best(values, chosen):
+    assert EQUIVALENT == 0.9
+    assert simplest(values, (2, 0, 1), values) == chosen
+    assert simplest((0.5, 0.5), (0, 0), (1.0, 2.0)) == 1
+    assert even((0.5, 0.46, 0.44)) == [0, 1]
 
 
 def test_a_law_without_a_name_has_higher_bars():
@@ -94,7 +119,7 @@ def test_a_law_without_a_name_has_higher_bars():
     assert required(0.15, 3) == pytest.approx(0.25 / 0.36)
 
 
-SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "signals": 0}
+SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "complexity": 0}
 
 
 @pytest.mark.parametrize(
@@ -111,8 +136,8 @@ SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 
         ({"removed": 0.089}, "small"),
         ({"removed": math.nan}, "small"),
         ({"removed": 0.03, "floor": 0.04}, None),
-        ({"removed": 0.151, "signals": 1}, None),
-        ({"removed": 0.149, "signals": 1}, "small"),  # many numbers fit many things a little
+        ({"removed": 0.151, "complexity": 1}, None),
+        ({"removed": 0.149, "complexity": 1}, "small"),  # many numbers fit many things a little
     ],
 )
 def test_a_refit_vetoes_what_is_impossible_uncertain_or_small(numbers, code):
@@ -130,13 +155,6 @@ def test_what_is_lost_without_an_effect_is_most_of_the_floor():
     assert needed(0.09, 0.15) and not needed(0.0899, 0.15) and not needed(math.nan, 0.15)
 
 
-@pytest.mark.parametrize(("more", "stays"), [(0.1, True), (0.12, False)])
-def test_a_named_law_stays_beside_a_remainder_that_adds_a_tenth_at_most(more, stays):
-    """Half of the error goes with the law, and `more` of the other half with its remainder."""
-    assert EQUIVALENT == 0.9
-    assert explains(0.5, more) == stays
-
-
 @pytest.mark.parametrize(
     ("share", "chance", "listed"),
     [(0.075, 0.0, True), (0.074, 0.0, False), (0.12, 0.06, True), (0.12, 0.061, False), (0.9, 0.46, False)],
@@ -144,3 +162,9 @@ def test_a_named_law_stays_beside_a_remainder_that_adds_a_tenth_at_most(more, st
 def test_a_suspect_removes_half_of_the_floor_and_twice_what_chance_does(share, chance, listed):
     assert (SUSPECT, CHANCE) == (0.5, 2.0)
     assert suspected(share, 0.15, chance) == listed
+
+
+def test_a_share_beyond_one_is_no_percentage():
+    assert Rejection("small", 0.05).sentence == "removes 5.0% of the squared error after its refit"
+    assert "none of the squared error, which grows to 3.20 times itself" in Rejection("small", -2.2).sentence
+    assert share_of(1.203, "the error") == "more than all of the error"

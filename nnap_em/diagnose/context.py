@@ -1,6 +1,8 @@
 """Constants of a search, and its two long steps: smooth a hypothesis, and extend its fit to the whole length."""
 
+import functools
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -15,7 +17,7 @@ from ..em.mstep import kept
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
-from ..prediction_error.multistep import JUDGED, errors, followed, ratio
+from ..prediction_error.multistep import FALLS, JUDGED, errors, followed, ratio
 from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss
@@ -110,74 +112,92 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
 
 
 def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMState:
-    """EM of `hypothesis` from a horizon of `first` rows to the whole length."""
+    """EM of `hypothesis` from a horizon of `first` rows to the whole length, from the start that gives the best fit.
+
+    It starts from the hypothesis; or, where that is likelier over the first horizon, from friction and noise as
+    declared; and once more with looser noise where sequences diverge that the model without the law follows.
+    """
     before, longest = context.before, context.longest
     schedule = Schedule(first=min(first, longest), growth=1.6, hold=1)
     growing = math.ceil(math.log(longest / schedule.first) / math.log(1.6)) if longest > schedule.first else 0
+    rule, fits, failure = hypothesis.m_step, [], FitError("no start")
 
     def run(model: StateSpaceModel) -> EMState:
-        begun = later_state(model, hypothesis.m_step, key=before.state.key)
-        return fit(begun, context.data, before.smoother, hypothesis.m_step, epochs=growing + 8, schedule=schedule)
+        begun = later_state(model, rule, key=before.state.key)
+        return fit(begun, context.data, before.smoother, rule, epochs=growing + 8, schedule=schedule)
 
-    def looser(model: StateSpaceModel) -> StateSpaceModel:
-        return eqx.tree_at(lambda m: m.log_q, model, model.log_q + LOOSER)
-
-    try:
-        state = run(hypothesis.model)
-    except FitError:
-        state = run(looser(hypothesis.model))
-    if np.isfinite(before.state.top).sum() > np.isfinite(state.top).sum():
-        try:  # sequences that the model without it follows diverge
-            other = run(looser(cast(StateSpaceModel, state.best)))
-            state = other if ahead(other.top, state.top) > 0 else state
-        except FitError:
-            pass
-    other = _afresh(context, hypothesis)
-    state = other if other is not None and ahead(other.top, state.top) > 0 else state
-    if context.loss.predicts:
-        state = _predicting(context, hypothesis, state)
-    reached = np.nanmean(state.top)
-    epochs = counted(state.epoch - 1, "epoch")
-    context.log(f"  fitted over the whole length in {epochs}: log-likelihood {reached:.1f} nat per sequence")
+    afresh = _afresh(context, hypothesis)
+    for start in (lambda: run(hypothesis.model), *([afresh] if afresh else []), lambda: run(_looser(hypothesis, fits))):
+        try:
+            fits.append(start())
+        except FitError as error:
+            failure = error
+        if fits and not _loses(fits, before.state) and (len(fits) > 1 or not afresh):
+            break
+    if not fits:
+        raise failure
+    state = _best(context, hypothesis, fits)
+    epochs, reached = counted(state.epoch - 1, "epoch"), np.nanmean(state.top)
+    context.log(
+        f"  fitted over the whole length in {epochs} ({state.stop}): log-likelihood {reached:.1f} nat per sequence"
+    )
     return state
 
 
-def _afresh(context: SearchContext, hypothesis: Hypothesis) -> EMState | None:
+def _loses(fits: Sequence[EMState], before: EMState) -> bool:
+    """True where sequences that another model follows diverge in all fits."""
+    return all(np.isfinite(state.top).sum() < np.isfinite(before.top).sum() for state in fits)
+
+
+def _looser(hypothesis: Hypothesis, fits: Sequence[EMState]) -> StateSpaceModel:
+    """The last model that was fitted, or the hypothesis, with more noise of the process."""
+    model = cast(StateSpaceModel, fits[-1].best) if fits else hypothesis.model
+    return eqx.tree_at(lambda m: m.log_q, model, model.log_q + LOOSER)
+
+
+def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMState] | None:
     """Fit with friction and noise from their start, and the same laws; None where `hypothesis` is likelier at first.
 
     Friction that was fitted without a law may stand in its place, too steep for the step of the integration, and no
     step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within .07 rad/s.
     """
     before = context.before
-    declared = begin(before.rig, context.data, key=before.state.key)
-    rule = eqx.tree_at(lambda rule: rule.centre, declared.m_step, hypothesis.m_step.centre)  # that of the first fit
-    weights = rule.weights(declared.model)
-    fresh = Hypothesis(weights.write(declared.model, weights.middle()), rule).having(hypothesis.additions)
-    brief = horizon(context.data, SCHEDULE.first)
-    state = start_state(fresh.model, fresh.m_step, key=before.state.key)
+    start = begin(before.rig, context.data, key=before.state.key)
+    rule = eqx.tree_at(lambda rule: rule.centre, start.m_step, hypothesis.m_step.centre)  # that of the first fit
+    weights = rule.weights(start.model)
+    fresh = Hypothesis(weights.write(start.model, weights.middle()), rule).having(hypothesis.additions)
+    brief, state = horizon(context.data, SCHEDULE.first), start_state(fresh.model, fresh.m_step, key=before.state.key)
     try:
         state = fit(state, context.data, before.smoother, fresh.m_step, epochs=SCHEDULE.at_first)
-        own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)
-        if ahead(state.top, np.asarray(own.loglik)) <= 0:
-            return None
-        context.log("  friction as declared is the likelier start over the first horizon: the fit begins there")
-        return fit(state, context.data, before.smoother, fresh.m_step)
     except FitError:
         return None
+    own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)
+    if ahead(state.top, np.asarray(own.loglik)) <= 0:
+        return None
+    context.log("  friction as declared is the likelier start over the first horizon: a fit begins there, too")
+    return lambda: fit(state, context.data, before.smoother, fresh.m_step)
 
 
-def _predicting(context: SearchContext, hypothesis: Hypothesis, state: EMState) -> EMState:
-    """A fit, or that of the model it began from where that predicts better.
-
-    EM, by one-step likelihood, may go away from what the errors of many steps had taught.
+def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState]) -> EMState:
+    """The likeliest of some fits; where many steps decide the one that predicts best, or if that is better the
+    hypothesis as it stands: EM, by one-step likelihood, may leave what the errors of many steps had taught.
     """
-    reached = hypothesis.refitted(cast(StateSpaceModel, state.best))
-    (a, one), (b, other) = (smooth(context, each, context.longest) for each in (hypothesis, reached))
-    if not (one & other).any():
+    state = functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, fits)
+    if not context.loss.predicts:
         return state
-    before, after = (errors(followed(f.model, f.m_step.prior, f.path, context.data), JUDGED) for f in (a, b))
-    if ratio(before, after, one & other) <= 1:
-        return state
+    (own, used), *others = (
+        smooth(context, hypothesis.refitted(model), context.longest)
+        for model in (hypothesis.model, *(cast(StateSpaceModel, one.best) for one in fits))
+    )
+    before = errors(followed(own.model, own.m_step.prior, own.path, context.data), JUDGED)
+    left = []
+    for other, whole in others:
+        both = used & whole
+        after = errors(followed(other.model, other.m_step.prior, other.path, context.data), JUDGED)
+        left.append(ratio(before, after, both) if both.any() else 1.0)
+    if min(left) <= 1:
+        near = [one for one, share in zip(fits, left, strict=True) if share <= min(left) + FALLS]
+        return functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, near)
     begun = later_state(hypothesis.model, hypothesis.m_step, key=state.key)
     schedule = Schedule(first=context.longest)
     return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)

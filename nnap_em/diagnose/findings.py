@@ -14,7 +14,7 @@ from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..fit.identify import friction_table
-from ..numerics.digits import finite, number, with_std
+from ..numerics.digits import finite, number, share_of, with_std
 from ..systems import AbstractSystem
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
@@ -36,7 +36,8 @@ def estimates(
 
     (values, slopes), unit = _reported(effect), effect.units_on(system)
     variance = {name: float(np.asarray(slope) @ cov @ np.asarray(slope)) for name, slope in slopes.items()}
-    return {n: Estimate(float(value), math.sqrt(max(0.0, variance[n])), unit[n]) for n, value in values.items()}
+    stds = {name: math.sqrt(max(0.0, v)) for name, v in variance.items()}
+    return {n: Estimate(float(values[n]), stds[n], unit[n]) for n in unit if n in values}  # in the order of the law
 
 
 @eqx.filter_jit
@@ -62,7 +63,7 @@ class Finding(NamedTuple):
 
     effect: AbstractEffect
     parameters: dict[str, Estimate]
-    evidence: dict[str, float]
+    evidence: dict[str, Any]
     equivalent: tuple[Key, ...]
     sentence: str
     curve: Curve | None = None
@@ -94,9 +95,11 @@ def findings(closed: Closed) -> list[Finding]:
             sentence += f"; the law is not quite of this form, what is left has {left}"
         evidence = {
             "log_likelihood_gain": record.gain,
-            "p_value": max(record.p_value, 1e-300),
+            "p_value": max(1e-300, record.p_value) if finite(record.p_value) else math.nan,
             "held_out_gain": record.held_out,
             "share_of_error": record.share,
+            "chance": record.chance,
+            "parts": list(record.parts),
         }
         beside = drawn is None and remainder is not None
         equivalent = tuple(dict.fromkeys([*effect.same_as(model.system, fitted.rig.measured), *record.equivalent]))
@@ -219,13 +222,19 @@ def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Disput
     out = []
     for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
         against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
+        share = share_of(dispute.share, "the prediction error")
         text = (
-            f"{words(dispute.key)} would remove {dispute.share:.0%} of the prediction error, but {listed(against)} "
-            f"{'shows' if len(against) == 1 else 'show'} the opposite (up to {dispute.harm:.0%} more error)"
+            f"{words(dispute.key)} would remove {share}, but {listed(against)} "
+            f"{'shows' if len(against) == 1 else 'show'} the opposite ({_more(dispute.harm)})"
         )
         place, share = place_of(dispute.key), dispute.share
         out.append(Dispute(**place, share_of_error=share, files=against, harm=dispute.harm, description=text))
     return out
+
+
+def _more(harm: float) -> str:
+    """Rise of an error by that share of it."""
+    return f"up to {harm:.0%} more error" if harm <= 1 else f"up to {number(1 + harm)} times the error"
 
 
 class SuspectReport(NamedTuple):
@@ -251,7 +260,7 @@ def suspected(closed: Closed) -> list[SuspectReport]:
     for suspect in [entry for step in closed.last for entry in step.suspects]:
         law, confirm = words(suspect.key), catalogue[suspect.key[0]].confirm
         text = (
-            f"{law} would remove {suspect.share:.0%} of the squared prediction error, "
+            f"{law} would remove {share_of(suspect.share, 'the squared prediction error')}, "
             f"where chance removes {f'up to {suspect.chance:.0%}' if suspect.chance >= 0.005 else 'less than 1%'}"
         )
         place, share, chance = place_of(suspect.key), suspect.share, suspect.chance

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
+from .verdict import REPEATS
 
 FOLDS = 5
 """Parts of motions, as far as there are recordings."""
@@ -15,9 +16,6 @@ BLOCKS = 5
 """Parts of time: what happens at one moment of every recording is no law."""
 QUARTERS = 4
 """Parts of each motion, where there are fewer than three motions."""
-REPEATS = 0.2
-"""Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
-differ by up to .13, others by .25 and more."""
 
 
 def motions(

@@ -1,5 +1,6 @@
 """A model with what was added to it: every addition is one record of law, prior and evidence."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,17 +18,22 @@ from .keys import Key
 class Found(NamedTuple):
     """Evidence for an added effect."""
 
-    gain: float
-    """Log-likelihood over the model without it, where it was found [nat]."""
-    held_out: float
-    """Expected gain on parts left out of the fit of its strengths [nat]; NaN where many steps decided."""
-    p_value: float
+    gain: float = math.nan
+    """Log-likelihood over the model without it, where it was found [nat]; NaN where many steps decided, as the next."""
+    held_out: float = math.nan
+    """Expected gain on parts left out of the fit of its strengths [nat]."""
+    p_value: float = math.nan
     """P-value of the likelihood ratio, times the number of candidates tried."""
     equivalent: tuple[Key, ...] = ()
     """Effects that the data cannot distinguish from it."""
-    share: float = float("nan")
-    """Share of the multi-step error that it removes on recordings left out of its fit."""
-    removed: float = float("nan")
+    share: float = math.nan
+    """Share of the multi-step error that it removes on recordings left out of its fit; NaN where one step decided, as
+    the next."""
+    chance: float = math.nan
+    """Largest such share of any law whose columns are shifted in time."""
+    parts: tuple[int, ...] = ()
+    """Number of parts left out on which the error fell, and of all."""
+    removed: float = math.nan
     """Share of the squared error that its refit removed where it was found."""
 
 
@@ -68,9 +74,11 @@ class Hypothesis(NamedTuple):
             jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
             jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
         )
-        model = with_effects(self.model, tuple(a.effect for a in additions))
+        model, first = with_effects(self.model, tuple(a.effect for a in additions)), self.m_step.shape
+        own = 2 * len(model.system.coordinates)  # noise of a memory has no ratio to hold
+        shape = model.log_q if first is None else model.log_q.at[:own].set(first[:own])
         rule = eqx.tree_at(
-            lambda m: (m.prior, m.shape), self.m_step, (joined, model.log_q), is_leaf=lambda leaf: leaf is None
+            lambda m: (m.prior, m.shape), self.m_step, (joined, shape), is_leaf=lambda leaf: leaf is None
         )
         return Hypothesis(model, rule, tuple(a.found for a in additions))
 

@@ -70,9 +70,17 @@ def completed(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     return effect.named and any(not e.named and _same_signals(e, effect, model) for e in model.effects)
 
 
-def free_signals(law: AbstractEffect) -> int:
-    """Number of signals of a law without a name; 0 for one with a name."""
+def complexity(law: AbstractEffect, model: StateSpaceModel | None = None) -> int:
+    """Number of signals of a law without a name, 0 for one with a name; -1 for a part of what a `model` has already."""
+    if model is not None and not (remainder_of(law, model) is None and replaced(law, model) is None):
+        return -1
     return 0 if law.named else max(1, len(law.inputs_named()))
+
+
+def elsewhere(one: Key, other: Key) -> bool:
+    """True for the same law at another joint or on another reading."""
+    plain = lambda key: (key[0], tuple(re.sub(r"\d+", "", name) for name in key[3]))  # noqa: E731
+    return one[1:3] != other[1:3] and plain(one) == plain(other)
 
 
 def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..data.dataset import Dataset
-from ..effects import Candidate
+from ..effects import Candidate, flat
 from ..em.local import locals_along
 from ..em.quadratic import whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
@@ -40,9 +40,9 @@ from ..prediction_error.multistep import (
 )
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
-from .refit import Trial
+from .refit import Refit
 from .smoothed import SmoothedFit
-from .verdict import MULTI_STEP, ONE_STEP, Bars
+from .verdict import EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, ONE_STEP, PRICE, Bars
 
 
 class Linearised(NamedTuple):
@@ -78,13 +78,19 @@ class AbstractLoss(eqx.Module):
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+    def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """A `trial` after what its fit by likelihood leaves to do."""
         return trial
 
     @abstractmethod
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Squared error of one fit over that of another, on the sequences that `fit` uses, at a band of horizons."""
+
+    @abstractmethod
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """Distance by which one law explains more than another in its place, both beside a fit without either, over
+        that within which they explain the same.
+        """
 
 
 class MultiStep(AbstractLoss):
@@ -132,15 +138,20 @@ class MultiStep(AbstractLoss):
             for band in bands
         )
 
-    def finish(self, fit: SmoothedFit, trial: Trial) -> Trial:
+    def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """The trial after Gauss-Newton steps on the multi-step errors."""
         along = finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
         return trial._replace(model=along.model, along=along)
 
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Ratio of robust squares, each fit along its own smoothed paths."""
         before, after = (errors(cast(Followed, t.along), self.judged[band]) for t in (null, full))
         return ratio(before, after, fit.used)
+
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """Difference of the shares that both remove."""
+        own, its = (1 - self.ratio(null, one, fit, 0) for one in (full, other))
+        return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
 
 
 class OneStep(AbstractLoss):
@@ -169,11 +180,17 @@ class OneStep(AbstractLoss):
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
 
-    def ratio(self, null: Trial, full: Trial, fit: SmoothedFit, band: int) -> float:
+    def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""
         gain = full.loglik - null.loglik
         both = fit.used & np.isfinite(gain)
         return 1.0 - 2.0 * float(np.sum(gain[both])) / max(readings(fit.data, both), 1)
+
+    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
+        """Difference in log-likelihood, less the price of the numbers of a law."""
+        own, its = (sum(flat(effect).size for effect in one.model.effects) for one in (full, other))
+        gain = float(np.nansum((other.loglik - full.loglik)[fit.used]))
+        return (gain - PRICE * (its - own)) / EQUIVALENT_NATS
 
 
 def readings(data: Dataset, used) -> int:

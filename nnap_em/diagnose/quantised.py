@@ -13,7 +13,7 @@ from ..em.loop import EMState
 from ..model.state_space import StateSpaceModel
 from .context import SearchContext, extend
 from .hypothesis import Found, Hypothesis
-from .verdict import ONE_STEP
+from .verdict import COARSE, FINEST, ONE_STEP
 
 
 def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesis, EMState | None]:
@@ -27,15 +27,15 @@ def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesi
         step = grid_step(y.ravel())
         model = cast(StateSpaceModel, state.best if state else hypothesis.model)
         declared, estimated = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
-        share = step**2 / 12 / (declared**2 if declared else max(estimated - step**2 / 12, 0.25 * estimated))
+        share = step**2 / 12 / (declared**2 if declared else max(estimated - step**2 / 12, FINEST * estimated))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
-        if share < 0.1 or gain < ONE_STEP.nats:
+        if share < COARSE or gain < ONE_STEP.nats:
             continue
         context.log(f"  {channel} comes in steps of {step:.4g}")
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        evidence = Found(float(gain), float(gain), 0.0)
+        evidence = Found(float(gain), math.nan, math.nan)  # of the same numbers: nothing is left out
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         hypothesis = hypothesis.refitted(early).plus(effect, candidate, evidence)
         if declared:

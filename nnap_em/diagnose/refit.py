@@ -28,8 +28,8 @@ HELD = 3
 """Passes with the noise as it is."""
 
 
-class Trial(NamedTuple):
-    """A model after some passes."""
+class Refit(NamedTuple):
+    """A model after some passes, or before any."""
 
     model: StateSpaceModel
     m_step: ScoringMStep
@@ -52,7 +52,7 @@ def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Ga
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
 
-@step(lambda model, m_step, path, *_, **__: Trial(model, m_step, path, HERE, HERE))
+@step(lambda model, m_step, path, *_, **__: Refit(model, m_step, path, HERE, HERE))
 def refit(
     model: StateSpaceModel,
     m_step: ScoringMStep,
@@ -61,13 +61,15 @@ def refit(
     used: Bool[np.ndarray, " seq"],
     *,
     passes: int = 5,
-) -> Trial:
+) -> Refit:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
 
-    The process and reading noise stay as they are in the first passes, while the path finds its place: they would fit
-    the way there, and their estimates decay slowly.
+    Passes have the rule of short horizons, its noise ratios held at those of `model`; the outcome, with its precision,
+    is stated under `m_step`.  The process and reading noise stay as they are in the first passes, while the path finds
+    its place: they would fit the way there, and their estimates decay slowly.
     """
-    still = eqx.tree_at(lambda r: r.stride, m_step, jnp.zeros_like(m_step.stride))
+    brief = eqx.tree_at(lambda r: r.shape, m_step.early(), model.log_q, is_leaf=lambda leaf: leaf is None)
+    still = eqx.tree_at(lambda r: r.stride, brief, jnp.zeros_like(brief.stride))
     core = m_step.core(model)
 
     def program(rule: ScoringMStep, core: Core, path: Gaussian):
@@ -78,7 +80,7 @@ def refit(
 
     best, stride, base, goal = None, 1.0, core, core
     for count in range(passes):
-        rule = m_step if count >= HELD else still
+        rule = brief if count >= HELD else still
         proposal, smoothed, loglik, hessian = program(rule, core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:
@@ -91,4 +93,6 @@ def refit(
         core = between(base, goal, stride)
     assert best is not None
     _, core, loglik, hessian, path = best
-    return Trial(m_step.whole(model, core), m_step, path, loglik, hessian)
+    fitted = m_step.whole(model, core)
+    early, late = (rule.weights(fitted).prior_precision(fitted.unknown) for rule in (brief, m_step))
+    return Refit(fitted, m_step, path, loglik, hessian + late - early)

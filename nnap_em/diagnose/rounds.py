@@ -7,19 +7,19 @@ import numpy as np
 
 from ..effects import AbstractEffect, flat
 from ..model.state_space import StateSpaceModel
+from ..numerics.digits import share_of
 from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
 from .context import SearchContext
-from .keys import Key, completed, contains, free_signals, key_of, remainder_of, replaced, words
+from .keys import Key, completed, complexity, contains, elsewhere, key_of, replaced, words
 from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
-from .refit import Trial
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
-from .trial import Refit, fitted, with_candidate
-from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, odds, required, suspected
+from .trial import Null, Trial, null_of, with_candidate
+from .verdict import EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
 
-_Law = TypeVar("_Law", Screened, Refit)
+_Law = TypeVar("_Law", Screened, Trial)
 
 SUSPECTS = 4
 """Suspects that are listed: the right law was the fourth on a real arm with three recordings."""
@@ -30,7 +30,7 @@ class Round(NamedTuple):
 
     step: Step
     screen: Screen
-    accepted: Refit | None
+    accepted: Trial | None
     equivalent: tuple[Key, ...] = ()
     """Named laws that the data cannot distinguish from the accepted one."""
 
@@ -47,19 +47,15 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     disputed = _disputed(fresh, seen) if context.loss.predicts else ()
     step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, disputed)
     admitted = [s for s in ranked if s.reached]
-    tried: list[Refit] = []
+    tried: list[Trial] = []
     fitting = fit, context.loss, context.effort.passes
     try:
-        null = fitted(fit.hypothesis, fit.path, *fitting) if admitted else None
+        null = null_of(fit.hypothesis, *fitting) if admitted else None
         while admitted and len(tried) < context.effort.shortlist:
-            first = min(s.band for s in admitted)
-            band = [s for s in admitted if s.band == first]
-            entries = sorted(_standing(band, [s.ratio for s in band], model), key=lambda s: -score(s, model))
-            tied = [s for s in entries if score(s, model) >= EQUIVALENT * score(entries[0], model)]
-            group = tied + _inside(tied, admitted, model)
+            group = _group(admitted, model)[: context.effort.shortlist - len(tried)]
             cases = []
             for s in group:
-                cases.append(with_candidate(s, cast(Trial, null), *fitting))
+                cases.append(with_candidate(s, cast(Null, null), *fitting))
                 _log(cases[-1], context)
             tried += cases
             admissible = [case for case in cases if case.rejection is None]
@@ -73,65 +69,78 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
-def _accepted(admissible: list[Refit], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
-    """Choose among laws that the screen cannot distinguish.
+def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
+    """Laws that are refitted beside each other: the best of the first band, and each of them at its other places.
 
-    The one counts whose refit removes most, in view of its prior odds; of those that are even in this, too, that of the
-    best odds, then the likeliest.  None is accepted where one of these is of another cause.
+    A law that a free function contains, or the reverse, comes in the form that explains as much as the better one, and
+    as itself where that is the function: a refit may show that it explains as much.
     """
-    admissible = _standing(admissible, [case.removed for case in admissible], fit.model)
-    values = [case.removed * _odds(case.candidate.start, fit.model) for case in admissible]
-    tied = [case for case, value in zip(admissible, values, strict=True) if value >= EQUIVALENT * max(values)]
-    best = max(tied, key=lambda case: (_odds(case.candidate.start, fit.model), _priced(case)))
+    band = [s for s in admitted if s.band == min(s.band for s in admitted)]
+    values = [s.ratio for s in band]
+    worths = _worths(band, values, model)
+    group: list[Screened] = []
+    for i in sorted(even(worths), key=lambda i: -worths[i]):
+        form = _form(band[i], band, values, values, model)
+        group += [form, band[i]] if complexity(form.candidate.start) > complexity(band[i].candidate.start) else [form]
+    group += [s for law in group for s in admitted if elsewhere(key_of(s.candidate.start), key_of(law.candidate.start))]
+    return list({id(s): s for s in group}.values())
+
+
+def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form.
+
+    None is accepted where one that is worth as much is of another cause.
+    """
+    model, values = fit.model, [case.removed for case in admissible]
+    ties = values if context.loss.predicts else [_priced(case) for case in admissible]
+    worths = _worths(admissible, values, model)
+    leader = admissible[simplest(worths, _complexities(admissible, model), ties)]
+    best = _form(leader, admissible, values, ties, model)
     law = best.candidate.start
-    rivals = [case for case in tied if other_cause(case.effect, law, fit.model.system)]
+    tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
+    rivals = [case for case in tied if other_cause(case.effect, law, model.system)]
     if rivals and context.loss.predicts:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
     candidates = [s.candidate.start for s in outcome.screen.screened]
-    parts = zip(candidates, overlaps(outcome.screen, best.screened), strict=True)
-    same = [key_of(c) for c, part in parts if c.named and (part < SAME or 0.0 < part * best.gain < EQUIVALENT_NATS)]
-    same += [
-        key_of(case.effect) for case in tied if case.effect.named and _priced(best) - _priced(case) < EQUIVALENT_NATS
-    ]
+    parts = list(zip(candidates, overlaps(outcome.screen, best.screened), strict=True))
+    same = [key_of(c) for c, part in parts if c.named and part < SAME]
+    if not context.loss.predicts:
+        tied = [case for case in tied if _priced(best) - _priced(case) < EQUIVALENT_NATS]
+        same += [key_of(c) for c, part in parts if c.named and 0.0 < part * best.gain < EQUIVALENT_NATS]
+    same += [key_of(case.effect) for case in tied if case.effect.named]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
 
 
-def _priced(case: Refit) -> float:
+def _priced(case: Trial) -> float:
     """Gain in log-likelihood less the price of the law's numbers [nat]."""
     return case.gain - PRICE * flat(case.effect).size
 
 
-def _standing(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[_Law]:
-    """Laws that none of the others stands for, from simple ones to free functions of many signals.
+def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
+    return [complexity(law.candidate.start, model) for law in laws]
 
-    A free function contains the named laws of its signals, and functions of fewer: as far as one of these is even with
-    it the free one goes, else they go.
+
+def _worths(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[float]:
+    """Values times prior odds: what laws of different causes are compared by."""
+    return [value * odds(number) for value, number in zip(values, _complexities(laws, model), strict=True)]
+
+
+def _form(
+    law: _Law, laws: Sequence[_Law], values: Sequence[float], ties: Sequence[float], model: StateSpaceModel
+) -> _Law:
+    """Simplest among a law, the free functions that contain it and what it contains, that explains as much as the best.
+
+    The parts left out of all are the same, so that they differ by what they explain: a bump is no ripple.
     """
-    standing: list[tuple[_Law, float]] = []
-    for law, value in sorted(zip(laws, values, strict=True), key=lambda pair: free_signals(pair[0].candidate.start)):
-        inside = [k for k in standing if contains(law.candidate.start, k[0].candidate.start, model.system)]
-        if not any(other >= EQUIVALENT * value for _, other in inside):
-            standing = [k for k in standing if not any(k is other for other in inside)] + [(law, value)]
-    return [law for law, _ in standing]
-
-
-def _inside(chosen: Sequence[Screened], admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
-    """Best named law that each free function among the `chosen` contains: a refit may show that it is even with it."""
-    out: list[Screened] = []
-    for free in chosen:
-        named = [
-            s
-            for s in admitted
-            if s.band == free.band
-            and not any(s is other for other in (*chosen, *out))
-            and s.candidate.start.named
-            and contains(free.candidate.start, s.candidate.start, model.system)
-        ]
-        out += named[:1] if named and named[0].ratio >= NAMED * free.ratio else []
-    return out
+    own = law.candidate.start
+    one_cause = lambda other: contains(other, own, model.system) or contains(own, other, model.system)  # noqa: E731
+    places = [i for i, other in enumerate(laws) if other is law or one_cause(other.candidate.start)]
+    some = [laws[i] for i in places]
+    chosen = simplest([values[i] for i in places], _complexities(some, model), [ties[i] for i in places])
+    return some[chosen]
 
 
 def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSystem) -> bool:
@@ -139,16 +148,6 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
     of_best, of_one = (set(effect.signals(system)) for effect in (best, one))
     same_law = one.named and one.name == best.name
     return not same_law and bool(of_best and of_one) and of_best.isdisjoint(of_one)
-
-
-def score(screened: Screened, model: StateSpaceModel) -> float:
-    """Multiple of its bar that the share of a candidate reaches, times its prior odds; the larger the better."""
-    return screened.ratio * _odds(screened.candidate.start, model)
-
-
-def _odds(law: AbstractEffect, model: StateSpaceModel) -> float:
-    remainder = remainder_of(law, model) is not None or replaced(law, model) is not None
-    return odds(free_signals(law), remainder=remainder)
 
 
 def _listed(screened: Screened) -> float:
@@ -172,19 +171,27 @@ def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
     return sorted(best.values(), key=_listed, reverse=True)
 
 
-def _log(case: Refit, context: SearchContext) -> None:
+def _log(case: Trial, context: SearchContext) -> None:
     """One line on a refit."""
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
-    share, reason = case.screened.share.least, case.rejection
+    share, reason, error = case.screened.share.least, case.rejection, "the squared error"
+    name, bar = words(key_of(case.effect)), f"bar {case.screened.bar:.1%}"
+    if case.refit is None:
+        context.log(
+            f"  {name} {values}: {share_of(share, error, 1)} by the linear screen, {share_of(case.foreseen, error, 1)} "
+            f"along its step; {bar}; not refitted"
+        )
+        return
+    nats = f", {case.gain:.0f} nat" if np.isnan(case.foreseen) else f", {case.foreseen:.1%} along its step"
     context.log(
-        f"  refitted {words(key_of(case.effect))} {values}: {share:.1%} of the squared error before the refit, "
-        f"{case.removed:.1%} after it ({case.gain:.0f} nat); bar {case.screened.bar:.1%}"
+        f"  refitted {name} {values}: {share_of(share, error, 1)} by the linear screen{nats}, "
+        f"{share_of(case.removed, error, 1)} after it; {bar}"
     )
     if reason is not None:
         context.log(f"  {words(key_of(case.effect))} {reason.sentence}")
 
 
-def _removals(tried: Sequence[Refit]) -> tuple[tuple[Key, float], ...]:
+def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
     best: dict[Key, float] = {}
     for case in tried:
         key = key_of(case.effect)
@@ -207,7 +214,7 @@ def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
     best: dict[Key, Disputed] = {}
     for screened in every:
         share, start = screened.share, screened.candidate.start
-        if share.least < required(screened.bar, free_signals(start)) or agreed(share.folds, screened.floor):
+        if share.least < required(screened.bar, complexity(start)) or agreed(share.folds, screened.floor):
             continue
         folds = np.asarray(share.folds)
         held = seen.members[screened.band]

@@ -16,10 +16,10 @@ from ..effects import Candidate, flat
 from ..prediction_error.shape import friction_prior
 from ..storage.journal import HERE, step
 from .folds import members, parts
-from .keys import free_signals
+from .keys import complexity
 from .losses import AbstractLoss, Linearised
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, Share, admissible, required
+from .verdict import CHANCE, Share, agreed, required, sensible
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
@@ -37,6 +37,8 @@ class Rows(NamedTuple):
     step: int
     overlap: float
     """Rows that count as one."""
+    survived: Float[np.ndarray, " column"]
+    """Norm of every column over what it was before."""
 
 
 class Shares(NamedTuple):
@@ -47,6 +49,7 @@ class Shares(NamedTuple):
     folds: Float[np.ndarray, "candidate fold"]
     directions: Float[np.ndarray, " candidate"]
     coefficients: Float[np.ndarray, " probe"]
+    survived: Float[np.ndarray, " candidate"]
 
 
 class Screened(NamedTuple):
@@ -64,6 +67,8 @@ class Screened(NamedTuple):
     """Largest share of any placebo at that band that the parts left out confirm."""
     independent: float
     """Number of independent errors."""
+    survived: float = 1.0
+    """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]."""
 
     @property
     def ratio(self) -> float:
@@ -73,7 +78,7 @@ class Screened(NamedTuple):
     @property
     def reached(self) -> bool:
         """True for an admissible share that reaches the bar of its law."""
-        return self.admissible and self.share.least >= required(self.bar, free_signals(self.candidate.start))
+        return self.admissible and self.share.least >= required(self.bar, complexity(self.candidate.start))
 
     @property
     def rank(self) -> tuple[bool, bool, float, float]:
@@ -88,9 +93,11 @@ class Screened(NamedTuple):
     @property
     def admissible(self) -> bool:
         """True where the parts left out confirm the share."""
-        start = self.candidate.start
-        multiple = float(self.coefficients[0])
-        return admissible(self.share, self.floor, multiple, linear=start.linear, answers=start.answers())
+        start, multiple = self.candidate.start, float(self.coefficients[0])
+        far = float(np.sqrt(np.mean(self.coefficients**2 * _ridge(self.candidate))))
+        if not sensible(multiple, far, self.survived, linear=start.linear):
+            return False
+        return agreed(self.share.folds, self.floor, answers=start.answers())
 
 
 def spans(candidates: Sequence[Candidate]) -> list[slice]:
@@ -117,7 +124,9 @@ def project(
     factor = np.linalg.cholesky(nuisance.T @ nuisance + precision)
     solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
     error = error - nuisance @ solve(nuisance.T @ error - pull)
-    return Rows(error, candidates - nuisance @ solve(nuisance.T @ candidates), cell[order], step, linearised.overlap)
+    left = candidates - nuisance @ solve(nuisance.T @ candidates)
+    survived = np.linalg.norm(left, axis=0) / np.maximum(np.linalg.norm(candidates, axis=0), 1e-300)
+    return Rows(error, left, cell[order], step, linearised.overlap, survived)
 
 
 def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
@@ -192,6 +201,7 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
     held = np.array([square[fold == f].sum() for f in np.unique(fold)] or [0.0])
     where, sizes = spans(candidates), np.array([len(c.probes) for c in candidates])
     inside, left_out, directions = np.zeros((3, len(candidates)))
+    survived = np.array([rows.survived[span].max(initial=0.0) for span in where])
     folds, coefficients = np.zeros((len(candidates), len(held))), np.zeros(where[-1].stop)
     for size in np.unique(sizes) if len(held) > 1 else ():  # of one fold nothing can be left out
         indices = np.flatnonzero(sizes == size)
@@ -205,7 +215,7 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
         moments = sum(sums.left_out(block == b) for b in np.unique(block))
         least = np.where(np.asarray(timed)[indices], np.inf, moments)
         left_out[indices] = np.minimum(out.sum(axis=1), least) / total
-    return Shares(inside, left_out, folds, directions, coefficients)
+    return Shares(inside, left_out, folds, directions, coefficients, survived)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
@@ -228,7 +238,7 @@ class _Band(NamedTuple):
     """Sequences that each fold holds, or pieces of."""
 
 
-_SHARES = Shares(HERE, HERE, HERE, HERE, HERE)
+_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE)
 _BAND = _Band(_SHARES, (), HERE, HERE, HERE)
 
 
@@ -287,8 +297,9 @@ def _screened(
 ) -> Iterator[Screened]:
     for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
-        directions = round(float(shares.directions[i]))
-        yield Screened(candidate, shares.coefficients[span], directions, share, band, floor, chance, independent)
+        directions, survived = round(float(shares.directions[i])), float(shares.survived[i])
+        numbers = band, floor, chance, independent, survived
+        yield Screened(candidate, shares.coefficients[span], directions, share, *numbers)
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:

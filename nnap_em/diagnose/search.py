@@ -3,18 +3,20 @@
 import dataclasses
 import math
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..em.loop import EMState, FitError
-from ..fit.identify import Identified, finished, identify
+from ..em.loop import EMState, FitError, e_step
+from ..fit.identify import Identified, begin, finished, identify
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.programs import release_programs
@@ -25,16 +27,16 @@ from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
 from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, renamed, silent
+from .backward import backward
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, remainder_of, replaced, words
-from .losses import AbstractLoss, MultiStep, OneStep, readings
+from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Closed, Step
 from .quantised import quantised
-from .rivals import compare_equivalents
 from .rounds import Round, screening_round
-from .trial import Refit, fitted
-from .verdict import KEEP, Rejection, explains, needed
+from .trial import Trial
+from .verdict import FOLLOWED, HELD, even
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -55,17 +57,17 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     return _with(hypothesis, outcome.accepted, _evidence(outcome, context.loss), context)
 
 
-def _with(hypothesis: Hypothesis, case: Refit, evidence: Found, context: SearchContext) -> Hypothesis:
+def _with(hypothesis: Hypothesis, case: Trial, evidence: Found, context: SearchContext) -> Hypothesis:
     """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
-    m_step = eqx.tree_at(lambda rule: rule.tie, case.after.m_step, hypothesis.m_step.tie)  # under the old hold on noise
     remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
     place = remainder if form is None else form
     law = None if place is None else hypothesis.found[place]
-    stays = law is None or (form is None and explains(law.removed, case.removed))
-    if law is not None and not stays:  # over the model without the older law
-        evidence = evidence._replace(removed=1 - (1 - law.removed) * (1 - case.removed))
-    following = case.after._replace(m_step=m_step, found=(*case.after.found[:-1], evidence))
+    both = None if law is None else 1 - (1 - law.removed) * (1 - case.removed)
+    stays = law is None or (form is None and 0 in even([law.removed, cast(float, both)]))
+    if not stays:  # over the model without the older law
+        evidence = evidence._replace(removed=cast(float, both))
+    following = case.after._replace(found=(*case.after.found[:-1], evidence))
     if stays or form is not None:  # its place is taken already
         return following
     context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
@@ -79,58 +81,22 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[Key, Any]]:
 
 def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
-    case = cast(Refit, outcome.accepted)
-    screened, directions = case.screened, max(case.screened.directions, 1)
-    p_value = min(1.0, float(stats.chi2.sf(2 * max(case.gain, 0.0), directions)) * outcome.step.tried)
-    left_out = screened.share.left_out
-    held_out, share = (math.nan, left_out) if loss.predicts else (0.5 * left_out * screened.independent, math.nan)
-    return Found(case.gain, held_out, p_value, outcome.equivalent, share, case.removed)
+    case = cast(Trial, outcome.accepted)
+    screened, share = case.screened, case.screened.share
+    evidence = Found(equivalent=outcome.equivalent, removed=case.removed)
+    if loss.predicts:  # a likelihood proves nothing there
+        parts = sum(part > 0 for part in share.folds), len(share.folds)
+        return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
+    p_value = float(stats.chi2.sf(2 * max(case.gain, 0.0), max(screened.directions, 1))) * outcome.step.tried
+    held_out = 0.5 * share.left_out * screened.independent
+    return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def _backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
-    """Backward elimination: remove laws, the least needed first, without which a fit loses too little to count.
+def search(context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified]) -> Closed:
+    """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
 
-    The models with and without a law are fitted in the same way, from their own smoothed paths.
-    """
-    while hypothesis.found:
-        fit, _ = smooth(context, hypothesis, context.longest)
-        if not fit.used.any():
-            break
-        full = fitted(hypothesis, fit.path, fit, context.loss, context.effort.passes)
-        losses = [_share_without(context, hypothesis, full, fit, place) for place in range(len(hypothesis.found))]
-        least = int(np.argmin(losses))
-        floor = context.loss.bars.floor(float(readings(fit.data, fit.used)))
-        if needed(losses[least], floor):
-            break
-        name = words(key_of(hypothesis.model.effects[least]))
-        reason = f"without it {losses[least]:.1%} of the squared error is lost, {KEEP * floor:.1%} counts"
-        context.log(f"  {name} is removed: {reason if losses[least] > -math.inf else Rejection('impossible').sentence}")
-        hypothesis = hypothesis.without(least)
-    return hypothesis
-
-
-def _share_without(context: SearchContext, hypothesis: Hypothesis, full, fit, place: int) -> float:
-    """Share of the squared error of a fit without an effect that the fit with it removes, at its best band."""
-    effect = hypothesis.model.effects[place]
-    if effect.read_off or any(remainder_of(other, hypothesis.model) == place for other in hypothesis.model.effects):
-        return math.inf  # seen in the numbers themselves, or a law whose remainder goes first
-    if not effect.possible():
-        return -math.inf
-    reduced = hypothesis.without(place)
-    smoothed, _ = smooth(context, reduced, context.longest)
-    both = fit._replace(used=fit.used & smoothed.used)
-    if not both.used.any():  # without it no sequence is followed
-        return math.inf
-    trial = fitted(reduced, smoothed.path, both._replace(hypothesis=reduced), context.loss, context.effort.passes)
-    return max(1 - context.loss.ratio(trial, full, both, band) for band in range(len(context.loss.bands)))
-
-
-def search(context: SearchContext, *, white: bool) -> Closed:
-    """Search for what the declared model lacks.
-
-    Where readings carry `white` noise, one-step errors are searched first, and the outcome is kept if its innovations
-    are white: those of the declared model need not be, since what is missing colours them.  Else multi-step errors
-    decide, from the declared model on.
+    Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
+    many steps: of a model that lacks more they prove nothing.
     """
     before, data = context.before, context.data
     try:  # steps of readings as noise: they spoil the noise that all else leans on
@@ -138,37 +104,23 @@ def search(context: SearchContext, *, white: bool) -> Closed:
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
-    one_step = _by_one_step(context, *begun) if white else None
-    hypothesis, state, steps, complete = one_step or _search(context, *begun, [_first(context)])
+    hidden = not set(before.model.system.coordinates) <= set(before.rig.measured)
+    lengths = _ladder(context) if hidden else [_first(context)]
+    hypothesis, state, steps, complete = _search(context, *begun, lengths)
+    if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
+        last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
+        hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     if not hypothesis.found or state is None:
         return Closed(before, before, (), tuple(steps), complete=complete)
-    outcome = finished(_outcome(before, hypothesis, state), data)
-    closed = Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
-    if one_step is None or not complete:  # to compare equivalents takes a fit for each
-        return closed
-    try:
-        return compare_equivalents(closed, data)
-    except FitError as error:
-        context.log(f"  equivalent laws could not be compared over the whole length ({error})")
-        return closed
-
-
-def _by_one_step(context: SearchContext, hypothesis: Hypothesis, state: EMState | None) -> "_Searched | None":
-    """Outcome of a search by one-step errors; None where its innovations are not white, so that it proves nothing."""
-    searched = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
-    white = white_innovations(_outcome(context.before, searched.hypothesis, searched.state), context.data)
-    if not white:
-        context.log(
-            "one-step errors follow each other with all that was found, and prove nothing: multi-step errors decide"
-        )
-    return searched if white else None
+    outcome = release(_outcome(before, hypothesis, state), data)
+    return Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
 
 
 def _ladder(context: SearchContext) -> list[int]:
-    """Rows of the rounds by one-step errors: the two shortest horizons of the fit, and one in the middle.
+    """Rows of the first rounds where a joint is hidden: the two shortest horizons of the fit, and one in the middle.
 
-    Over the whole length a fit takes a strong effect for noise of the process, above all where a joint is hidden: on a
-    simulated arm a spring explains .17 of the one-step error over .6 s, .21 over 1 s, and nothing over 5 s.
+    Over the whole length a fit takes a strong effect for noise of the process: on a simulated arm a spring explains .38
+    of the multi-step error over .6 s and less than .09 over 5 s; of the one-step error .17, and nothing.
     """
     longest = context.longest
     short = [length for length in sorted(context.stages) if length < longest]
@@ -179,7 +131,7 @@ def _ladder(context: SearchContext) -> list[int]:
 def _first(context: SearchContext) -> int:
     """Rows of the first round by multi-step errors: all, or if most sequences diverge before, as many as most keep."""
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
-    most = [length for length, share in followed.items() if share >= 0.5]
+    most = [length for length, share in followed.items() if share >= FOLLOWED]
     return max(most, default=min(followed, default=context.longest))
 
 
@@ -219,9 +171,9 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
                 searched.add(_names(hypothesis))
                 if _names(proposed) in searched:  # nothing new, or one law in the place of another and back
                     steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
-                    proposed = _backward(context, hypothesis)
-                    if proposed.found is hypothesis.found:
-                        return _Searched(hypothesis, state, steps)
+                    proposed = backward(context, hypothesis)
+                    if _names(proposed) == _names(hypothesis):
+                        return _Searched(hypothesis._replace(found=proposed.found), state, steps)
         except TimeUp:
             context.log("the time is up: the search is not finished")
             return _Searched(hypothesis, state, steps, complete=False)
@@ -260,6 +212,9 @@ def close_the_loop(
     data = jax.device_put(data)
     stages: Stages = {}
 
+    white = white_readings(data, begin(rig, data, key=key).model)
+    held = rig if white else _held(rig)
+
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}
 
@@ -267,7 +222,7 @@ def close_the_loop(
             seen[rows] = (state, used)
             log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
-        outcome = identify(rig, part, key=key, smoother=_unbranched, watch=watch)
+        outcome = identify(held, part, key=key, smoother=_unbranched, watch=watch)
         stages.clear()  # a fit that fails leaves the stages of the one before
         stages.update(seen)
         return outcome
@@ -275,13 +230,39 @@ def close_the_loop(
     if len(data.t) < 2:
         log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
-    if white_readings(data, before.model):
-        return _branching(search(SearchContext(before, stages, data, MultiStep(), effort, log, until=end), white=True))
+    if white:
+        context = SearchContext(before, stages, data, MultiStep(), effort, log, until=end)
+        return _branching(search(context, white=True, release=finished))
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
-    closed = search(SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), white=False)
+    context, release = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), _released(rig)
+    closed = search(context, white=False, release=release)
+    before = release(before, data)
+    closed = closed._replace(before=before, after=closed.after if closed.found else before)
     return _branching(closed._replace(interventions=disturbances, pieces=pieces))
+
+
+def _held(rig: Rig) -> Rig:
+    """The rig with its declared numbers nearly held."""
+    narrow = {name: dataclasses.replace(number, std=HELD * number.std) for name, number in rig.parameters.items()}
+    return dataclasses.replace(rig, parameters=narrow)
+
+
+def _released(rig: Rig) -> Callable[[Identified, Dataset], Identified]:
+    """End of fits whose numbers were held: they move under what is declared where that predicts what is left out."""
+
+    def release(fitted: Identified, data: Dataset) -> Identified:
+        rule, model = fitted.m_step, fitted.model
+        own = np.arange(rule.prior.size) < len(rule.prior.declared)
+        std = jnp.where(own, rule.prior.std / HELD, rule.prior.std)
+        rule = eqx.tree_at(lambda r: (r.prior.std, r.least), rule, (std, HELD * rule.least))
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+        _, info = rule(model, posterior, data)
+        state = fitted.state._replace(hessian=info.hessian)
+        return finished(fitted._replace(rig=rig, m_step=rule, state=state), data)
+
+    return release
 
 
 def _unbranched(bank: StartBank) -> GaussianSmoother:

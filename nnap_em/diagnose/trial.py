@@ -11,16 +11,16 @@ from ..fit.memory import extended
 from ..numerics.gaussian import Gaussian
 from .findings import estimates
 from .hypothesis import Hypothesis, covariances
-from .keys import free_signals, replaced
+from .keys import complexity, replaced
 from .losses import AbstractLoss
 from .propose import seeded
-from .refit import Trial, refit
+from .refit import Refit, refit
 from .screen import Screened
 from .smoothed import SmoothedFit
-from .verdict import Rejection, veto
+from .verdict import FORESEEN, Rejection, needed, required, veto
 
 
-class Refit(NamedTuple):
+class Trial(NamedTuple):
     """A hypothesis with one effect more (or another in the place of one), and the error that it removes."""
 
     screened: Screened
@@ -34,6 +34,10 @@ class Refit(NamedTuple):
     """Wald statistic of its strengths, jointly [standard deviations]."""
     amplitude: float
     """The same of its reported amplitude alone; infinite for a law that reports none."""
+    foreseen: float = np.nan
+    """Share that the step of the screen removes, before any pass; NaN where likelihood decides."""
+    refit: Refit | None = None
+    """Its fit; None where the step of the screen removed too little for one."""
 
     @property
     def candidate(self) -> Candidate:
@@ -50,35 +54,61 @@ class Refit(NamedTuple):
         """Reason against it; None where there is none."""
         numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
         return veto(
-            possible=self.effect.possible(), floor=self.screened.floor, signals=free_signals(self.effect), **numbers
+            possible=self.effect.possible(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
         )
 
 
-def fitted(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
-    """`hypothesis` after some passes from a path, finished before and after on the data of the loss."""
-    begun = Trial(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0)))
-    begun = loss.finish(fit, begun)
-    return loss.finish(fit, refit(begun.model, hypothesis.m_step.early(), path, fit.data, fit.used, passes=passes))
+class Null(NamedTuple):
+    """A hypothesis before its passes and after them: what trials are compared with."""
+
+    start: Refit
+    end: Refit
 
 
-def with_candidate(screened: Screened, null: Trial, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
-    """A candidate in the model, or in the place of the law that it is another form of, refitted."""
+def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss) -> Refit:
+    """`hypothesis` before any pass, finished on the data of the loss along a path."""
+    return loss.finish(fit, Refit(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0))))
+
+
+def fitted(start: Refit, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
+    """A refit after some passes from where it was begun, finished again."""
+    return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used, passes=passes))
+
+
+def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Null:
+    """`hypothesis` along the paths of `fit`, before its passes and after them."""
+    start = begun(hypothesis, fit.path, fit, loss)
+    return Null(start, fitted(start, fit, loss, passes))
+
+
+def with_candidate(screened: Screened, null: Null, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
+    """A candidate in the model, or in the place of the law that it is another form of, refitted.
+
+    Not refitted where the nonlinear error hardly falls along the step of the screen, friction and parameters moving
+    with it.
+    """
     candidate, hypothesis = screened.candidate, fit.hypothesis
     effect = seeded(candidate, screened.coefficients)
     place = replaced(effect, hypothesis.model)
     full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, candidate)
-    trial = fitted(full, extended(full.model, fit.path, fit.data), fit, loss, passes)
-    after = full.refitted(trial.model)
-    gain = np.nan_to_num(trial.loglik, nan=-1e3) - np.nan_to_num(null.loglik, nan=-1e3)
-    effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, trial.hessian)[-1]
+    start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
+    foreseen = 1 - loss.ratio(null.start, start, fit, screened.band) if loss.predicts else np.nan
+    if loss.predicts and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
+        return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
+    end = fitted(start, fit, loss, passes)
+    after = full.refitted(end.model)
+    gain = np.nan_to_num(end.loglik, nan=-1e3) - np.nan_to_num(null.end.loglik, nan=-1e3)
+    effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, end.hessian)[-1]
     reported = estimates(effect, cov, after.model.system).get("amplitude")
-    return Refit(
+    return Trial(
         screened,
         after,
-        1 - loss.ratio(null, trial, fit, screened.band),
+        1 - loss.ratio(null.end, end, fit, screened.band),
         float(np.sum(gain[fit.used])),
         certainty(candidate, effect, cov),
         reported.value / reported.std if reported and reported.std > 0 else np.inf,
+        foreseen,
+        end,
     )
 
 

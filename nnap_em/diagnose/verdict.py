@@ -1,12 +1,16 @@
-"""Every number that decides whether an effect enters a model or leaves it, and the decisions.
+"""Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
 The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
 candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
+Elsewhere, since folders before this one use them: READINGS (`prediction_error/noise.py`) and WHITE
+(`residual/innovations.py`), which choose the loss, and the bars of memory (`fit/memory.py`).
 """
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+
+from ..numerics.digits import share_of
 
 CHANCE = 2.0
 """Multiple of the chance level that a share must reach: two placebos are exceeded by chance once in three rounds."""
@@ -19,6 +23,11 @@ HARM = 2 / 3
 """Multiple of the floor by which the error may rise on one part: 10 % of a multi-step error."""
 PROBE = (0.3, 3.0)
 """Smallest and largest multiple of its probe at which a law that is not linear is still the law that was probed."""
+FAR = 3.0
+"""Largest distance of a linear law from none, in root mean square of the standard deviations of its prior."""
+SURVIVES = 0.05
+"""Smallest share of a law's columns that friction and parameters cannot give: on a slide under control that lacks a
+force 2 % of a false scale of its sensor, and 10 to 95 % of all other laws."""
 CERTAIN = 5.0
 """Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
 DETERMINED = 2.0
@@ -33,12 +42,27 @@ PRICE = 1.0
 [Akaike 1974, IEEE Trans. Automatic Control 19(6)]."""
 SAME = 0.01
 """Share of the information on an effect that an equivalent one may leave unexplained."""
+FORESEEN = 1 / 3
+"""Multiple of what a refit must remove by which the error must fall along the step of the screen, or none is made."""
 KEEP = 0.6
 """Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay: a
 refit, which is not linear, differs from the screen by less than the rest."""
 SUSPECT = 0.5
 """Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
 candidates removed .02 and .07 of the multi-step error."""
+
+HELD = 0.2
+"""Standard deviation of declared numbers in a search by multi-step errors over the declared one: likelihood counts rows
+that follow each other as independent, and would bend the numbers by many of them to stand for what is missing."""
+FOLLOWED = 0.5
+"""Share of the sequences that the first round follows: over the whole length, or as many rows as so many keep."""
+REPEATS = 0.2
+"""Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
+differ by up to .13, others by .25 and more."""
+COARSE = 0.1
+"""Variance of rounding to the steps of a reading, over that of its noise, from which on steps are an effect."""
+FINEST = 0.25
+"""Smallest share of an estimated variance of a reading that is noise beside the rounding in it."""
 
 
 class Bars(NamedTuple):
@@ -76,32 +100,43 @@ class Share(NamedTuple):
         return min(self.inside, self.left_out)
 
 
-def admissible(share: Share, floor: float, multiple: float, *, linear: bool, answers: bool) -> bool:
-    """True for a law whose share the parts confirm.
+def sensible(multiple: float, far: float, survived: float, *, linear: bool) -> bool:
+    """True for a law that a fit may reach and that the nuisance cannot stand for.
 
-    `multiple` is the fitted multiple of its probe.  A free function of an input `answers` any disturbance under
-    feedback, and has to remove the floor on every part.
+    `multiple` is the fitted multiple of its probe, `far` the distance of a linear law from none in standard deviations
+    of its prior, `survived` the share of its columns that friction and parameters cannot give.
     """
-    if not linear and not PROBE[0] < multiple < PROBE[1]:
-        return False
-    return agreed(share.folds, floor, answers=answers)
+    return (linear or PROBE[0] < multiple < PROBE[1]) and far < FAR and survived >= SURVIVES
 
 
 def agreed(folds: Sequence[float], floor: float, *, answers: bool = False) -> bool:
-    """True where the error falls on most parts and rises on none by much."""
+    """True where the error falls on most parts and rises on none by much.
+
+    A free function of an input `answers` any disturbance under feedback, and has to remove the floor on every part.
+    """
     if answers:
         return min(folds) >= floor
     return sum(fold > 0 for fold in folds) >= AGREE * len(folds) and min(folds) > -HARM * floor
 
 
-def required(bar: float, signals: int) -> float:
-    """Share that a law must reach: the bar, higher by the odds for a free function of so many signals (named: 0)."""
-    return bar / NAMED**signals
+def odds(complexity: int) -> float:
+    """Prior odds of a law: remainders of accepted laws (-1), named laws (0), free functions by their signals."""
+    return NAMED ** (1 + complexity)
 
 
-def odds(signals: int, *, remainder: bool) -> float:
-    """Prior odds of a law in comparisons: remainders of accepted laws first, then named laws, then free functions."""
-    return 1.0 if remainder else NAMED ** (1 + signals)
+def required(bar: float, complexity: int) -> float:
+    """Share that a law must reach: the bar, higher by the odds for a free function."""
+    return bar / NAMED ** max(complexity, 0)
+
+
+def even(values: Sequence[float]) -> list[int]:
+    """Places of those that explain as much as the best."""
+    return [i for i, value in enumerate(values) if value >= EQUIVALENT * max(values)]
+
+
+def simplest(values: Sequence[float], complexities: Sequence[int], ties: Sequence[float]) -> int:
+    """The one order of laws: place of the simplest of those that explain as much as the best, then by `ties`."""
+    return min(even(values), key=lambda i: (complexities[i], -ties[i]))
 
 
 class Rejection(NamedTuple):
@@ -113,25 +148,26 @@ class Rejection(NamedTuple):
     @property
     def sentence(self) -> str:
         """The reason as a clause whose subject is the effect."""
-        return REASONS[self.code].format(self.value)
+        value = share_of(self.value, "the squared error", 1) if self.code == "small" else self.value
+        return REASONS[self.code].format(value)
 
 
 REASONS = {
     "impossible": "has a value without physical meaning after its refit",
     "uncertain": "is {:.1f} standard deviations from none after its refit",
     "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
-    "small": "removes {:.1%} of the squared error after its refit",
+    "small": "removes {} after its refit",
 }
 
 
 def veto(
-    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, signals: int
+    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, complexity: int
 ) -> Rejection | None:
     """Reason against an effect after its refit, None where there is none.
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
     one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
-    `signals` those of a free function (named: 0).
+    `complexity` that of the law.
     """
     if not possible:
         return Rejection("impossible")
@@ -139,20 +175,12 @@ def veto(
         return Rejection("uncertain", certainty)
     if not amplitude > DETERMINED:
         return Rejection("undetermined", amplitude)
-    return None if needed(removed, required(floor, signals)) else Rejection("small", removed)
+    return None if needed(removed, required(floor, complexity)) else Rejection("small", removed)
 
 
 def needed(share: float, floor: float) -> bool:
     """True for a share between two fits, with an effect and without it, that is enough for the effect."""
     return share >= KEEP * floor
-
-
-def explains(law: float, remainder: float) -> bool:
-    """True where a named law stays beside its remainder.
-
-    The law removes the share `law`, the remainder the share `remainder` of what is left then.
-    """
-    return law >= EQUIVALENT * (law + (1 - law) * remainder)
 
 
 def suspected(share: float, floor: float, chance: float) -> bool:

@@ -50,6 +50,11 @@ class EMState(NamedTuple):
     """Place in `AbstractMStep.stages` of the rule in use."""
     since: int = 0
     """Epoch from which on it is."""
+    stop: str = ""
+    """Reason of the end of the last fit: `RESTED`, `REFUSED` or `SPENT`; empty before one has ended."""
+
+
+RESTED, REFUSED, SPENT = "at rest", "no step raises the likelihood", "epochs spent"
 
 
 class FitError(RuntimeError):
@@ -186,6 +191,8 @@ def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArra
 
 
 SCHEDULE = Schedule()
+AFTERWARDS = 1 << 30
+"""First number that is folded into the key of a state for draws after its fit; smaller ones are epochs."""
 EPOCHS = 40
 """Epochs of a fit at most."""
 REST = 0.05
@@ -221,9 +228,10 @@ def fit(
         state = state._replace(model=model, best=model)
     while state.epoch < epochs:
         seen = schedule.horizon(state.epoch, longest)
-        if _rests(state, schedule, longest, tolerance if state.stage == last else COARSE):
-            if state.stage == last:
-                break
+        ended = _ended(state, schedule, longest, tolerance if state.stage == last else COARSE)
+        if ended and state.stage == last:
+            return state._replace(stop=ended)
+        if ended:
             state = _released(state)
         elif seen > schedule.horizon(max(state.epoch - 1, 0), longest):
             state = state._replace(top=np.full(state.top.size, -np.inf), stride=1.0)
@@ -243,7 +251,7 @@ def fit(
         state = _judge(state, proposal, info.hessian, np.asarray(loglik), used)
         state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         watch(state, seen, used)
-    return state
+    return state._replace(stop=SPENT)
 
 
 def _afresh(state: EMState) -> EMState:
@@ -303,9 +311,10 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
     return trials[int(np.argmax(logliks))]
 
 
-def _rests(state: EMState, schedule: Schedule, longest: int, tolerance: float) -> bool:
+def _ended(state: EMState, schedule: Schedule, longest: int, tolerance: float) -> str:
+    """Reason to end a stage of a fit; empty where there is none."""
     if state.epoch - state.since < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
-        return False
+        return ""
     if state.stride < 0.2 and math.isinf(state.ess):  # a sampled likelihood may fall by chance
-        return True
-    return bool(np.all(np.abs(np.diff(state.loglik[-3:])) < tolerance))
+        return REFUSED
+    return RESTED if np.all(np.abs(np.diff(state.loglik[-3:])) < tolerance) else ""

@@ -14,7 +14,7 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
+from ..em.loop import AFTERWARDS, EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
 from ..em.mstep import ScoringMStep, kept
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
@@ -43,7 +43,7 @@ class Identified(NamedTuple):
     smoother: AbstractSmoother
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     discrepancy: float = 0.0
-    """Size of the forces that no part of the model describes (`stated.widened`); 0 where readings are white noise."""
+    """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
     memory: str = ""
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
     rise: float = 0.0
@@ -140,12 +140,10 @@ PARTS = 2
 def finished(fitted: Identified, data: Dataset) -> Identified:
     """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
 
-    Only where the noise of the readings is not that of the model: elsewhere one-step likelihood is efficient, and its
+    Where it does not and the noise of the readings is that of the model, one-step likelihood is efficient, and its
     curvature is its precision.
     """
     data = jax.device_put(data)
-    if white_readings(data, fitted.model):
-        return fitted
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
     if used.sum() < PARTS:
@@ -159,9 +157,12 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
-        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian))
+        top = np.where(np.asarray(info.used), np.asarray(posterior.loglik), np.nan)
+        fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian, top=top))
+    elif white_readings(data, fitted.model):
+        return fitted
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, 1))
+    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, AFTERWARDS))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..effects import fields
 from ..em.local import locals_along
-from ..em.loop import EMState, FitError, Schedule, e_step, fit, later_state
+from ..em.loop import AFTERWARDS, EMState, FitError, Schedule, e_step, fit, later_state
 from ..em.mstep import ScoringMStep, kept
 from ..em.prior import ParameterPrior
 from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
@@ -264,13 +264,13 @@ def remember(
     """The static fit `state`, or where data show memory a fit with a contact in each joint that shows it.
 
     A joint whose friction the model lacks pushes the others too: the one that shows memory best goes first, and the
-    others are screened again with it in the model.
+    others are screened again with it in the model, or without it where it is refused.
     """
     fitted = _smoothed(state, rule, smoother, data)
     joints = range(len(fitted.model.system.coordinates))
     sentences: dict[int, str] = {}
     for _ in joints:
-        left = [j for j in joints if not sentences.get(j, "").startswith(FOUND)]
+        left = [j for j in joints if not sentences.get(j, "").startswith((FOUND, REFUSED))]
         scales = sizes(fitted.model, fitted.path, data, fitted.used)
         steps = np.geomspace(scales.shortest, scales.longest, DISTANCES)
         tries = [
@@ -286,9 +286,8 @@ def remember(
         trial = _with(fitted, bristle, smoother, data, epochs=epochs, watch=watch)
         accepted, reason = _judged(fitted, trial, data)
         sentences[j] = f"{FOUND if accepted else REFUSED} ({reason})"
-        if not accepted or trial is None:
-            break
-        fitted = trial
+        if accepted and trial is not None:
+            fitted = trial
     return Remembered(fitted.state, fitted.rule, tuple(f"joint {j + 1}: {sentences[j]}" for j in joints))
 
 
@@ -303,7 +302,8 @@ def _with(
 ) -> _Fit | None:
     """EM from a fit on, over whole sequences, with a contact more; None where it diverges."""
     model, rule = with_contacts(straight_at_rest(fitted.model, [bristle]), fitted.rule, [bristle])
-    begin, before = later_state(model, rule, key=jax.random.fold_in(fitted.state.key, 1)), fitted.state.epoch
+    key = jax.random.fold_in(fitted.state.key, AFTERWARDS + bristle.joint)
+    begin, before = later_state(model, rule, key=key), fitted.state.epoch
     blank = np.full(len(data.t), -np.inf)
     begin = begin._replace(top=blank, loglik=blank[:1])
 

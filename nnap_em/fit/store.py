@@ -178,8 +178,10 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
             # numbers that effects and models have had since
-            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest"))
-            return value if since and value is None else differs(place, "missing in the file")
+            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest", "/stop"))
+            return (
+                value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
+            )
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":

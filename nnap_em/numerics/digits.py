@@ -28,6 +28,15 @@ def number(value: Any, digits: int = 3) -> str:
     return _minus(f"{value / 10.0**size:.{digits - 1}f}") + power(size)
 
 
+def share_of(share: float, whole: str, places: int = 0) -> str:
+    """A share of a squared error as a percentage; beyond 1 and -1, where it is none, in words."""
+    if share > 1:
+        return f"more than all of {whole}"
+    if share < -1:
+        return f"none of {whole}, which grows to {number(1 - share)} times itself"
+    return f"{share:.{places}%} of {whole}"
+
+
 def with_std(value: Any, std: Any) -> str:
     """A value and its standard deviation, both to the second digit of the latter."""
     if not finite(value) or not finite(std) or std <= 0:

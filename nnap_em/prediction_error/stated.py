@@ -106,9 +106,10 @@ def of_states(
 
     The smoother is linear about its path: the mean square of what each draw moves there.
     """
+    key_columns, key_kicks = jax.random.split(key)
     weights = m_step.weights(model)
-    other = discrepancy_columns(model, weights, path, data, np.ones(len(data.t), bool), key=key)
-    kicks = force * jax.random.normal(jax.random.fold_in(key, 1), (phi.shape[0], other.force.shape[1]), phi.dtype)
+    other = discrepancy_columns(model, weights, path, data, np.ones(len(data.t), bool), key=key_columns)
+    kicks = force * jax.random.normal(key_kicks, (phi.shape[0], other.force.shape[1]), phi.dtype)
     linear = locals_along(model, m_step.prior, path, data, m_step.linearise)
     common = model.log_q, model.log_r, model.start, weights.nodes, jnp.concatenate([phi, kicks], axis=1)
     return each(_moved, common, (linear, path.mean, other))

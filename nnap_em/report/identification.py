@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..data.logs import Logs
 from ..diagnose.keys import listed
 from ..em.build import build_system
+from ..em.loop import REFUSED
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import misfits, moved
 from ..fit.predict import smooth
@@ -82,6 +83,7 @@ def write_identification(
         "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
         "contacts": [bristle.document() for bristle in bristles],
         "log_likelihood": fitted.state.loglik.tolist(),
+        "reached": float(np.nanmean(fitted.state.top)),
         "epochs": entries,
         "left_out": entries[-1]["left_out"],
         "visited": ranges,
@@ -102,6 +104,7 @@ def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
     early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
+    rested += f", until {fitted.state.stop}" * (fitted.state.stop == REFUSED)
     text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
     first = [f"The fit does not describe the motion, do not use it: {'; '.join(misfit)}."] * bool(misfit)
     return " ".join([*first, text, *(one.sentence for one in moved(fitted))])

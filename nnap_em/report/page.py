@@ -117,7 +117,7 @@ def _environment() -> jinja2.Environment:
         loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["grouped"] = grouped
-    names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence")
+    names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence", "share")
     environment.filters |= {name: getattr(wording, name) for name in names} | {
         "trust": _trust,
         "highest": _highest,
@@ -138,11 +138,12 @@ def _environment() -> jinja2.Environment:
 
 
 def _error_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Title, number and remark of the errors about 1 s ahead of the first two columns."""
+    """Title, number and remark of the errors about 1 s ahead, of the two columns that change most by the effects."""
     error, units = document.get("error") or {}, document.get("units") or {}
     horizons, after = reached(error), error.get("after") or {}
-    tiles = []
-    for column, values in list((error.get("before") or error.get("fit") or {}).items())[:2]:
+    grows, tiles = growth(error) if document.get("effects") else {}, []
+    columns = (error.get("before") or error.get("fit") or {}).items()
+    for column, values in sorted(columns, key=lambda entry: -abs(grows.get(entry[0], 0.0)))[:2]:
         if not horizons:
             break
         place = min(range(len(horizons)), key=lambda i: abs(horizons[i] - 1.0))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..diagnose.keys import words
-from ..numerics.digits import finite, number, ten, with_std
+from ..numerics.digits import finite, number, share_of, ten, with_std
 
 
 def chance(p: float) -> str:
@@ -40,6 +40,11 @@ def reached(error: Mapping[str, Any]) -> list[float]:
     """
     horizons, reach = error.get("horizons_s") or [], error.get("reach_s", math.inf)
     return [min(horizon, reach) for before, horizon in itertools.pairwise([0.0, *horizons]) if before < reach]
+
+
+def share(value: float) -> str:
+    """A share of the error as a percentage, as far as it is one."""
+    return share_of(value, "the error").replace("%", " %")
 
 
 def quantity(entry: Mapping[str, Any]) -> str:

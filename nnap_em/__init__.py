@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .em.loop import EMState, FitError, Schedule
     from .fit.branches import Branch, branches
     from .fit.identify import Identified, friction_table, identify, parameter_table
+    from .fit.observer import Observation, Observer, observer
     from .fit.predict import Prediction, horizon_errors, predict, smooth
     from .fit.store import load, save
     from .identifiability.check import CheckResult, check
@@ -62,6 +63,8 @@ __all__ = [
     "Identified",
     "Logs",
     "MixtureSmoother",
+    "Observation",
+    "Observer",
     "ParticleSmoother",
     "Posterior",
     "Prediction",
@@ -85,6 +88,7 @@ __all__ = [
     "horizon_errors",
     "identify",
     "load",
+    "observer",
     "over",
     "pad",
     "paper_experiment",
@@ -122,6 +126,7 @@ _homes = {
     "model.friction": ("FrictionNetwork",),
     "fit.branches": ("Branch", "branches"),
     "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "fit.observer": ("Observation", "Observer", "observer"),
     "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),

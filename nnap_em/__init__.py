@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from .portable.c99 import write_c
     from .portable.draws import write_draws
     from .portable.export import ExportError, export
+    from .portable.fmu import write_fmu
     from .portable.mjcf import write_mjcf
+    from .portable.online import write_observer
     from .portable.urdf import write_urdf
     from .smoother.gaussian import ExtendedKalmanSmoother
     from .smoother.mixture import MixtureSmoother
@@ -104,7 +106,9 @@ __all__ = [
     "specs",
     "write_c",
     "write_draws",
+    "write_fmu",
     "write_mjcf",
+    "write_observer",
     "write_rig",
     "write_urdf",
 ]
@@ -120,6 +124,8 @@ _homes = {
     "portable.export": ("ExportError", "export"),
     "portable.c99": ("write_c",),
     "portable.draws": ("write_draws",),
+    "portable.fmu": ("write_fmu",),
+    "portable.online": ("write_observer",),
     "portable.mjcf": ("write_mjcf",),
     "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),

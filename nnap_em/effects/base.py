@@ -127,7 +127,7 @@ class Stream(NamedTuple):
     """A law of the command over time as a filter: what it remembers of earlier rows, and its step."""
 
     memory: Float[Array, " memory"]
-    """Before the first row."""
+    """Memory before the first row."""
     step: Callable[[Float[Array, " memory"], Scalar], tuple[Float[Array, " memory"], Scalar]]
     """Function of the memory and the command of a row: the memory after it, and the command that arrives."""
 

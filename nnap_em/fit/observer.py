@@ -47,7 +47,7 @@ class Observation(NamedTuple):
     """State of an observer after a row: the estimate, its test, and what the next row needs."""
 
     mean: Float[Array, " state"]
-    """Of the likeliest branch: coordinates, rates, memory of laws [rad and rad/s, or m and m/s]."""
+    """Mean of the likeliest branch: coordinates, rates, memory of laws [rad and rad/s, or m and m/s]."""
     cov: Float[Array, "state state"]
     innovation: Float[Array, " obs"]
     """Readings minus their prediction, over the standard deviation, one at a time; 0 where there was none."""
@@ -70,7 +70,7 @@ class Observation(NamedTuple):
     late: Float[Array, " obs"]
     """Readings that wait for the input of their row; NaN where none does."""
     time: Float[Array, ""]
-    """Of the row, on the clock of the logs [s]."""
+    """Time of the row, on the clock of the logs [s]."""
     age: Float[Array, ""]
     """Since the first row [s]; below 0 before it."""
     rows: Int[Array, ""]
@@ -137,10 +137,12 @@ def functions(
 
     def start(time: float | Float[Array, ""] = 0.0) -> Observation:
         nothing, time = jnp.zeros(len(waits), dtype), jnp.asarray(time, dtype)
+        every, log_weight = alone(model.start)
         return Observation(
-            *model.start, nothing, zero + 1, zero + 1, jnp.asarray(0), *alone(model.start), commands.memory,
-            jnp.zeros(columns, dtype), jnp.zeros(drives, dtype), nothing + jnp.nan, time - model.dt, zero - model.dt,
-            jnp.asarray(0),
+            mean=model.start.mean, cov=model.start.cov, innovation=nothing, misfit=zero + 1, weight=zero + 1,
+            flags=jnp.asarray(0), branches=every, log_weight=log_weight, commands=commands.memory,
+            u=jnp.zeros(columns, dtype), fed=jnp.zeros(drives, dtype), late=nothing + jnp.nan, time=time - model.dt,
+            age=zero - model.dt, rows=jnp.asarray(0),
         )  # fmt: skip
 
     def step(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
@@ -188,10 +190,12 @@ def functions(
         beyond = jnp.any(innovation[best] ** 2 > gate**2) & sane
         bits = (MISSING, ~jnp.all(read)), (OUTLIER, beyond), (NO_INPUT, ~jnp.all(sound) & ~first), (RESTARTED, ~sane)
         flags = sum(jnp.where(held, bit, 0) for bit, held in (*bits, (AMBIGUOUS, weight < 1 - LEAST)))
+        mean, cov = jax.tree.map(lambda a: a[best], every)
         return Observation(
-            *jax.tree.map(lambda a: a[best], every), jnp.where(sane, innovation[best], 0.0),
-            jnp.where(sane, misfit, 1.0), weight, cast(Array, flags), every, log_weight - log_weight[best], memory,
-            u, fed, jnp.where(read & waits, y, jnp.nan), time, age, jnp.where(sane, state.rows + 1, 1),
+            mean=mean, cov=cov, innovation=jnp.where(sane, innovation[best], 0.0), misfit=jnp.where(sane, misfit, 1.0),
+            weight=weight, flags=cast(Array, flags), branches=every, log_weight=log_weight - log_weight[best],
+            commands=memory, u=u, fed=fed, late=jnp.where(read & waits, y, jnp.nan), time=time, age=age,
+            rows=jnp.where(sane, state.rows + 1, 1),
         )  # fmt: skip
 
     return start, jax.jit(step)

@@ -18,7 +18,7 @@ class CommandStream(NamedTuple):
     """The commands of a row to what is set at the drives, with what is remembered of earlier rows."""
 
     memory: Any
-    """Before the first row; arrays for every drive."""
+    """Memory before the first row; arrays for every drive."""
     step: Callable[[Any, Float[Array, " column"], Any], tuple[Any, Float[Array, " input"]]]
     """Function of the memory, a row of input columns and the mask of the first row: the memory after it, and the values
     that the commands set (`Inputs.u`)."""

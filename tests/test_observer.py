@@ -9,7 +9,7 @@ import pytest
 from helpers import slide
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
+from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.effects import catalogue
 from nnap_em.fit import observer as observing
 from nnap_em.fit.identify import begin
@@ -23,6 +23,7 @@ from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.kalman import CUBATURE, TANGENT, ekf
 from nnap_em.smoother.mixture import mixture_filter
+from nnap_em.systems import specs
 
 NUMBER = lambda x: jnp.asarray(x, float)  # noqa: E731
 ROWS = 60
@@ -237,3 +238,42 @@ def test_the_observer_of_a_fit_has_its_names():
     filtered = ekf(fitted.model, fitted.model.start, prepare(fitted.model, one))
     np.testing.assert_allclose(states.mean[-1], filtered.state.mean[-1], atol=1e-3)
     assert isinstance(restart_prior(fitted.model), Gaussian)
+
+
+CART = """<mujoco><option gravity="0 0 0"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" stiffness="20"/>
+<geom type="box" size=".1 .1 .1" mass="1.2"/><site name="s"/></body></worldbody>
+<actuator><motor name="push" joint="x"/></actuator><sensor><accelerometer name="acc" site="s"/></sensor></mujoco>"""
+CART_RIG = """format = 1
+name = "cart"
+[model]
+type = "mjcf"
+file = "cart.xml"
+friction = "none"
+[sampling]
+dt = 0.05
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["x", "acc.x"]
+noise_std = { x = 0.05, "acc.x" = 0.1 }
+"""
+
+
+def test_an_acceleration_counts_when_its_input_is_known(tmp_path):
+    """One row later: in rows without an acceleration the estimate is that of the filter again."""
+    (tmp_path / "cart.xml").write_text(CART)
+    (tmp_path / "rig.toml").write_text(CART_RIG)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    t = 0.05 * np.arange(ROWS)
+    u, rng = np.sin(2 * t)[:, None], np.random.default_rng(0)
+    y = np.stack([0.3 * np.sin(2 * t), np.sin(2 * t) / 1.2], axis=1) + 0.05 * rng.normal(size=(ROWS, 2))
+    y[::2, 1] = np.nan
+    one = jax.tree.map(jnp.asarray, Dataset(t, u, y, np.ones(ROWS, bool)))
+    fitted = begin(rig, jax.tree.map(lambda a: a[None], one), key=jax.random.key(0))
+    filtered = ekf(fitted.model, fitted.model.start, prepare(fitted.model, one), CUBATURE)
+    online = observer(fitted)
+    states = _replay(online.start, online.step, one)
+    np.testing.assert_allclose(states.mean[::2], filtered.state.mean[::2], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(states.cov[::2], filtered.state.cov[::2], rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(states.innovation[2::2, 1], filtered.innovation[1:-1:2, 1], rtol=1e-8, atol=1e-9)
+    assert np.max(np.abs(states.mean[1::2] - filtered.state.mean[1::2])) > 1e-4

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from observer import SANITIZED, held, play, replay, rough, wild
+from observer_c import SANITIZED, held, paper_rig, play, replay, rough, wild
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
@@ -115,8 +115,6 @@ def test_float_is_within_a_hundredth_of_a_standard_deviation(plain, tmp_path):
 @pytest.fixture(scope="module")
 def acrobot(tmp_path_factory):
     """The paper's acrobot with theta2 hidden, its friction that of the truth."""
-    from observer import paper_rig
-
     truth = paper_model()
     log = paper_experiment(truth, 1, 399, key=jax.random.key(3))
     fitted = begin(paper_rig(), log.data, key=jax.random.key(0))

@@ -193,5 +193,5 @@ def _c(node: ast.AST, dialect: Dialect) -> str:
         case ast.Call(func=ast.Name(id=name), args=args):
             return f"{name}({', '.join(_c(a, dialect) for a in args)})"
         case ast.Call(func=ast.Attribute(value=inner, attr="astype")):
-            return f"whole({_c(inner, dialect)})"
+            return f"whole({_c(inner, dialect)})".replace("(trunc(", "((").replace("(truncf(", "((")
     raise ExportError(f"{ast.unparse(node)!r} has no plain C form; use nnap-em export --out for NumPy")

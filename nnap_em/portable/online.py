@@ -21,7 +21,7 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE
 from ..storage.files import replace_text
 from .c99 import WHOLE, Dialect, function
-from .export import unrolled
+from .export import ExportError, unrolled
 from .unroll import named
 
 BRANCHES = 16
@@ -186,7 +186,10 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
         read = prior.write(model, p[: prior.size]).emission
         return read(x, inputs(row)), jax.jacfwd(read)(x, inputs(row))
 
-    stream = hooks.command_stream(model.effects, model.servos, system, model.dt)
+    try:
+        stream = hooks.command_stream(model.effects, model.servos, system, model.dt)
+    except ValueError as error:
+        raise ExportError(str(error)) from None
     flat, unravel = ravel_pytree(stream.memory)
 
     def commands(memory, u, first, p):

@@ -87,7 +87,7 @@ class _Writer:
             return number.item() if isinstance(number, np.ndarray) else number
         if (plain := _simpler(form, values)) is not None:
             return plain
-        key = (form, *((type(value), value) for value in values))
+        key = (form, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
         if key not in self.known:
             self.known[key] = name = f"t{len(self.lines)}"
             self.lines[name] = (form.format(*map(_text, values)), values)

@@ -240,7 +240,8 @@ def test_the_observer_of_a_fit_has_its_names():
     assert isinstance(restart_prior(fitted.model), Gaussian)
 
 
-CART = """<mujoco><option gravity="0 0 0"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" stiffness="20"/>
+CART = """<mujoco><option gravity="0 0 0"/><worldbody><body name="cart">
+<joint name="x" type="slide" axis="1 0 0" stiffness="20"/>
 <geom type="box" size=".1 .1 .1" mass="1.2"/><site name="s"/></body></worldbody>
 <actuator><motor name="push" joint="x"/></actuator><sensor><accelerometer name="acc" site="s"/></sensor></mujoco>"""
 CART_RIG = """format = 1

@@ -179,6 +179,7 @@ def functions(
         misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (mean_square - state.misfit)
         known = jnp.all(jnp.abs(every.mean[best]) < FAR) & jnp.all(jnp.isfinite(every.cov[best]))
         sane = (misfit < DIVERGED) & known & jnp.isfinite(log_weight[best])
+        innovation = jnp.where(sane, innovation[best], 0.0)
 
         values, seen = jnp.where(read, y, 0.0), read & ~waits
         afresh, *_ = absorbed(again, linear_reading(model, again.mean, here), r, values, seen)
@@ -187,12 +188,17 @@ def functions(
             every, log_weight = _branched(every, log_weight, angles)
         best = jnp.argmax(log_weight)
         weight = 1 / jnp.sum(jnp.exp(log_weight - log_weight[best]))
-        beyond = jnp.any(innovation[best] ** 2 > gate**2) & sane
-        bits = (MISSING, ~jnp.all(read)), (OUTLIER, beyond), (NO_INPUT, ~jnp.all(sound) & ~first), (RESTARTED, ~sane)
-        flags = sum(jnp.where(held, bit, 0) for bit, held in (*bits, (AMBIGUOUS, weight < 1 - LEAST)))
+        bits = {
+            MISSING: ~jnp.all(read),
+            OUTLIER: jnp.any(innovation**2 > gate**2),
+            NO_INPUT: ~jnp.all(sound) & ~first,
+            RESTARTED: ~sane,
+            AMBIGUOUS: jnp.sum(jnp.isfinite(log_weight)) > 1,
+        }
+        flags = sum(jnp.where(holds, bit, 0) for bit, holds in bits.items())
         mean, cov = jax.tree.map(lambda a: a[best], every)
         return Observation(
-            mean=mean, cov=cov, innovation=jnp.where(sane, innovation[best], 0.0), misfit=jnp.where(sane, misfit, 1.0),
+            mean=mean, cov=cov, innovation=innovation, misfit=jnp.where(sane, misfit, 1.0),
             weight=weight, flags=cast(Array, flags), branches=every, log_weight=log_weight - log_weight[best],
             commands=memory, u=u, fed=fed, late=jnp.where(read & waits, y, jnp.nan), time=time, age=age,
             rows=jnp.where(sane, state.rows + 1, 1),

@@ -171,28 +171,6 @@ EXPORT fmi3Status fmi3DoStep(void *x, double from, double step, bool keep, bool 
     return fmi3OK;
 }
 
-EXPORT fmi3Status fmi3GetFMUState(void *f, void **state)
-{
-    if (!*state) *state = malloc(sizeof(instance));
-    if (!*state) return fmi3Error;
-    memcpy(*state, f, sizeof(instance));
-    return fmi3OK;
-}
-
-EXPORT fmi3Status fmi3SetFMUState(void *f, void *state)
-{
-    memcpy(f, state, sizeof(instance));
-    return fmi3OK;
-}
-
-EXPORT fmi3Status fmi3FreeFMUState(void *f, void **state)
-{
-    (void)f;
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-
 #define ABSENT(name) EXPORT fmi3Status fmi3##name(void) { return fmi3Error; }
 #define VALUES(type) ABSENT(Get##type) ABSENT(Set##type)
 VALUES(Float32) VALUES(Int8) VALUES(UInt8) VALUES(Int16) VALUES(UInt16) VALUES(UInt32) VALUES(Int64) VALUES(UInt64)
@@ -200,6 +178,7 @@ VALUES(Boolean) VALUES(String) VALUES(Binary) VALUES(Clock) VALUES(IntervalDecim
 VALUES(ShiftDecimal) VALUES(ShiftFraction) VALUES(ContinuousStates)
 ABSENT(SetInt32) ABSENT(EnterEventMode) ABSENT(EnterStepMode) ABSENT(EnterConfigurationMode)
 ABSENT(ExitConfigurationMode) ABSENT(GetNumberOfVariableDependencies) ABSENT(GetVariableDependencies)
+ABSENT(GetFMUState) ABSENT(SetFMUState) ABSENT(FreeFMUState)
 ABSENT(SerializedFMUStateSize) ABSENT(SerializeFMUState) ABSENT(DeserializeFMUState) ABSENT(GetDirectionalDerivative)
 ABSENT(GetAdjointDerivative) ABSENT(EvaluateDiscreteStates) ABSENT(UpdateDiscreteStates) ABSENT(SetTime)
 ABSENT(EnterContinuousTimeMode) ABSENT(CompletedIntegratorStep) ABSENT(GetContinuousStateDerivatives)

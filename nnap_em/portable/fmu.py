@@ -81,7 +81,7 @@ def _description(fitted: Identified, name: str, token: str) -> ET.Element:
         generationTool=f"nnap_em {__version__}", description=f"Observer of {rig.name}",
     )  # fmt: skip
     step = {"fixedInternalStepSize": repr(rig.dt), "canHandleVariableCommunicationStepSize": "true"}
-    ET.SubElement(root, "CoSimulation", {"modelIdentifier": name, "canGetAndSetFMUState": "true", **step})
+    ET.SubElement(root, "CoSimulation", {"modelIdentifier": name, **step})
     definitions = ET.SubElement(root, "UnitDefinitions")
     for unit in dict.fromkeys(unit for _, unit in (*inputs, *outputs, *parameters) if unit):
         ET.SubElement(definitions, "Unit", name=unit)

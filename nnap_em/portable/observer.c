@@ -249,7 +249,6 @@ static void report(nnap_state *s, int best)
         s->mean[i] = s->branch[best].mean[i];
         s->std[i] = SQRT(square);
     }
-    for (int i = 0; i < M; i++) s->innovation[i] = s->branch[best].innovation[i];
     const real top = s->branch[best].log_weight;
     for (int k = 0; k < s->live; k++) s->branch[k].log_weight -= top;
 }
@@ -306,6 +305,7 @@ static int row(nnap_state *s, const real *u, const real *y)
         const real square = s->branch[best].innovation[i] * s->branch[best].innovation[i];
         sum += square < GATE * GATE ? square : GATE * GATE;
         beyond = beyond || square > gate * gate;
+        s->innovation[i] = s->branch[best].innovation[i];
         s->late[i] = isfinite(y[i]) && waits[i] ? y[i] : NAN;
     }
     if (count) s->misfit += FORGET * (sum / count - s->misfit);
@@ -315,7 +315,7 @@ static int row(nnap_state *s, const real *u, const real *y)
         alone(s, again_mean, again_root);
         absorb(in, s->parameter, value, now, INFINITY, &s->branch[0]);
         s->branch[0].log_weight = 0;
-        for (int i = 0; i < M; i++) s->branch[0].innovation[i] = 0;
+        for (int i = 0; i < M; i++) s->innovation[i] = 0;
         if (!sound(&s->branch[0])) alone(s, again_mean, again_root);
         s->misfit = 1;
         s->rows = 1;
@@ -344,6 +344,7 @@ void nnap_start(nnap_state *s, double time)
     s->age = -DT;
     s->rows = 0;
     s->misfit = 1;
+    for (int i = 0; i < M; i++) s->innovation[i] = 0;
     report(s, 0);
 }
 

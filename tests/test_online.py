@@ -139,6 +139,7 @@ def test_wild_input_leaves_numbers_and_no_fault(which, request, tmp_path):
         source = tmp_path / f"wild{single}.c"
         write_observer(fitted, source, single=single)
         assert all(wild(source, 3_000, *SANITIZED)[k] > 0 for k in (0, 2, 3))
+        assert wild(source, 30_000)  # some faults take longer to meet, as branches of which one is impossible
 
 
 def test_stamps_say_which_rows_are_missing(plain):
@@ -183,6 +184,8 @@ def test_nothing_is_written_where_a_law_has_no_c_form(tmp_path, monkeypatch):
     def refused(*args, **names):
         raise ExportError("no form")
 
+    with pytest.raises(ExportError, match="a file that ends in"):
+        write_observer(_fit(), tmp_path / "arm.h")
     monkeypatch.setattr(online, "unrolled", refused)
     with pytest.raises(ExportError):
         write_observer(_fit(), tmp_path / "arm.c")

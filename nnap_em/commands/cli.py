@@ -293,6 +293,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.error("--particles goes with --smoother particle")
     if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c, args.observer, args.fmu)):
         arguments.error("say where to: --out OUT, --mjcf, --urdf, --c, --observer or --fmu FILE")
+    if args.command == "export" and args.float and not (args.observer or args.fmu):
+        arguments.error("--float goes with --observer or --fmu")
     if args.command == "export" and args.draws and args.out is None:
         arguments.error("--draws goes with --out OUT, the folder for the files")
     try:

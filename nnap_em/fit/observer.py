@@ -7,7 +7,7 @@ it an online estimate has a gate for outliers, an end of branches that lose, and
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -94,6 +94,25 @@ class Observer(NamedTuple):
     """Columns of `y`."""
 
 
+class _Row(NamedTuple):
+    """Inputs and readings of one row, as the filter takes them."""
+
+    first: Bool[Array, ""]
+    u: Float[Array, " column"]
+    memory: Any
+    y: Float[Array, " obs"]
+    read: Bool[Array, " obs"]
+    late: Float[Array, " obs"]
+    gate: Float[Array, ""]
+    held: Inputs
+    """Inputs over the interval before the row."""
+    here: Inputs
+    """Inputs at its readings."""
+    flags: Int[Array, ""]
+    time: Float[Array, ""]
+    age: Float[Array, ""]
+
+
 def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cubature = CUBATURE) -> Observer:
     """The model of a fit as an online estimator, a row every `rig.dt` seconds.
 
@@ -145,72 +164,64 @@ def functions(
             age=zero - model.dt, rows=jnp.asarray(0),
         )  # fmt: skip
 
-    def step(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
-        first, sound = state.age < -0.5 * model.dt, jnp.isfinite(u)
+    def taken(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
+        first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
         u = jnp.where(first, 0.0, jnp.where(sound, u, state.u))
-        gate = jnp.where(state.rows < SETTLING, jnp.inf, GATE)
         memory, fed = commands.step(state.commands, u, state.age < 0.5 * model.dt)
         memory, fed = jax.tree.map(lambda a, b: jnp.where(first, a, b), (state.commands, state.fed), (memory, fed))
-        scale = u[drives:] if columns > drives else None
-        held = Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale)
-        time, age = state.time + model.dt, state.age + model.dt
-        here = Inputs(fed, fed, time + 0.5 * model.dt, age, scale)  # of these, no reading but those that wait has `u`
-        read, before = jnp.isfinite(y), jnp.isfinite(state.late)
+        scale, time, age = u[drives:] if columns > drives else None, state.time + model.dt, state.age + model.dt
+        return _Row(
+            first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
+            late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),
+            held=Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale),
+            here=Inputs(fed, fed, time + 0.5 * model.dt, age, scale),  # `fed` stands for what is not decided yet
+            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & ~first}), time=time, age=age,
+        )  # fmt: skip
 
-        def row(x: Gaussian):
-            late = nothing_read(x, len(waits))
-            if waits.any():
-                late = absorbed(
-                    x, linear_reading(model, x.mean, held), r, jnp.where(before, state.late, 0.0), before, gate
-                )
-            _, ahead = moved(late[0], linearise(model, late[0], held), q, ~first)
-            values = jnp.where(read, y, 0.0)
-            now = absorbed(ahead, linear_reading(model, ahead.mean, here), r, values, read & ~waits, gate)
-            return now[0], late[1] + now[1], late[2] + now[2]
+    def filtered(x: Gaussian, row: _Row, late: Float[Array, " obs"]) -> tuple[Gaussian, Array, Array]:
+        before = jnp.zeros_like(late), jnp.zeros_like(late)
+        if waits.any():
+            y, waited = jnp.nan_to_num(late), jnp.isfinite(late)
+            x, *before, _ = absorbed(x, linear_reading(model, x.mean, row.held), r, y, waited, row.gate)
+        _, ahead = moved(x, linearise(model, x, row.held), q, ~row.first)
+        now = absorbed(ahead, linear_reading(model, ahead.mean, row.here), r, row.y, row.read, row.gate)
+        return now[0], before[0] + now[1], before[1] + now[2]
 
-        live = jnp.isfinite(state.log_weight)
+    def step(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
+        row, live = taken(state, u, y), jnp.isfinite(state.log_weight)
         best = jnp.argmax(state.log_weight)
-        every, innovation, log_variance = _every(row, state.branches, best, jnp.sum(live) == 1)
-        lost = jnp.sum(jnp.minimum(innovation**2, gate**2) + log_variance, axis=1)
+        every, innovation, log_variance = _every(
+            lambda x: filtered(x, row, state.late), state.branches, best, jnp.sum(live) == 1
+        )
+        lost = jnp.sum(jnp.minimum(innovation**2, row.gate**2) + log_variance, axis=1)
         log_weight = jnp.where(live & jnp.isfinite(lost), state.log_weight - 0.5 * lost, -jnp.inf)
         best = jnp.argmax(log_weight)
-        squared, count = jnp.minimum(innovation[best] ** 2, GATE**2), jnp.sum(read & ~waits) + jnp.sum(before)
-        mean_square = jnp.sum(squared) / jnp.maximum(count, 1).astype(dtype)
-        misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (mean_square - state.misfit)
+        count = jnp.sum(row.read) + jnp.sum(jnp.isfinite(state.late))
+        square = jnp.sum(jnp.minimum(innovation[best] ** 2, GATE**2)) / jnp.maximum(count, 1).astype(dtype)
+        misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (square - state.misfit)
         known = jnp.all(jnp.abs(every.mean[best]) < FAR) & jnp.all(jnp.isfinite(every.cov[best]))
         sane = (misfit < DIVERGED) & known & jnp.isfinite(log_weight[best])
         innovation = jnp.where(sane, innovation[best], 0.0)
 
-        values, seen = jnp.where(read, y, 0.0), read & ~waits
-        afresh, *_ = absorbed(again, linear_reading(model, again.mean, here), r, values, seen)
+        afresh, *_ = absorbed(again, linear_reading(model, again.mean, row.here), r, row.y, row.read)
         every, log_weight = jax.tree.map(lambda a, b: jnp.where(sane, a, b), (every, log_weight), alone(afresh))
         if branches > 1:
             every, log_weight = _branched(every, log_weight, angles)
         best = jnp.argmax(log_weight)
-        weight = 1 / jnp.sum(jnp.exp(log_weight - log_weight[best]))
-        bits = {
-            MISSING: ~jnp.all(read),
-            OUTLIER: jnp.any(innovation**2 > gate**2),
-            NO_INPUT: ~jnp.all(sound) & ~first,
-            RESTARTED: ~sane,
-            AMBIGUOUS: jnp.sum(jnp.isfinite(log_weight)) > 1,
-        }
-        flags = sum(jnp.where(holds, bit, 0) for bit, holds in bits.items())
-        mean, cov = jax.tree.map(lambda a: a[best], every)
+        (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
+        outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
         return Observation(
             mean=mean, cov=cov, innovation=innovation, misfit=jnp.where(sane, misfit, 1.0),
-            weight=weight, flags=cast(Array, flags), branches=every, log_weight=log_weight - log_weight[best],
-            commands=memory, u=u, fed=fed, late=jnp.where(read & waits, y, jnp.nan), time=time, age=age,
-            rows=jnp.where(sane, state.rows + 1, 1),
+            weight=1 / jnp.sum(jnp.exp(log_weight)), branches=every, log_weight=log_weight, commands=row.memory,
+            flags=row.flags + _bits({OUTLIER: outlier, RESTARTED: ~sane, AMBIGUOUS: ambiguous}), u=row.u,
+            fed=row.held.u, late=row.late, time=row.time, age=row.age, rows=jnp.where(sane, state.rows + 1, 1),
         )  # fmt: skip
 
     return start, jax.jit(step)
 
 
-def nothing_read(x: Gaussian, readings: int) -> tuple[Gaussian, Float[Array, " obs"], Float[Array, " obs"]]:
-    """Outcome of `absorbed` where there is nothing to absorb."""
-    none = jnp.zeros(readings, x.mean.dtype)
-    return x, none, none
+def _bits(flags: dict[int, Bool[Array, ""]]) -> Int[Array, ""]:
+    return jnp.sum(jnp.stack([jnp.where(holds, bit, 0) for bit, holds in flags.items()]))
 
 
 def _every(row: Callable, branches: Gaussian, best: Int[Array, ""], alone: Bool[Array, ""]):

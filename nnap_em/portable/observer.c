@@ -177,7 +177,11 @@ static real joined(const nnap_branch *a, const nnap_branch *b, real most, nnap_b
 static void part(nnap_state *s)
 {
     const real narrow = (real)4 / 9, noise = narrow / (1 - narrow), reach = SQRT(3 * (1 - narrow));
-    int which = -1, angle = 0;
+    const real top = s->branch[likeliest(s)].log_weight;
+    int which = -1, angle = 0, left = 0;
+    for (int k = 0; k < s->live; k++)
+        if (EXP(s->branch[k].log_weight - top) > 0 && sound(&s->branch[k])) s->branch[left++] = s->branch[k];
+    s->live = left;
     for (int k = 0; k < s->live; k++) {
         real widest = 0;
         for (int a = 0; a < ANGLES; a++) widest = FMAX(widest, variance(&s->branch[k], angles[a]));

@@ -104,6 +104,8 @@ def write_observer(fitted: Identified, out: Path, *, single: bool = False) -> No
     `single`: numbers of 32 bits.  Functions have the name of the file: `arm_start`, `arm_step`, `arm_covariance`.
     Raises ExportError, before anything is written, where a law has no plain C form.
     """
+    if out.suffix != ".c":
+        raise ExportError(f"{out}: name a file that ends in .c; its declarations go beside it")
     source, header = observer_c(fitted, out.stem, single=single)
     replace_text(out.with_suffix(".h"), header)
     replace_text(out, source)

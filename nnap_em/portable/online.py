@@ -34,7 +34,10 @@ EXACT = {False: 1e-11, True: 1e-6}
 
 
 class Table(NamedTuple):
-    """A friction curve as polynomials on equal parts of asinh(v / knee): about a tenth of the network's time."""
+    """A friction curve as polynomials on equal parts of asinh(v / knee).
+
+    A step of the acrobot takes 6.5 us with it and 34 us with the network.
+    """
 
     name: str
     knee: float

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .em.loop import EMState, FitError, Schedule
     from .fit.branches import Branch, branches
     from .fit.identify import Identified, friction_table, identify, parameter_table
+    from .fit.observer import Observation, Observer, observer
     from .fit.predict import Prediction, horizon_errors, predict, smooth
     from .fit.store import load, save
     from .identifiability.check import CheckResult, check
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
     from .portable.c99 import write_c
     from .portable.draws import write_draws
     from .portable.export import ExportError, export
+    from .portable.fmu import write_fmu
     from .portable.mjcf import write_mjcf
+    from .portable.online import write_observer
     from .portable.urdf import write_urdf
     from .smoother.gaussian import ExtendedKalmanSmoother
     from .smoother.mixture import MixtureSmoother
@@ -62,6 +65,8 @@ __all__ = [
     "Identified",
     "Logs",
     "MixtureSmoother",
+    "Observation",
+    "Observer",
     "ParticleSmoother",
     "Posterior",
     "Prediction",
@@ -85,6 +90,7 @@ __all__ = [
     "horizon_errors",
     "identify",
     "load",
+    "observer",
     "over",
     "pad",
     "paper_experiment",
@@ -100,7 +106,9 @@ __all__ = [
     "specs",
     "write_c",
     "write_draws",
+    "write_fmu",
     "write_mjcf",
+    "write_observer",
     "write_rig",
     "write_urdf",
 ]
@@ -116,12 +124,15 @@ _homes = {
     "portable.export": ("ExportError", "export"),
     "portable.c99": ("write_c",),
     "portable.draws": ("write_draws",),
+    "portable.fmu": ("write_fmu",),
+    "portable.online": ("write_observer",),
     "portable.mjcf": ("write_mjcf",),
     "portable.urdf": ("write_urdf",),
     "storage.files": ("StoreError",),
     "model.friction": ("FrictionNetwork",),
     "fit.branches": ("Branch", "branches"),
     "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "fit.observer": ("Observation", "Observer", "observer"),
     "diagnose.search": ("close_the_loop",),
     "diagnose.outcome": ("Closed",),
     "model.state_space": ("StateSpaceModel",),

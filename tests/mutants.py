@@ -41,6 +41,27 @@ BRANCH = f"{MACHINES}mass_and_bias_are_those_of_mujoco[branch.xml]"
 LEFT_OUT = "test_mstep.py::test_sequences_that_are_not_used_have_no_weight"
 
 MUTANTS = (
+    Mutant(
+        "share of a late command",
+        "effects/actuator.py",
+        "(1 - rows + late) * line[0] + (rows - late) * line[min(rows, 1)]",
+        "(rows - late) * line[0] + (1 - rows + late) * line[min(rows, 1)]",
+        "test_observer.py::test_the_same_numbers_as_the_filter[a late input-cubature]",
+    ),
+    Mutant(
+        "input that is no number taken as none",
+        "fit/observer.py",
+        "jnp.where(sound, u, state.u)",
+        "jnp.where(sound, u, 0.0)",
+        "test_observer.py::test_an_input_that_is_no_number_is_the_one_before",
+    ),
+    Mutant(
+        "outliers absorbed",
+        "smoother/kalman.py",
+        "observed[i] & (e * e <= gate * gate * s)",
+        "observed[i]",
+        "test_observer.py::test_outliers_are_gated_and_change_nothing",
+    ),
     Mutant("sign of the Coriolis torque", "systems/arm.py", "gravity1 - h * v[1]", "gravity1 + h * v[1]", LAGRANGE),
     Mutant("sign of the centrifugal torque", "systems/arm.py", "gravity2 + h * v[0]", "gravity2 - h * v[0]", LAGRANGE),
     Mutant(

@@ -139,6 +139,7 @@ examples:
   nnap-em export found/after.npz --out exported
   nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
   nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
+  nnap-em export fit --observer arm.c --fmu arm.fmu  states of the running machine, as C99 and for Simulink
   nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
 
 OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
@@ -274,6 +275,9 @@ def parser() -> argparse.ArgumentParser:
     export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
     export.add_argument("--urdf", metavar="FILE", type=Path, help="write such a machine as URDF")
     export.add_argument("--c", metavar="FILE", type=Path, help="write friction and feed-forward torque as C99")
+    export.add_argument("--observer", metavar="FILE", type=Path, help="write an online estimator of the states as C99")
+    export.add_argument("--fmu", metavar="FILE", type=Path, help="write that estimator as an FMU (FMI 3.0)")
+    export.add_argument("--float", action="store_true", help="numbers of 32 bits in these two")
     export.add_argument("--draws", type=_count, metavar="N", help="write N draws of the posterior to OUT instead")
     export.add_argument("--seed", type=_natural, default=0, help="of the draws (0)")
     return top
@@ -287,8 +291,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
         arguments.error("--particles goes with --smoother particle")
-    if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c)):
-        arguments.error("say where to: --out OUT, --mjcf FILE, --urdf FILE or --c FILE")
+    if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c, args.observer, args.fmu)):
+        arguments.error("say where to: --out OUT, --mjcf, --urdf, --c, --observer or --fmu FILE")
+    if args.command == "export" and args.float and not (args.observer or args.fmu):
+        arguments.error("--float goes with --observer or --fmu")
     if args.command == "export" and args.draws and args.out is None:
         arguments.error("--draws goes with --out OUT, the folder for the files")
     try:

@@ -9,13 +9,15 @@ from ..numerics.digits import counted
 from ..portable.c99 import write_c
 from ..portable.draws import TABLE, write_draws
 from ..portable.export import export
+from ..portable.fmu import write_fmu
 from ..portable.mjcf import write_mjcf
+from ..portable.online import write_observer
 from ..portable.urdf import write_urdf
 from ..storage.log import Log
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
-    """Write it as JSON, NumPy and StableHLO, for a simulator, for a controller, or as draws of its posterior."""
+    """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
     if args.mjcf is not None:
         for line in write_mjcf(fitted, args.mjcf, alone=args.alone):
@@ -29,6 +31,12 @@ def run(args: argparse.Namespace, log: Log) -> None:
         for line in write_c(fitted, args.c):
             log(f"{args.c} leaves out {line}")
         log(f"wrote {args.c}")
+    if args.observer is not None:
+        write_observer(fitted, args.observer, single=args.float)
+        log(f"wrote {args.observer} and {args.observer.with_suffix('.h').name}")
+    if args.fmu is not None:
+        binary = write_fmu(fitted, args.fmu, single=args.float)
+        log(f"wrote {args.fmu}" + ("" if binary else ", with sources alone: there is no compiler `cc` here"))
     if args.draws is not None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
         log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")

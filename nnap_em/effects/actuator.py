@@ -1,5 +1,6 @@
 """Actuators: laws between the commanded input u and the torque at its joint."""
 
+import math
 from functools import partial
 from typing import ClassVar
 
@@ -7,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .base import JointEffect, Scalar, input_of, one
+from .base import JointEffect, Scalar, Stream, input_of, one
 
 
 class InputEffect(JointEffect):
@@ -126,6 +127,16 @@ class InputDelay(JointEffect):
         take = lambda k: padded[jnp.clip(k.astype(int) + 1, 0, u.shape[0])]  # noqa: E731
         return (1 - share) * take(whole) + share * take(whole + 1)
 
+    def stream(self, dt):
+        late = max(float(self.delay), 0.0) / dt
+        rows = math.ceil(late)
+
+        def step(memory, u):
+            line = jnp.append(memory, u)
+            return line[1:], (1 - rows + late) * line[0] + (rows - late) * line[min(rows, 1)]
+
+        return Stream(jnp.zeros(rows, self.delay.dtype), step)
+
 
 class ActuatorLag(JointEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
@@ -142,11 +153,15 @@ class ActuatorLag(JointEffect):
         return [one(partial(cls, joint=j), 0.0, n * dt, 5 * dt) for j, _ in around.driven for n in grid]
 
     def input(self, u, dt):
+        stream = self.stream(dt)
+        return jax.lax.scan(stream.step, stream.memory.astype(u.dtype), u)[1]
+
+    def stream(self, dt):
         tau = jnp.maximum(self.tau, 0.05 * dt)
         keep = jnp.exp(-dt / tau)
         share = tau / dt * (1 - keep)
 
         def step(torque, u):
-            return u + (torque - u) * keep, u + (torque - u) * share
+            return u + (torque - u) * keep, u + (torque[0] - u) * share
 
-        return jax.lax.scan(step, jnp.zeros_like(u[0]), u)[1]
+        return Stream(jnp.zeros(1, self.tau.dtype), step)

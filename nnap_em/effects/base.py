@@ -123,6 +123,15 @@ class Curve(NamedTuple):
     """Functions whose sum the curve is; None: the values as they stand."""
 
 
+class Stream(NamedTuple):
+    """A law of the command over time as a filter: what it remembers of earlier rows, and its step."""
+
+    memory: Float[Array, " memory"]
+    """Memory before the first row."""
+    step: Callable[[Float[Array, " memory"], Scalar], tuple[Float[Array, " memory"], Scalar]]
+    """Function of the memory and the command of a row: the memory after it, and the command that arrives."""
+
+
 class AbstractEffect(eqx.Module):
     """A law that the declared physics may lack.  Its hooks change the model.
 
@@ -231,6 +240,10 @@ class AbstractEffect(eqx.Module):
     def input(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
         """Input that reaches the drive, mean over each sample: for laws with memory of the input, as delays."""
         return u
+
+    def stream(self, dt: float) -> Stream | None:
+        """`input` row by row, for use while the machine runs; None for a law that takes no time."""
+        return None
 
     def drive(self, torque: Float[Array, "*time"]) -> Float[Array, "*time"]:
         """Torque of the drive that reaches the joint, at one moment [N m, or N]."""

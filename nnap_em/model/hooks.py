@@ -1,15 +1,27 @@
 """The hooks of effects, run one effect after the other: the one place that the model and the score test share."""
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..effects.actuator import InputDelay
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..systems.base import AbstractSystem
-from .servo import Servo
+from .servo import LAWS, Servo
 
 Effects = Sequence[AbstractEffect]
+
+
+class CommandStream(NamedTuple):
+    """The commands of a row to what is set at the drives, with what is remembered of earlier rows."""
+
+    memory: Any
+    """Memory before the first row; arrays for every drive."""
+    step: Callable[[Any, Float[Array, " column"], Any], tuple[Any, Float[Array, " input"]]]
+    """Function of the memory, a row of input columns and the mask of the first row: the memory after it, and the values
+    that the commands set (`Inputs.u`)."""
 
 
 def reaching(
@@ -51,6 +63,52 @@ def late(
                 column = before + effect.input(column - before, dt)
         columns.append(column)
     return jnp.stack(columns, axis=1)
+
+
+def command_stream(
+    effects: Effects, servos: Sequence[Servo] | None, system: AbstractSystem, dt: float
+) -> CommandStream:
+    """`reaching` or `fed` row by row.
+
+    Raises ValueError where a law of the command has no form for one row.
+    """
+    lines = [_line(effects, servos[i] if servos else None, joint, dt) for i, joint in enumerate(system.joints)]
+
+    def step(memory, u, first):
+        scale = u[len(lines) :] if u.shape[0] > len(lines) else None
+        passed = [line(own, u[i], scale, first) for i, ((_, line), own) in enumerate(zip(lines, memory, strict=True))]
+        return tuple(own for own, _ in passed), jnp.stack([fed for _, fed in passed]) if passed else u
+
+    return CommandStream(tuple(memory for memory, _ in lines), step)
+
+
+def _line(effects: Effects, servo: Servo | None, joint: int, dt: float) -> tuple[Any, Callable[..., Any]]:
+    """Memory and step of one drive: the command as in the first row, what it set, then the memory of each law."""
+    laws = [(effect, effect.stream(dt)) for effect in effects if effect.joint == joint]
+    for effect, stream in laws:
+        if stream is None and type(effect).input is not AbstractEffect.input:
+            raise ValueError(f"{effect.name!r} has no form for one row: give it `stream` beside `input`")
+    delay = InputDelay(servo.values["delay"], joint=0).stream(dt) if servo and "delay" in servo.values else None
+    streams = [stream for stream in (delay, *(stream for _, stream in laws)) if stream]
+
+    def step(memory, u, scale, first):
+        (begun, stood, *before), after = memory, []
+
+        def through(stream, value, base):
+            own, late = stream.step(before[len(after)], value - base)
+            after.append(own)
+            return base + late
+
+        if servo:
+            begun = jnp.where(first, u, begun)
+            u = LAWS[servo.kind].feed(servo.at(scale).values, through(delay, u, begun) if delay else u)
+            stood = jnp.where(first, u, stood) if servo.feeds_back else stood
+        for effect, stream in laws:
+            u = through(stream, u, stood) if stream else u
+            u = u if servo else effect.drive(u)
+        return (begun, stood, *after), u
+
+    return (jnp.zeros(()), jnp.zeros(()), *(stream.memory for stream in streams)), step
 
 
 def driven(

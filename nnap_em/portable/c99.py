@@ -19,15 +19,18 @@ from .placement import of_command
 from .unroll import Source
 
 CALLS: dict[str, str] = {
-    "maximum": "fmax({}, {})", "minimum": "fmin({}, {})", "where": "({} ? {} : {})", "arctan2": "atan2({}, {})",
-    "fmod": "fmod({}, {})", "abs": "fabs({})", "sign": "(double)(({0} > 0) - ({0} < 0))", "isfinite": "isfinite({})",
-    "logical_not": "!({})", "arcsinh": "asinh({})", "arccosh": "acosh({})", "arctanh": "atanh({})",
-    "arcsin": "asin({})", "arccos": "acos({})", "arctan": "atan({})", "round": "rint({})",
+    "maximum": "({0} > {1} ? {0} : {1})", "minimum": "({0} < {1} ? {0} : {1})", "where": "({} ? {} : {})",
+    "arctan2": "atan2({}, {})", "fmod": "fmod({}, {})", "abs": "fabs({})", "sign": "(({0} > 0) - ({0} < 0))",
+    "isfinite": "isfinite({})", "logical_not": "!({})", "arcsinh": "asinh({})", "arccosh": "acosh({})",
+    "arctanh": "atanh({})", "arcsin": "asin({})", "arccos": "acos({})", "arctan": "atan({})", "round": "rint({})",
 } | {name: f"{name}({{}})" for name in (
     "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor",
     "ceil", "trunc",
 )}  # fmt: skip
 """C of NumPy's functions."""
+WHOLE = """/* The whole number that a floating one is; 0 where none is. */
+static inline long whole(double x) { return x > -2e9 && x < 2e9 ? (long)x : 0; }
+"""
 OPERATORS: dict[type, str] = {
     ast.Add: "({} + {})", ast.Sub: "({} - {})", ast.Mult: "({} * {})", ast.Div: "({} / {})", ast.Pow: "pow({}, {})",
     ast.BitAnd: "({} & {})", ast.BitOr: "({} | {})", ast.BitXor: "({} ^ {})", ast.USub: "(-{})",
@@ -95,21 +98,43 @@ def write_c(fitted: Identified, out: Path) -> list[str]:
    Not in here: {", ".join(left) or "nothing"}. */
 #include <math.h>
 
+{WHOLE}
 enum {{ {name.upper()}_JOINTS = {dof} }};
 """.replace("*/\n   ", "* /\n   ")
     replace_text(out, head + "\n" + "\n".join(map(function, sources)))
     return left
 
 
-def function(source: Source) -> str:
+class Dialect(NamedTuple):
+    """Type of the numbers in a C function, and its words before the name."""
+
+    real: str = "double"
+    words: str = "void"
+    single: bool = False
+    """True for literals and functions of 32 bits."""
+
+    def number(self, value: float) -> str:
+        """A literal."""
+        return repr(value) + ("f" if self.single else "")
+
+    def call(self, form: str, arguments: list[str]) -> str:
+        """A function of the mathematics library."""
+        single = self.single and not form.startswith("isfinite")
+        return (re.sub(r"^([a-z]+[0-9p]*)\(", r"\1f(", form) if single else form).format(*arguments)
+
+
+PLAIN = Dialect()
+
+
+def function(source: Source, dialect: Dialect = PLAIN) -> str:
     """A C function of arrays, whose last argument is the result."""
-    (results,) = source.results
-    arrays = [f"const double {name}[{size}]" for name, size in source.sizes.items()]
-    lines = [f"void {source.name}({', '.join(arrays)}, double tau[{len(results)}])", "{"]
+    results, real = [text for result in source.results for text in result], dialect.real
+    arrays = [f"const {real} {name}[{size or 1}]" for name, size in source.sizes.items()]
+    lines = [f"{dialect.words} {source.name}({', '.join(arrays)}, {real} tau[{len(results) or 1}])", "{"]
     code = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
         lines += [
-            f"    const double {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", code)
+            f"    const {real} {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", code)
         ]
         lines += [f"    (void){name};"]
     whole_numbers: set[str] = set()
@@ -118,8 +143,8 @@ def function(source: Source) -> str:
         node = ast.parse(text, mode="eval").body
         if _whole(node, whole_numbers):
             whole_numbers.add(name)
-        lines.append(f"    const {'long' if name in whole_numbers else 'double'} {name} = {_c(node)};")
-    lines += [f"    tau[{i}] = {_c(ast.parse(text, mode='eval').body)};" for i, text in enumerate(results)]
+        lines.append(f"    const {'long' if name in whole_numbers else real} {name} = {_c(node, dialect)};")
+    lines += [f"    tau[{i}] = {_c(ast.parse(text, mode='eval').body, dialect)};" for i, text in enumerate(results)]
     return "\n".join([*lines, "}", ""])
 
 
@@ -141,7 +166,7 @@ def _whole(node: ast.AST, names: set[str]) -> bool:
     return False
 
 
-def _c(node: ast.AST) -> str:
+def _c(node: ast.AST, dialect: Dialect) -> str:
     """A Python expression of scalars in C.
 
     Raises ExportError for what has no plain C form.
@@ -150,19 +175,23 @@ def _c(node: ast.AST) -> str:
         case ast.Constant(value=bool() | int() as value):
             return str(int(value))
         case ast.Constant(value=float() as value):
-            return repr(value)
+            return dialect.number(value)
         case ast.Name(id=name):
             return name
         case ast.Attribute(value=ast.Name(id="np"), attr="inf" | "nan" as name):
             return {"inf": "INFINITY", "nan": "NAN"}[name]
+        case ast.BinOp(left=ast.Name(id=name), op=ast.Pow(), right=ast.Constant(value=int(power))) if 1 < power < 5:
+            return f"({' * '.join([name] * power)})"
         case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(left), _c(right))
+            return OPERATORS[type(op)].format(_c(left, dialect), _c(right, dialect))
         case ast.UnaryOp(op=op, operand=operand) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(operand))
+            return OPERATORS[type(op)].format(_c(operand, dialect))
         case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(left), _c(right))
+            return OPERATORS[type(op)].format(_c(left, dialect), _c(right, dialect))
         case ast.Call(func=ast.Attribute(value=ast.Name(id="np"), attr=name), args=args) if name in CALLS:
-            return CALLS[name].format(*map(_c, args))
+            return dialect.call(CALLS[name], [_c(a, dialect) for a in args])
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return f"{name}({', '.join(_c(a, dialect) for a in args)})"
         case ast.Call(func=ast.Attribute(value=inner, attr="astype")):
-            return f"(long){_c(inner)}"
+            return f"whole({_c(inner, dialect)})".replace("(trunc(", "((").replace("(truncf(", "((")
     raise ExportError(f"{ast.unparse(node)!r} has no plain C form; use nnap-em export --out for NumPy")

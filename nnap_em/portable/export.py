@@ -176,26 +176,33 @@ def predictor(fitted: Identified) -> str:
     )
 
 
-def unrolled(name: str, function: Callable[..., tuple[Array, ...]], **arguments: Array) -> Source:
+def unrolled(
+    name: str,
+    function: Callable[..., tuple[Array, ...]],
+    truth: Callable[..., tuple[Array, ...]] | None = None,
+    names: dict[str, Any] | None = None,
+    **arguments: Array,
+) -> Source:
     """`function` in NumPy, compared with JAX at four random places about `arguments`.
 
+    The numbers of JAX are those of `truth`, where the function has others by their `names` in it.
     Raises ExportError where there is no such source, or where its numbers are others.
     """
     try:
         source = unroll(name, function, **arguments)
     except UnrollError as error:
         raise ExportError(f"{error}; use {STEP}") from None
-    rng, space = np.random.default_rng(0), {"np": np}
+    rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    expected = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    expected = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):
         outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
-    for mine, truth in zip((outputs,) if len(expected) == 1 else outputs, expected, strict=True):
-        flat = np.asarray(truth, np.float64).reshape(4, -1)
-        computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1)
-        bound = math.sqrt(jnp.finfo(truth.dtype).eps)
+    for mine, theirs in zip((outputs,) if len(expected) == 1 else outputs, expected, strict=True):
+        flat = np.asarray(theirs, np.float64).reshape(4, -1)
+        computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1) if mine else flat
+        bound = math.sqrt(jnp.finfo(theirs.dtype).eps)
         if not np.allclose(computed, flat, rtol=bound, atol=bound, equal_nan=True):
             raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STEP}")
     return source

@@ -44,6 +44,16 @@ class UnrollError(ValueError):
     """An operation that cannot be written in plain NumPy, by the name of JAX's primitive."""
 
 
+_named = core.Primitive("named")
+_named.def_abstract_eval(lambda x, function, value: x)
+_named.def_impl(lambda x, function, value: jnp.asarray(value(np.asarray(x)), x.dtype))
+
+
+def named(function: str, value: Callable[[np.ndarray], np.ndarray], x: jax.Array) -> jax.Array:
+    """A function of a scalar that is written by its name; `value` has its numbers."""
+    return _named.bind(x, function=function, value=value)
+
+
 class Source(NamedTuple):
     """A Python function of NumPy scalars or equal batches."""
 
@@ -77,7 +87,7 @@ class _Writer:
             return number.item() if isinstance(number, np.ndarray) else number
         if (plain := _simpler(form, values)) is not None:
             return plain
-        key = (form, *((type(value), value) for value in values))
+        key = (form, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
         if key not in self.known:
             self.known[key] = name = f"t{len(self.lines)}"
             self.lines[name] = (form.format(*map(_text, values)), values)
@@ -189,6 +199,8 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]
     if name == "integer_pow":
         return [_each(writer, f"{{}} ** {params['y']}", operands)]
+    if name == "named":
+        return [_each(writer, f"{params['function']}({{}})", operands)]
     if name in _ELEMENTWISE:
         return [_each(writer, _ELEMENTWISE[name], operands)]
     if name in _REDUCTIONS:
@@ -221,7 +233,10 @@ def _converted(old: str, new: str) -> str:
 
 def _constant(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Numbers alone: JAX computes them."""
-    typed = [jnp.asarray(x.tolist(), _dtype(atom)) for x, atom in zip(operands, equation.invars, strict=True)]
+    typed = [
+        jnp.asarray(x.tolist(), _dtype(atom)).reshape(x.shape)
+        for x, atom in zip(operands, equation.invars, strict=True)
+    ]
     outputs = equation.primitive.bind(*typed, **equation.params)
     return [_array(x) for x in (outputs if equation.primitive.multiple_results else [outputs])]
 
@@ -276,7 +291,7 @@ def _move(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         elif _symbolic(operand):
             raise UnrollError(f"JAX's {name!r} moves numbers to where other numbers say")
         else:
-            places.append(jnp.asarray(operand.tolist(), _dtype(atom)))
+            places.append(jnp.asarray(operand.tolist(), _dtype(atom)).reshape(operand.shape))
     indices = equation.primitive.bind(*places, **equation.params)
     values = np.array(pool, object)
     return [

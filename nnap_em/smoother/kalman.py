@@ -111,10 +111,11 @@ def linear_reading(model, x: Float[Array, " state"], u: Any) -> Reading:
     return Reading(rows, value - product(rows, x))
 
 
-def absorbed(state: Gaussian, reading: Reading, r, y, observed):
+def absorbed(state: Gaussian, reading: Reading, r, y, observed, gate: Any = None):
     """`state` after readings, one at a time: y_i = rows_i x + offset_i + noise of variance r_i.
 
-    With it the whitened innovations, their log variances and the gains, 0 where nothing is `observed`.
+    With it the whitened innovations, their log variances and the gains, 0 where nothing is `observed`.  A reading whose
+    innovation is beyond a `gate` [standard deviations] changes nothing: its gain is 0.
     """
     mean, cov = state
     rows = reading.rows
@@ -122,8 +123,9 @@ def absorbed(state: Gaussian, reading: Reading, r, y, observed):
     for i in range(y.shape[0]):
         pc = product(cov, rows[i])
         s = jnp.sum(rows[i] * pc) + r[i]
-        gain = jnp.where(observed[i], pc / s, 0.0)
         e = y[i] - reading.offset[i] - jnp.sum(rows[i] * mean)
+        inside = observed[i] if gate is None else observed[i] & (e * e <= gate * gate * s)
+        gain = jnp.where(inside, pc / s, 0.0)
         mean = mean + gain * e
         cov = cov - gain[:, None] * pc[None, :]
         whitened.append(jnp.where(observed[i], e / jnp.sqrt(s), 0.0))

@@ -1,0 +1,160 @@
+"""The observer on the paper's acrobot with theta2 hidden: beside the filter of the true model, its time, C and Python.
+
+python benchmarks/observer.py                                                       # some minutes
+python benchmarks/observer.py --steps 10000000 --table docs/results/observer.md     # and as many under sanitizers
+"""
+
+import argparse
+import itertools
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import date
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from arm import JOINTS, declared, machine, recorded
+from observer_c import SANITIZED, held, paper_rig, play, replay, rough, wild
+
+import nnap_em
+from nnap_em.data.dataset import Dataset
+from nnap_em.data.rig import Declared, Rig
+from nnap_em.fit.identify import Identified, begin, identify
+from nnap_em.fit.observer import RESTARTED, Observer, functions, observer, restart_prior
+from nnap_em.fit.store import load, save
+from nnap_em.model.simulate import paper_experiment, paper_model
+from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.portable.online import write_observer
+from nnap_em.smoother.kalman import CUBATURE
+
+
+def hidden_error(online: Observer, data: Dataset, x: np.ndarray, settled: int = 100) -> tuple[float, int]:
+    """RMS error of theta2 [rad] after the first rows of every sequence, and the number of new starts."""
+
+    def every(state, row):
+        state = jax.vmap(online.step)(state, *row)
+        return state, (state.mean, state.flags)
+
+    rows = tuple(jnp.swapaxes(jnp.asarray(a), 0, 1) for a in (jax.vmap(held)(data.u), data.y))
+    begin = jax.vmap(online.start)(jnp.asarray(data.t[:, 0]))
+    mean, flags = jax.jit(lambda: jax.lax.scan(every, begin, rows)[1])()
+    error = np.asarray(mean)[settled:, :, 1] - np.asarray(x)[:, settled:, 1].T
+    restarts = int(np.sum(np.asarray(flags) & RESTARTED > 0))
+    return float(np.sqrt(np.mean(((error + np.pi) % (2 * np.pi) - np.pi) ** 2))), restarts
+
+
+def python_time(online: Observer, u: np.ndarray, y: np.ndarray) -> float:
+    """Time of a step [s], the fastest tenth: other programs run beside this one."""
+    state, times = online.start(), []
+    for row in zip(u, y, strict=True):
+        begin = time.perf_counter()
+        state = online.step(state, *row)
+        state.mean.block_until_ready()
+        times.append(time.perf_counter() - begin)
+    return float(np.percentile(times[len(times) // 2 :], 10))
+
+
+def accuracy(fitted: Identified, truth: StateSpaceModel, sequences: int) -> Iterator[tuple[str, str]]:
+    """The hidden joint beside the filter of the true model."""
+    test = paper_experiment(truth, sequences, 499, key=jax.random.key(49))
+    online, known = observer(fitted), true_observer(fitted, truth)
+    (error, restarts), (best, _) = (hidden_error(one, test.data, test.x) for one in (online, known))
+    yield f"hidden theta2 from 1 s on, RMSE, {sequences} sequences of 5 s", f"{error:.4f} rad, {restarts} new starts"
+    yield "the same by the filter of the true model", f"{best:.4f} rad: ratio {error / best:.3f}"
+
+
+def alike(fitted: Identified, truth: StateSpaceModel, rows: int, folder: Path) -> Iterator[tuple[str, str]]:
+    """C beside Python, and the time of both."""
+    long, online = paper_experiment(truth, 1, rows - 1, key=jax.random.key(50)).data, observer(fitted)
+    t, u, clean = np.asarray(long.t[0]), held(np.asarray(long.u[0])), np.asarray(long.y[0])
+    y = rough(clean)
+    states = jax.tree.map(np.asarray, replay(online, t, u, y))
+    std = np.sqrt(np.diagonal(states.cov, axis1=1, axis2=2))
+    for bits, kind in ((64, np.float64), (32, np.float32)):
+        source = folder / f"arm{bits}.c"
+        write_observer(fitted, source, single=bits == 32)
+        found = play(source, t, u, y, 4, kind)
+        gap, other = np.max(np.abs(found.mean - states.mean) / std), np.sum(found.flags != states.flags)
+        seconds = play(source, t[:4000], u[:4000], clean[:4000], 4, kind).seconds
+        yield (
+            f"C, {bits} bits, beside Python: {rows} rows with gaps and spikes",
+            f"{gap:.1e} standard deviations; {other} rows with other flags",
+        )
+        yield f"a step in C, {bits} bits, gcc -O2", f"{1e6 * seconds:.1f} us"
+    yield "a step in Python, jitted, theta2 hidden", f"{1e6 * python_time(online, u[:2000], clean[:2000]):.0f} us"
+
+
+def six_joints(folder: Path) -> Iterator[tuple[str, str]]:
+    """Time of a step for the arm of `arm.py`, all joints read, its numbers those before a fit."""
+    rig = declared(folder, 6)
+    data, _ = recorded(machine(6, imu=False), JOINTS[:6], 0)
+    fitted, source = begin(rig, data, key=jax.random.key(0)), folder / "six.c"
+    write_observer(fitted, source)
+    t, u, y = (np.asarray(a[0]) for a in (data.t, data.u, data.y))
+    lines = source.read_text().count("\n")
+    yield f"a step in C for six joints ({lines} lines)", f"{1e6 * play(source, t, held(u), y, 12).seconds:.0f} us"
+
+
+def wild_runs(fitted: Identified, steps: int, folder: Path) -> Iterator[tuple[str, str]]:
+    """Steps with any input under the sanitizers: of a pendulum, and a hundredth of them with branches."""
+    t = 0.01 * np.arange(300)
+    swing = np.stack([np.sin(3 * t), 3 * np.cos(3 * t)], axis=1)[None]
+    names = {key: Declared(value, 0.0) for key, value in (("m", 0.5), ("lc", 0.2), ("I", 0.002), ("g", 9.81))}
+    rig = Rig("pendulum", "pendulum", names, True, ("u",), (1,), 0.01, "sequence", ("theta1", "dtheta1"),
+              {"theta1": 0.01, "dtheta1": 0.05}, {})  # fmt: skip
+    pendulum = begin(rig, Dataset(t[None], swing[..., :1], swing, np.ones((1, 300), bool)), key=jax.random.key(0))
+    for name, one, count in (("pendulum", pendulum, steps), ("acrobot", fitted, steps // 100)):
+        for bits in (64, 32):
+            write_observer(one, folder / f"{name}{bits}.c", single=bits == 32)
+            counts = wild(folder / f"{name}{bits}.c", count, *SANITIZED)
+            flagged = "{} new starts, {} rows in several branches, {} jumps of time, {} rows with outliers"
+            yield f"{count} wild steps, {name}, {bits} bits, address and undefined", flagged.format(*counts)
+
+
+def main() -> int:
+    """Fit, compare, time."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--sequences", type=int, default=20, help="test sequences of 5 s (20)")
+    arguments.add_argument("--rows", type=int, default=10_000, help="rows of C beside Python (10,000)")
+    arguments.add_argument("--steps", type=int, default=0, help="steps under the sanitizers (0)")
+    arguments.add_argument("--fit", type=Path, default=Path("out/observer_fit/model.npz"), help="kept from run to run")
+    arguments.add_argument("--table", type=Path, help="page to write")
+    args = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    truth = paper_model()
+    if not args.fit.exists():
+        train = paper_experiment(truth, 20, 499, key=jax.random.key(48)).data
+        save(args.fit, identify(paper_rig(), train, key=jax.random.key(0)))
+    fitted = load(args.fit)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    where = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores that other programs used as well, "
+    where += f"nnap_em {nnap_em.__version__}, commit {commit.stdout.strip()}."
+    print(where)
+    table = ["| | |", "| --- | --- |"]
+    with tempfile.TemporaryDirectory() as name:
+        parts = [accuracy(fitted, truth, args.sequences), alike(fitted, truth, args.rows, Path(name))]
+        parts += [six_joints(Path(name)), wild_runs(fitted, args.steps, Path(name)) if args.steps else ()]
+        for what, value in itertools.chain(*parts):
+            table.append(f"| {what} | {value} |")
+            print(table[-1], flush=True)
+    if args.table:
+        head = args.table.read_text().partition("<!-- table -->")[0] if args.table.exists() else ""
+        command = f"`python benchmarks/observer.py {' '.join(sys.argv[1:])}`"
+        args.table.write_text("\n".join([f"{head}<!-- table -->", "", where, command, "", *table, ""]))
+    return 0
+
+
+def true_observer(fitted: Identified, truth: StateSpaceModel) -> Observer:
+    """The observer of the model that made the logs."""
+    start, step = functions(truth, fitted.bank.angles, restart_prior(truth), 16, CUBATURE)
+    return observer(fitted)._replace(start=start, step=step)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

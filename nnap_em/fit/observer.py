@@ -1,0 +1,258 @@
+"""A fitted model on the running machine: states and their covariance, one row of readings after the other.
+
+The filter is that of `smoother/kalman.py`, or where an angle is not read the mixture of `smoother/mixture.py`. Beside
+it an online estimate has a gate for outliers, an end of branches that lose, and a new start after divergence.
+[Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", secs. 3.4 and 5.4]
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..model import hooks
+from ..model.friction import FrictionNetwork
+from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian, symmetric
+from ..smoother.kalman import CUBATURE, Cubature, Tangent, absorbed, linear_reading, moved
+from ..smoother.mixture import WIDE, Components, merged, split
+from .identify import Identified
+
+GATE = 6.0
+"""Innovation beyond which a reading is an outlier [standard deviations]."""
+SETTLING = 10
+"""Rows after a start in which there is no gate."""
+FORGET = 0.02
+"""Weight of a row in the mean of squared innovations."""
+DIVERGED = 9.0
+"""Mean of squared innovations from which on the estimate starts anew: three standard deviations, where one is right;
+fourteen rows in a row beyond the gate."""
+LEAST = 1e-7
+"""Probability of a branch below which it ends."""
+TWIN = 0.1
+"""Distance in every state [standard deviations] below which a branch is the likeliest one."""
+FAR = 1e6
+"""Largest size of a state: beyond is no number of a machine, and sines have no digits."""
+
+MISSING, OUTLIER, NO_INPUT, RESTARTED, AMBIGUOUS = 1, 2, 4, 8, 16
+"""Bits of the flags of a row: some reading is no number; some reading was beyond the gate; an input is no number, and
+the one before holds; the estimate had diverged and has started anew; more than one branch is left."""
+
+
+class Observation(NamedTuple):
+    """State of an observer after a row: the estimate, its test, and what the next row needs."""
+
+    mean: Float[Array, " state"]
+    """Mean of the likeliest branch: coordinates, rates, memory of laws [rad and rad/s, or m and m/s]."""
+    cov: Float[Array, "state state"]
+    innovation: Float[Array, " obs"]
+    """Readings minus their prediction, over the standard deviation, one at a time; 0 where there was none."""
+    misfit: Float[Array, ""]
+    """Mean of squared innovations over some fifty rows: 1 where the model is right."""
+    weight: Float[Array, ""]
+    """Probability of the likeliest branch."""
+    flags: Int[Array, ""]
+    """Bits of `MISSING`, `OUTLIER`, `NO_INPUT`, `RESTARTED` and `AMBIGUOUS`."""
+    branches: Gaussian
+    """All branches, with a leading axis."""
+    log_weight: Float[Array, " branch"]
+    """Log of their weights, 0 for the likeliest; -inf for a free place."""
+    commands: Any
+    """Memory of what lies between commands and drives."""
+    u: Float[Array, " column"]
+    """Inputs that are held."""
+    fed: Float[Array, " input"]
+    """Values that the commands set at the drives over the last interval."""
+    late: Float[Array, " obs"]
+    """Readings that wait for the input of their row; NaN where none does."""
+    time: Float[Array, ""]
+    """Time of the row, on the clock of the logs [s]."""
+    age: Float[Array, ""]
+    """Since the first row [s]; below 0 before it."""
+    rows: Int[Array, ""]
+    """Number of rows since the last start."""
+
+
+class Observer(NamedTuple):
+    """A filter as two pure functions, for `jax.jit`, `jax.vmap` and `jax.lax.scan`."""
+
+    start: Callable[..., Observation]
+    """`start(time=0.0)`: the prior of the first row, and its time on the clock of the logs [s]."""
+    step: Callable[[Observation, Float[Array, " column"], Float[Array, " obs"]], Observation]
+    """`step(state, u, y)`: `u` are the inputs held from the row before to this one, `y` its readings; NaN is none.
+
+    In the first row `u` counts for nothing."""
+    states: tuple[str, ...]
+    """Names of the states that are coordinates and rates."""
+    inputs: tuple[str, ...]
+    """Columns of `u`."""
+    measured: tuple[str, ...]
+    """Columns of `y`."""
+
+
+class _Row(NamedTuple):
+    """Inputs and readings of one row, as the filter takes them."""
+
+    first: Bool[Array, ""]
+    u: Float[Array, " column"]
+    memory: Any
+    y: Float[Array, " obs"]
+    read: Bool[Array, " obs"]
+    late: Float[Array, " obs"]
+    gate: Float[Array, ""]
+    held: Inputs
+    """Inputs over the interval before the row."""
+    here: Inputs
+    """Inputs at its readings."""
+    flags: Int[Array, ""]
+    time: Float[Array, ""]
+    age: Float[Array, ""]
+
+
+def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cubature = CUBATURE) -> Observer:
+    """The model of a fit as an online estimator, a row every `rig.dt` seconds.
+
+    `branches`: Gaussians at most, where an angle is not read; one where all are.  A reading that depends on the input
+    of its own row, an acceleration, counts one row later.
+    Raises ValueError where a law of the command has no form for one row.
+    """
+    rig, model = fitted.rig, fitted.model
+    return Observer(
+        *functions(model, fitted.bank.angles, restart_prior(model), branches if fitted.bank.angles else 1, linearise),
+        model.system.coordinates + model.system.rates,
+        rig.input_columns + rig.scale_columns,
+        rig.measured,
+    )
+
+
+def restart_prior(model: StateSpaceModel) -> Gaussian:
+    """Prior of a machine in motion: anywhere in a turn, at a third of the largest rate; else ten times the first."""
+    system, std = model.system, np.sqrt(np.diag(np.asarray(model.start.cov)))
+    dof, unknown = len(system.coordinates), model.unknown
+    place = np.where(np.asarray(system.angles[:dof]), math.pi / 2, 10 * std[:dof])
+    rate = np.asarray(unknown.speed) / 3 if isinstance(unknown, FrictionNetwork) else 10 * std[dof : 2 * dof]
+    wide = np.maximum(std, np.concatenate([place, rate, std[2 * dof :]]))
+    return Gaussian(model.start.mean, jnp.diag(jnp.asarray(wide**2, model.log_q.dtype)))
+
+
+def functions(
+    model: StateSpaceModel, angles: tuple[int, ...], again: Gaussian, branches: int, linearise: Tangent | Cubature
+) -> tuple[Callable[..., Observation], Callable[..., Observation]]:
+    """`start` and `step` of a model whose `angles` may be in several places, with the prior of a new start."""
+    commands = hooks.command_stream(model.effects, model.servos, model.system, model.dt)
+    dtype, drives, dof = model.log_q.dtype, len(model.system.joints), len(model.system.coordinates)
+    q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
+    waits = np.asarray([place >= 2 * dof for place in model.measured])
+    columns = drives + len({place for servo in model.servos or () for _, place, _ in servo.scales})
+    zero = jnp.zeros((), dtype)
+
+    def alone(prior: Gaussian) -> tuple[Gaussian, Float[Array, " branch"]]:
+        every = jax.tree.map(lambda a: jnp.broadcast_to(a, (branches, *a.shape)), prior)
+        return every, jnp.where(jnp.arange(branches) == 0, zero, -jnp.inf)
+
+    def start(time: float | Float[Array, ""] = 0.0) -> Observation:
+        nothing, time = jnp.zeros(len(waits), dtype), jnp.asarray(time, dtype)
+        every, log_weight = alone(model.start)
+        return Observation(
+            mean=model.start.mean, cov=model.start.cov, innovation=nothing, misfit=zero + 1, weight=zero + 1,
+            flags=jnp.asarray(0), branches=every, log_weight=log_weight, commands=commands.memory,
+            u=jnp.zeros(columns, dtype), fed=jnp.zeros(drives, dtype), late=nothing + jnp.nan, time=time - model.dt,
+            age=zero - model.dt, rows=jnp.asarray(0),
+        )  # fmt: skip
+
+    def taken(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
+        first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
+        u = jnp.where(first, 0.0, jnp.where(sound, u, state.u))
+        memory, fed = commands.step(state.commands, u, state.age < 0.5 * model.dt)
+        memory, fed = jax.tree.map(lambda a, b: jnp.where(first, a, b), (state.commands, state.fed), (memory, fed))
+        scale, time, age = u[drives:] if columns > drives else None, state.time + model.dt, state.age + model.dt
+        return _Row(
+            first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
+            late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),
+            held=Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale),
+            here=Inputs(fed, fed, time + 0.5 * model.dt, age, scale),  # `fed` stands for what is not decided yet
+            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & ~first}), time=time, age=age,
+        )  # fmt: skip
+
+    def filtered(x: Gaussian, row: _Row, late: Float[Array, " obs"]) -> tuple[Gaussian, Array, Array]:
+        before = jnp.zeros_like(late), jnp.zeros_like(late)
+        if waits.any():
+            y, waited = jnp.nan_to_num(late), jnp.isfinite(late)
+            x, *before, _ = absorbed(x, linear_reading(model, x.mean, row.held), r, y, waited, row.gate)
+        _, ahead = moved(x, linearise(model, x, row.held), q, ~row.first)
+        now = absorbed(ahead, linear_reading(model, ahead.mean, row.here), r, row.y, row.read, row.gate)
+        return now[0], before[0] + now[1], before[1] + now[2]
+
+    def step(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
+        row, live = taken(state, u, y), jnp.isfinite(state.log_weight)
+        best = jnp.argmax(state.log_weight)
+        every, innovation, log_variance = _every(
+            lambda x: filtered(x, row, state.late), state.branches, best, jnp.sum(live) == 1
+        )
+        lost = jnp.sum(jnp.minimum(innovation**2, row.gate**2) + log_variance, axis=1)
+        log_weight = jnp.where(live & jnp.isfinite(lost), state.log_weight - 0.5 * lost, -jnp.inf)
+        best = jnp.argmax(log_weight)
+        count = jnp.sum(row.read) + jnp.sum(jnp.isfinite(state.late))
+        square = jnp.sum(jnp.minimum(innovation[best] ** 2, GATE**2)) / jnp.maximum(count, 1).astype(dtype)
+        misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (square - state.misfit)
+        known = jnp.all(jnp.abs(every.mean[best]) < FAR) & jnp.all(jnp.isfinite(every.cov[best]))
+        sane = (misfit < DIVERGED) & known & jnp.isfinite(log_weight[best])
+        innovation = jnp.where(sane, innovation[best], 0.0)
+
+        afresh, *_ = absorbed(again, linear_reading(model, again.mean, row.here), r, row.y, row.read)
+        every, log_weight = jax.tree.map(lambda a, b: jnp.where(sane, a, b), (every, log_weight), alone(afresh))
+        if branches > 1:
+            every, log_weight = _branched(every, log_weight, angles)
+        best = jnp.argmax(log_weight)
+        (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
+        outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
+        return Observation(
+            mean=mean, cov=cov, innovation=innovation, misfit=jnp.where(sane, misfit, 1.0),
+            weight=1 / jnp.sum(jnp.exp(log_weight)), branches=every, log_weight=log_weight, commands=row.memory,
+            flags=row.flags + _bits({OUTLIER: outlier, RESTARTED: ~sane, AMBIGUOUS: ambiguous}), u=row.u,
+            fed=row.held.u, late=row.late, time=row.time, age=row.age, rows=jnp.where(sane, state.rows + 1, 1),
+        )  # fmt: skip
+
+    return start, jax.jit(step)
+
+
+def _bits(flags: dict[int, Bool[Array, ""]]) -> Int[Array, ""]:
+    return jnp.sum(jnp.stack([jnp.where(holds, bit, 0) for bit, holds in flags.items()]))
+
+
+def _every(row: Callable, branches: Gaussian, best: Int[Array, ""], alone: Bool[Array, ""]):
+    """`row` of every branch; of one only where the others are free places."""
+    if branches.mean.shape[0] == 1:
+        return jax.tree.map(lambda a: a[None], row(jax.tree.map(lambda a: a[0], branches)))
+
+    def one(branches):
+        outcome = row(jax.tree.map(lambda a: a[best], branches))
+        return jax.tree.map(lambda a: jnp.broadcast_to(a, (branches.mean.shape[0], *a.shape)), outcome)
+
+    return jax.lax.cond(alone, one, jax.vmap(row), branches)
+
+
+def _branched(
+    every: Gaussian, log_weight: Float[Array, " branch"], angles: tuple[int, ...]
+) -> tuple[Gaussian, Float[Array, " branch"]]:
+    """Branches after one that has become wide is split, and without those that have lost."""
+    places, log_weight = jnp.arange(len(log_weight)), log_weight - jnp.max(log_weight)
+    width = jnp.max(jnp.diagonal(every.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)], axis=1)
+
+    def parted(parts: Components) -> Components:
+        return merged(merged(split(parts, angles, WIDE)))
+
+    whole = Components(every, log_weight, places)
+    whole = jax.lax.cond(jnp.any((width > WIDE**2) & jnp.isfinite(log_weight)), parted, lambda parts: parts, whole)
+    (mean, cov), log_weight, _ = whole
+    best = jnp.argmax(log_weight)
+    std = jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2))
+    near = jnp.all(jnp.abs(mean - mean[best][None]) < TWIN * std[best][None], axis=1)
+    twin = near & jnp.all(jnp.abs(std - std[best][None]) < TWIN * std[best][None], axis=1) & (places != best)
+    share = jnp.where(twin, jnp.exp(log_weight - log_weight[best]), 0.0)
+    log_weight = jnp.where(twin | (log_weight < log_weight[best] + math.log(LEAST)), -jnp.inf, log_weight)
+    return Gaussian(mean, symmetric(cov)), log_weight.at[best].add(jnp.log1p(jnp.sum(share)))

@@ -94,8 +94,8 @@ def verdict() -> str:
 
 
 def folders() -> str:
-    """A section for each folder of the package, in the order of README.md: its README and a row for each module."""
-    return "\n\n".join(map(_folder, re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "README.md").read_text())))
+    """A section for each folder of the package, in the order of CONTRIBUTING.md: README and modules."""
+    return "\n\n".join(map(_folder, re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "CONTRIBUTING.md").read_text())))
 
 
 def _folder(name: str) -> str:

@@ -177,7 +177,7 @@ read from them would make the fast sequences diverge (0.02 to 0.2 keep them, 0 l
 def _beside(nodes: Float[Array, " count"]) -> Float[Array, "count count"]:
     """Projection off constant and Coulomb friction, and nearly off viscous."""
     top = jnp.max(jnp.abs(nodes))
-    base = jnp.linalg.qr(jnp.stack([jnp.ones_like(nodes), jnp.tanh(nodes / (COULOMB * top)), nodes / top], axis=1))[0]
-    return jnp.eye(nodes.shape[0], dtype=nodes.dtype) - base @ (
-        jnp.asarray([1.0, 1.0, 1.0 - VISCOUS])[:, None] * base.T
-    )
+    kinds = jnp.stack([jnp.ones_like(nodes), jnp.tanh(nodes / (COULOMB * top)), nodes / top], axis=1)
+    base = jnp.linalg.qr(kinds)[0]
+    free = jnp.asarray([1.0, 1.0, 1.0 - VISCOUS], nodes.dtype)[: base.shape[1]]
+    return jnp.eye(nodes.shape[0], dtype=nodes.dtype) - (base * free) @ base.T

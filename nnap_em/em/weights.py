@@ -179,5 +179,5 @@ def _beside(nodes: Float[Array, " count"]) -> Float[Array, "count count"]:
     top = jnp.max(jnp.abs(nodes))
     kinds = jnp.stack([jnp.ones_like(nodes), jnp.tanh(nodes / (COULOMB * top)), nodes / top], axis=1)
     base = jnp.linalg.qr(kinds)[0]
-    free = jnp.asarray([1.0, 1.0, 1.0 - VISCOUS], nodes.dtype)[: base.shape[1]]
+    free = jnp.asarray([1.0, 1.0, 1.0 - VISCOUS], nodes.dtype)[None, : base.shape[1]]
     return jnp.eye(nodes.shape[0], dtype=nodes.dtype) - (base * free) @ base.T

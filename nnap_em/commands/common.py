@@ -137,6 +137,8 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
 def warn_of_torques(folder: Path, bench: Bench) -> None:
     """Warn where the inputs cannot be those of the declared bodies."""
     rig, data = bench.rig, bench.train.data
+    if rig.equations:
+        return
     system = build_system(rig)
     for finding in torques(rig, system, data, measure_scales(rig, system, data)):
         if finding.mark == ERROR:

@@ -32,12 +32,12 @@ def read_bounds(table: Any, inputs: Collection[str], states: Collection[str]) ->
     rate, start = table.table("rate", absent={}), table.table("start", absent={})
     rate.check((), inputs)
     start.check((), states)
-    values = {name: _range(table, name) for name in table.items if name not in ("rate", "start")}
-    rates = {name: _range(rate, name) for name in rate.items}
-    return Bounds(values, rates, {name: _range(start, name, place=True) for name in start.items})
+    values = {name: read_range(table, name) for name in table.items if name not in ("rate", "start")}
+    rates = {name: read_range(rate, name) for name in rate.items}
+    return Bounds(values, rates, {name: read_range(start, name, place=True) for name in start.items})
 
 
-def _range(table: Any, key: str, *, place: bool = False) -> Range:
+def read_range(table: Any, key: str, *, place: bool = False) -> Range:
     """A pair as it stands; a number is that far both ways, or the one `place`."""
     value = table.items[key]
     pair = value if isinstance(value, list) else [value, value] if place else [0.0, value]

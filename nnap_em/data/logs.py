@@ -26,9 +26,10 @@ TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
 INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
-HELD = "held"
+HELD, RANGE = "held", "range"
 _REASONS = {
     HELD: "equal to the one before, until the sensor takes its next",
+    RANGE: "at the end of the declared range of the sensor",
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
     "late start": "one value over again until the sensor starts",
@@ -45,7 +46,7 @@ class Masked(NamedTuple):
 
     file: str
     kind: str
-    """`spike`, `stuck`, `late start`, `saturated`, `held`: readings; `gap`, `cut`: rows."""
+    """`spike`, `stuck`, `late start`, `saturated`, `held`, `range`: readings; `gap`, `cut`: rows."""
     column: str | None
     row: int
     """The first one in the file, counted from 1 under the header."""
@@ -83,7 +84,7 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
     """
     files = log_files(Path(folder))
-    tables = [_read_table(path, rig) for path in files]
+    tables = [_within(_read_table(path, rig), rig) for path in files]
     early = [table.readings(rig, until) for table in tables]
     if held := {} if trust else _held(early):
         tables = [_once(table, held, rig) for table in tables]
@@ -160,6 +161,17 @@ def _held(logs: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
     return {name: each for name, each in rows.items() if each > 1}
 
 
+def _within(source: _Table, rig: Rig) -> _Table:
+    """A file without the readings at the declared ends of their sensors, whose tangent there would be 0."""
+    table, masked = source.table.copy(), list(source.masked)
+    for name, (low, high) in rig.ranges.items():
+        column = table[:, 1 + len(rig.logged_inputs) + rig.measured.index(name)]
+        if (beyond := np.flatnonzero((column <= low) | (column >= high))).size:
+            column[beyond] = np.nan
+            masked.append(_masked(source, RANGE, name, beyond))
+    return source._replace(table=table, masked=masked) if rig.ranges else source
+
+
 def _once(source: _Table, held: Mapping[str, float], rig: Rig) -> _Table:
     """A file in which each reading stands in one row, the first that has it."""
     table, masked = source.table.copy(), list(source.masked)
@@ -175,7 +187,7 @@ def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"
     """Readings of a file that are not used, with a warning."""
     line, t = int(source.line[rows[0]]), float(source.table[rows[0], 0])
     problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), the first at {t:.6g} s"
-    hint = "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
+    hint = "not used" if kind == RANGE else "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
     warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}; {hint}", DataWarning, 2)
     return Masked(source.path.name, kind, column, line + 1, t, rows.size)
 

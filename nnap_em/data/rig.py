@@ -2,18 +2,19 @@
 
 import dataclasses
 import difflib
+import functools
 import json
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from ..storage.files import replace_text
-from .limits import UNBOUNDED, Bounds, read_bounds
+from .limits import UNBOUNDED, Bounds, read_bounds, read_range
 from .machine import machine_unit, unpacked
 from .servo import AT, TORQUE, Drive, key_of, read_drives, scaled
 from .servo import keys as drive_keys
@@ -94,6 +95,7 @@ class Declaration(NamedTuple):
     machine: str = ""
     input_kinds: tuple[str, ...] = ()
     input_scales: Mapping[str, Mapping[str, float]] = {}
+    equations: str = ""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,9 @@ class Rig:
     memory: bool = False  # True: friction may have a hidden state in each joint
     # columns that a number of a servo ("goal.kp") is proportional to, each with its value where it is as declared
     input_scales: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
+    equations: str = ""  # of a plant that is written as equations: all of them, as `equations.Text.packed` writes them
+    ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)  # ends of sensors: not read
+    horizon: float | None = None  # s; how far predictions are used, of equations; None: by their time constants
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -144,6 +149,8 @@ class Rig:
             return (
                 key.unit if self._turns(name.rpartition(".")[0]) else key.unit.replace("N m", "N").replace("rad", "m")
             )
+        if self.equations:
+            return _units(self.equations).get(name, "")
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
 
     def _turns(self, column: str) -> bool:
@@ -166,9 +173,8 @@ class Rig:
     def __str__(self) -> str:
         words = {name: "" if kind == TORQUE else f" ({kind})" for name, kind in self.kinds.items()}
         scales = [f"{name} by {' and '.join(scale)}" for name, scale in self.input_scales.items()]
-        inputs = [
-            f"{name}{word} on joint {j}" for (name, word), j in zip(words.items(), self.input_joints, strict=True)
-        ] + scales
+        joints = zip(words.items(), self.input_joints, strict=True)
+        inputs = [f"{name}{word}" + ("" if self.equations else f" on joint {j}") for (name, word), j in joints] + scales
         noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}
         reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
         lines = [
@@ -196,15 +202,16 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     system = model.choice("type", systems)
     declaration = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
     spec = declaration.spec
-    sampling.check(("dt", "input_hold", "clock"))
+    sampling.check(("dt", "input_hold", "clock"), ("horizon",) if declaration.equations else ())
     sampling.choice("input_hold", ("zero-order",))
     start.check((), spec.states)
-    measured, noise_std = _measurement(root.table("measurement"), spec)
+    measured, noise_std, ranges = _measurement(root.table("measurement"), spec, bool(declaration.equations))
+    friction = "none" if declaration.equations else model.choice("friction", _FRICTION)
     return Rig(
         name=root.text("name"),
         system=system,
         parameters=declaration.parameters,
-        friction=model.choice("friction", _FRICTION) != "none",
+        friction=friction != "none",
         input_columns=declaration.input_columns,
         input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
@@ -215,8 +222,11 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         limits=read_bounds(root.table("limits", absent={}), declaration.input_columns, spec.states),
         machine=declaration.machine,
         input_kinds=declaration.input_kinds,
-        memory=model.text("friction") == "dynamic",
+        memory=friction == "dynamic",
         input_scales=declaration.input_scales,
+        equations=declaration.equations,
+        ranges=ranges,
+        horizon=sampling.positive("horizon") if "horizon" in sampling.items else None,
     )
 
 
@@ -230,28 +240,62 @@ def write_rig(rig: Rig, path: Path) -> None:
     bodies = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
     lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
-    friction = "dynamic" if rig.memory else "unknown" if rig.friction else "none"
-    kind = "map with memory" if rig.memory else "static map velocity -> torque"
-    lines += [f'friction = "{friction}"    # {kind} in each joint']
-    lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
-    unit = "" if rig.input_kinds else "    # N m, or N on a slide"
-    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
-    lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
-    units = {key: f"{value}    # {rig.unit(key)}" for key, value in parameters.items()}
-    lines += drive_lines(rig.kinds, units, toml_text)
+    lines += _equations(rig) if rig.equations else _joints(rig, parameters, bodies)
     lines += [
         "",
         "[sampling]",
         f"dt = {rig.dt!r}    # s",
         'input_hold = "zero-order"',
         f"clock = {toml_text(rig.clock)}",
+        *([f"horizon = {rig.horizon!r}    # s"] if rig.horizon else []),
     ]
-    lines += ["", "[measurement]", f"columns = [{', '.join(map(toml_text, rig.measured))}]"]
+    readings = json.loads(rig.equations)["readings"] if rig.equations else {}
+    reads = {name: readings.get(name, name) for name in rig.measured}
+    names = f"[{', '.join(map(toml_text, rig.measured))}]"
+    lines += ["", "[measurement]", f"columns = {_inline(reads) if readings else names}"]
+    lines += [f"range = {_inline({name: list(ends) for name, ends in rig.ranges.items()})}"] if rig.ranges else []
     lines += ["", "[measurement.noise_std]", *(f"{n} = {std!r}    # {rig.unit(n)}" for n, std in rig.noise_std.items())]
     lines += ["", "[start]    # prior of the first row"]
     lines += [f"{name} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
     lines += _limits(rig.limits)
     replace_text(path, "\n".join(lines) + "\n")
+
+
+def _joints(rig: Rig, parameters: Mapping[str, str], bodies: Sequence[str]) -> list[str]:
+    """Friction and inputs of a machine with joints."""
+    friction = "dynamic" if rig.memory else "unknown" if rig.friction else "none"
+    kind = "map with memory" if rig.memory else "static map velocity -> torque"
+    lines = [f'friction = "{friction}"    # {kind} in each joint']
+    lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
+    unit = "" if rig.input_kinds else "    # N m, or N on a slide"
+    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
+    lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
+    units = {key: f"{value}    # {rig.unit(key)}" for key, value in parameters.items()}
+    return [*lines, *drive_lines(rig.kinds, units, toml_text)]
+
+
+def _equations(rig: Rig) -> list[str]:
+    """States, inputs, rates and unknown terms of equations."""
+    of = json.loads(rig.equations)
+    known = {name: unit for name, unit in of["units"].items() if name in rig.parameters}
+    parts = {key: of[key] for key in ("states", "inputs", "rates")} if not of["function"] else {}
+    lines = [
+        f"{key} = {_inline(names) if all(names.values()) else json.dumps(list(names))}" for key, names in parts.items()
+    ]
+    lines += ["", "[model.units]", *(f"{name} = {toml_text(unit)}" for name, unit in known.items())] if known else []
+    terms = {name: ("", signals) for name, signals in of["terms"].items()} | dict(of["enters"])
+    entries = {
+        name: {"signals": signals} | ({"enters": port} if port else {}) for name, (port, signals) in terms.items()
+    }
+    return lines + (
+        ["", "[model.unknown]", *(f"{n} = {_inline(entry)}" for n, entry in entries.items())] if terms else []
+    )
+
+
+def _inline(values: Mapping[str, Any]) -> str:
+    """An inline table of texts, numbers and lists of these."""
+    text = lambda value: toml_text(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False)  # noqa: E731
+    return f"{{ {', '.join(f'{toml_text(name)} = {text(value)}' for name, value in values.items())} }}"
 
 
 def _columns(values: Mapping[str, float]) -> str:
@@ -370,6 +414,13 @@ class _Table:
         return tuple(value)
 
 
+@functools.cache
+def _units(equations: str) -> dict[str, str]:
+    """Units of all names of equations."""
+    of = json.loads(equations)
+    return {**of["states"], **of["inputs"], **of["units"]}
+
+
 def _parse(path: Path) -> dict[str, object]:
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
@@ -437,10 +488,13 @@ def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ..
     return columns, joints, drives
 
 
-def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The measured columns and the noise declared for them."""
-    table.check(("columns",), ("noise_std",))
-    columns = table.distinct("columns", str)
+def _measurement(
+    table: _Table, spec: SystemSpec, formulas: bool
+) -> tuple[tuple[str, ...], dict[str, float], dict[str, tuple[float, float]]]:
+    """The measured columns, the noise declared for them, and the ranges of their sensors."""
+    table.check(("columns",), ("noise_std", "range"))
+    formulas = formulas and isinstance(table.value("columns"), dict)
+    columns = tuple(table.table("columns").items) if formulas else table.distinct("columns", str)
     if not columns:
         table.refuse("columns")
     for column in columns:
@@ -450,7 +504,10 @@ def _measurement(table: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], dict
     noise = table.table("noise_std", absent={})
     noise = dataclasses.replace(noise, items=dict(flat(noise.items)))
     noise.check((), columns)
-    return columns, {column: noise.positive(column) for column in noise.items}
+    ends = table.table("range", absent={})
+    ends.check((), columns)
+    ranges = {column: read_range(ends, column) for column in ends.items}
+    return columns, {column: noise.positive(column) for column in noise.items}, ranges
 
 
 def _limits(limits: Bounds) -> list[str]:

@@ -24,14 +24,18 @@ class Scene(NamedTuple):
 
     system: AbstractSystem
     q: Float[Array, " dof"]
-    v: Float[Array, " dof"]
-    drive: Float[Array, " dof"]
+    """Coordinates; of equations all states."""
+    v: Float[Array, " rate"]
+    """Rates; of equations none."""
+    drive: Float[Array, " port"]
     """Generalised force of the inputs [N m]."""
     time: Scalar
-    friction: Float[Array, " dof"]
+    friction: Float[Array, " port"]
     """Torque of the learned map at v [N m]."""
     map: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
     """The learned map itself."""
+    u: Float[Array, " input"] | None = None
+    """Inputs that reach the plant."""
 
 
 class Around(NamedTuple):
@@ -166,7 +170,7 @@ class AbstractEffect(eqx.Module):
     joint: int | None = eqx.field(static=True, default=None, kw_only=True)
     """The joint that it acts on, counted from 1; None: all, or no joint."""
     channel: str | None = eqx.field(static=True, default=None, kw_only=True)
-    """The reading that it acts on; "all": every one."""
+    """The reading that it acts on ("all": every one); of equations also the port, or the input."""
 
     @classmethod
     def meaning(cls) -> str:
@@ -253,13 +257,13 @@ class AbstractEffect(eqx.Module):
         """The machine as it truly is."""
         return system
 
-    def friction(self, torque: Float[Array, " dof"], scene: Scene) -> Float[Array, " dof"]:
+    def friction(self, torque: Float[Array, " port"], scene: Scene) -> Float[Array, " port"]:
         """The friction torque as it truly is."""
         return torque
 
-    def force(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " dof"]:
-        """Generalised force that comes on top [N m]."""
-        return jnp.zeros_like(scene.v)
+    def force(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " port"]:
+        """Generalised force that comes on top [N m], or push at every port."""
+        return jnp.zeros_like(scene.drive)
 
     def drift(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
         """Time derivative of its own states."""

@@ -1,7 +1,7 @@
 """First model of EM, from the declaration and the logs; every scale comes from one of the two."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from ..model.state_space import MOST_STEPS, SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
+from .equations import build_equations
 from .mstep import COARSE, STEP, ScoringMStep
 from .prior import ParameterPrior
 from .readings import RESTS, at_rest, reading_noise
@@ -43,13 +44,15 @@ class Problem(NamedTuple):
     bank: StartBank
 
 
-def build_system(rig: Rig) -> AbstractSystem:
+def build_system(rig: Rig) -> Any:
     """The declared physics, at the mean of what is uncertain.
 
     Raises RigError where its mass matrix is not positive definite.
     """
     values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.bodies.items()}
-    system = systems[rig.system].declared(values, rig.input_joints, rig.machine)
+    system = systems[rig.system].declared(values, rig.input_joints, rig.machine or rig.equations)
+    if rig.equations:
+        return system
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(system.coordinates)))
     if np.linalg.eigvalsh(np.asarray(_masses(system, jnp.asarray(q, float)))).min() <= 0:
         raise RigError(f"rig {rig.name!r}: {NO_MACHINE}: their kinetic energy can fall below 0; correct [model]")
@@ -155,6 +158,10 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
 def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     """The model that EM starts from: declared physics, a small random friction network, noise as large as motion."""
     system, servos = build_system(rig), build_servos(rig)
+    if rig.equations:
+        model, prior, learned, estimated, quiet = build_equations(rig, system, data)
+        mstep = ScoringMStep(prior, jnp.zeros(0), learned, estimated, shape=model.log_q, quiet=quiet)
+        return Problem(model, mstep, StartBank((1,) * len(system.states)))
     scales = measure_scales(rig, system, data)
     states = system.coordinates + system.rates
     start, open_ = start_prior(rig, system, data, scales)

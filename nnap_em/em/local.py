@@ -31,25 +31,25 @@ def local(
 def _sensitivities(
     model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, inputs: Inputs
 ) -> tuple[
-    Float[Array, "time state dof"],
+    Float[Array, "time state port"],
     Float[Array, "time state param"],
-    Float[Array, "time obs dof"] | None,
+    Float[Array, "time obs port"] | None,
     Float[Array, "time obs param"],
 ]:
     """Sensitivities of next state and reading to a force held over the step, and to the parameters."""
     value, held = prior.read(model), prior.held(model)
     free = np.flatnonzero(~held)
-    dof = len(model.system.coordinates)
-    still = jnp.zeros(dof, path.mean.dtype)
+    ports = len(model.system.ports)
+    still = jnp.zeros(ports, path.mean.dtype)
     z = jnp.concatenate([still, value[free]])  # a force, and the parameters that do not act as forces held over a step
-    by_z = jax.jacfwd(lambda z: prior.write(model, value.at[free].set(z[dof:])).inputs(seq))(z)
+    by_z = jax.jacfwd(lambda z: prior.write(model, value.at[free].set(z[ports:])).inputs(seq))(z)
 
     def row(state, u, by_z):
         x = state.mean
 
         def both(z, u):
-            changed = prior.write(model, value.at[free].set(z[dof:]))
-            return changed.transition(x, u, z[:dof]), changed.emission(x, u, z[:dof])
+            changed = prior.write(model, value.at[free].set(z[ports:]))
+            return changed.transition(x, u, z[:ports]), changed.emission(x, u, z[:ports])
 
         def along(dz, du):
             return jax.jvp(both, (z, u), (dz, du))[1]
@@ -61,9 +61,9 @@ def _sensitivities(
             return sum((e.force(scene, nothing) for e in changed.effects if e.held), still)
 
         moved, read = jax.vmap(along, in_axes=(0, -1), out_axes=-1)(jnp.eye(z.shape[0], dtype=z.dtype), by_z)
-        by_force, feels = moved[:, :dof], read[:, :dof] if model.system.sensors else None
-        by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, dof:])
-        of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, dof:])
+        by_force, feels = moved[:, :ports], read[:, :ports] if model.system.senses_push else None
+        by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, ports:])
+        of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, ports:])
         if held.any():
             middle = x + 0.5 * model.dt * model.rate(x, u, still)
             push = jax.jacfwd(pushed)(value[held])

@@ -144,7 +144,7 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
     pick = lambda a: jnp.where(used.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     total = jax.tree.map(lambda a: jnp.sum(pick(a), axis=0), terms)
     first = jax.tree.map(pick, first)
-    near = jnp.repeat(jnp.broadcast_to(rule.reach, core.unknown.scale.shape) ** -2.0, weights.nodes.shape[1])
+    near = jnp.repeat(jnp.broadcast_to(rule.reach, weights.nodes.shape[:1]) ** -2.0, weights.nodes.shape[1])
     near = jnp.diag(jnp.concatenate([near, jnp.zeros(weights.prior.size, near.dtype)]))
     w = weights.fit(core.unknown, core.w, total.score, total.information + near, rule.iterations)
     hessian = _definite(total.information + weights.prior_precision(core.unknown))
@@ -203,6 +203,10 @@ class ScoringMStep(AbstractMStep):
     """Log variances of the process noise of the first model."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
     """`Weights.least`, of the declared parameters."""
+    quiet: Float[Array, " obs"] | None = None
+    """Smallest log variances of the readings, by the logs alone; None: any. Process noise of a hidden state may stand
+    for that of its reading.
+    """
 
     def weights(self, model) -> Weights:
         """Estimated vector: weights of the network and parameters."""
@@ -269,20 +273,31 @@ class ScoringMStep(AbstractMStep):
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
         """Log variances of process and reading noise after the step."""
-        info = total.noise_information
-        learn = jnp.asarray([i < 2 * dof for i in range(model.log_q.shape[0])] + list(self.learn_r))
+        info, states = total.noise_information, len(self.learn_start)
+        learn = jnp.asarray([i < states for i in range(model.log_q.shape[0])] + list(self.learn_r))
         info = jnp.where(learn[:, None] & learn[None, :], info, 0.0)
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
         n = model.log_q.shape[0]
-        hold = jnp.zeros_like(info).at[: 2 * dof, : 2 * dof].set(self._hold(dof))
+        hold = jnp.zeros_like(info).at[:states, :states].set(self._hold(dof))
         assert self.shape is not None
         off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
-        step = jnp.linalg.solve(info + hold, jnp.where(learn, total.noise_score, 0.0) - hold @ off)
+        score = jnp.where(learn, total.noise_score, 0.0) - hold @ off
+        step = jnp.linalg.solve(info + hold, score)
+        if self.quiet is not None:  # those that would fall below go as far as that, the others as that lets them
+            down = jnp.where(learn, jnp.concatenate([model.log_q - jnp.inf, self.quiet - model.log_r]), -jnp.inf)
+            low = step < down
+            fixed, matrix = jnp.where(low, down, 0.0), jnp.where(low[:, None] | low[None], 0.0, info + hold)
+            rest = jnp.where(low, 0.0, score - (info + hold) @ fixed)
+            step = fixed + jnp.linalg.solve(matrix + jnp.diag(low.astype(score.dtype)), rest)
         step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
         return model.log_q + step[:n], model.log_r + step[n:]
 
     def _hold(self, dof: int) -> Float[Array, "state state"]:
-        """Prior precision of the log process noises: kicks act on rates, and reach angles over one step."""
+        """Prior precision of the log process noises: kicks act on rates, and reach angles over one step; on all states
+        of equations.
+        """
+        if not dof:
+            return self.tie * (jnp.eye(count := len(self.learn_start)) - 1 / count)
         rate = jnp.eye(dof)
         angle = jnp.concatenate([rate, -rate], axis=1)
         ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)

@@ -18,11 +18,11 @@ class Local(NamedTuple):
     seq: Prepared
     affine: Affine
     reading: Reading
-    by_force: Float[Array, "*time state dof"]
+    by_force: Float[Array, "*time state port"]
     """Sensitivity of the next state to a force held over the step."""
     by_parameter: Float[Array, "*time state param"]
     reading_by_parameter: Float[Array, "*time obs param"]
-    reading_by_force: Float[Array, "*time obs dof"] | None = None
+    reading_by_force: Float[Array, "*time obs port"] | None = None
     """Sensitivity of the reading to a force at its moment; None without a sensor of forces."""
 
 
@@ -76,9 +76,10 @@ def whitened_sensitivities(
 
 
 def friction_columns(
-    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], by_force: Float[Array, "state dof"]
+    nodes: Float[Array, "dof count"], speed: Float[Array, "node dof"], by_force: Float[Array, "state port"]
 ) -> Float[Array, "state phi"]:
-    """Sensitivity of the next state to the torques at the nodes, mean over some speeds."""
+    """Sensitivity of the next state to the torques at the nodes, mean over some speeds; equations have none."""
+    by_force = by_force[:, : len(nodes)]
     weights = spread(nodes, speed, jnp.full_like(speed, 1 / speed.shape[0]))
     return (by_force[:, :, None] * weights[None]).reshape(by_force.shape[0], -1)
 
@@ -114,7 +115,7 @@ def quadratic(
         speed = 0.5 * (prev + following - kick)[:, dof : 2 * dof]  # half the kick would count as signal
         sensitivity = friction_columns(nodes, speed, by_force)
         push = spd_solve(jnp.diag(q) + excess, kick.T).T
-        pull = push @ by_force  # node dof
+        pull = push @ by_force[:, :dof]  # node dof
         score = spread(nodes, speed, pull / speed.shape[0]).ravel()
         score = jnp.concatenate([score, jnp.mean(push, axis=0) @ by_parameter])
         expected = jnp.diag(spd_solve(jnp.diag(q) + excess, jnp.eye(q.shape[0], dtype=q.dtype)))
@@ -134,7 +135,9 @@ def quadratic(
     rates = jnp.concatenate([posterior.prev, posterior.next[-1:]])[..., dof : 2 * dof]
     of_torque = jnp.zeros(nodes.size, score.dtype)
     if linear.reading_by_force is not None:
-        each = jnp.where(observed[:, None], miss / r[None, None], 0.0) @ linear.reading_by_force / miss.shape[1]
+        each = (
+            jnp.where(observed[:, None], miss / r[None, None], 0.0) @ linear.reading_by_force[..., :dof] / miss.shape[1]
+        )
         of_torque = jnp.sum(jax.vmap(lambda v, pull: spread(nodes, v, pull))(rates, each), axis=0).ravel()
     of_readings = jnp.einsum("to,top->p", weighed, linear.reading_by_parameter)
     score = score + jnp.concatenate([of_torque, of_readings])

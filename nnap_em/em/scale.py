@@ -1,6 +1,7 @@
 """Scale of all masses and of friction, which is not identifiable where nothing drives the machine."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,20 +9,19 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..data.rig import Declared, Rig
-from ..systems import AbstractSystem
 
 EXACT = 1e-4
 """Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too."""
 
 
-def not_identifiable(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
+def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
 
     Without a torque the motion is the same when M(q) and c(q, v) are multiplied by one number, and the learned friction
     with them. That number is free as long as a change of the uncertain parameters multiplies M and c. Of the change
     that is the least in declared standard deviations, the parameter that moves by the most of them is held; and so on.
     """
-    if rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
+    if rig.equations or rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
         return ()  # the gains of servos are numbers of the machine, and `identifiability` looks at these
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v = (jnp.asarray(rng.uniform(-3.0, 3.0, (16, dof))) for _ in range(2))

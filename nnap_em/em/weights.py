@@ -19,7 +19,7 @@ class Weights(eqx.Module):
     """Precision of the weights' prior; the network's output is scaled so that 1 is natural."""
     centre: Float[Array, " weight"]
     """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
-    asymmetry: Float[Array, " dof"]
+    asymmetry: Float[Array, " port"]
     """Prior standard deviation [N m] of an offset, the even part of a friction map that all nodes share."""
     rough: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
     """Standard deviation of the even part at every node alone, in those of the offset."""
@@ -88,7 +88,7 @@ class Weights(eqx.Module):
         torque = jax.vmap(lambda w: jax.vmap(unknown.with_weights(w))(self.nodes.T).T)(self.centre[None] + moved)
         torque = torque - jnp.mean(torque, axis=0, keepdims=True)
         cov = jnp.einsum("sja,sjb->jab", torque, torque) / DRAWS
-        cov = cov + ((GRAIN * unknown.scale) ** 2)[:, None, None] * jnp.eye(count, dtype=dtype)[None]
+        cov = cov + ((GRAIN * unknown.scale[: len(self.nodes)]) ** 2)[:, None, None] * jnp.eye(count, dtype=dtype)[None]
         w = jnp.concatenate([unknown.weights(), jnp.zeros(self.prior.size, dtype)])
         own = jax.scipy.linalg.block_diag(*jnp.linalg.inv(cov), jnp.eye(self.prior.size, dtype=dtype))
         return self.symmetry(unknown, w) + own

@@ -14,12 +14,14 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import AFTERWARDS, EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, start_state, unsettled
+from ..em.loop import AFTERWARDS, EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, later_state, start_state, unsettled
 from ..em.mstep import ScoringMStep, kept
+from ..em.prior import ParameterPrior
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
+from ..prediction_error import simulated
 from ..prediction_error.multistep import FALLS, JUDGED, errors, finish, followed, ratio
 from ..prediction_error.noise import white_readings
 from ..prediction_error.stated import widened
@@ -46,6 +48,8 @@ class Identified(NamedTuple):
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
     memory: str = ""
     """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
+    horizon_note: str | None = None
+    """Sentence on fits by likelihood and by errors over the horizon of use; of equations alone."""
     rise: float = 0.0
     """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
 
@@ -141,9 +145,11 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
 
     Where it does not and the noise of the readings is that of the model, one-step likelihood is efficient, and its
-    curvature is its precision.
+    curvature is its precision.  Equations are always fitted to errors over their horizon of use.
     """
     data = jax.device_put(data)
+    if not fitted.model.system.coordinates:
+        return _simulating(fitted, data)
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
     if used.sum() < PARTS:
@@ -164,6 +170,44 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
     stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, AFTERWARDS))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
+
+
+NOISE_EPOCHS = 12
+"""Epochs of EM for noise alone, at most."""
+WORSE = 1.2
+"""Error of the likelier fit over the horizon of use, over that of the fit to such errors, from which on they differ."""
+
+
+def _simulating(fitted: Identified, data: Dataset) -> Identified:
+    """Equations whose parameters are those of the smallest errors over the horizon of use, with noise by EM.
+
+    Likelihood alone trades long for short predictions: process noise of a hidden state stands for all that is slow.
+    """
+    prior, key = fitted.m_step.prior, fitted.state.key
+    likely = simulated.simulated(fitted.model, prior, data)
+    scale = simulated.scale_of(likely.error)
+    declared = prior.write(fitted.model, jnp.zeros_like(prior.mean))
+    cost = lambda of: simulated.cost(of.error, scale, of.overlap, simulated.observed(of)) + of.z @ of.z  # noqa: E731
+    best = min((simulated.fit(model, prior, data, scale=scale) for model in (declared, fitted.model)), key=cost)
+    rule = eqx.tree_at(lambda rule: rule.prior, fitted.m_step, ParameterPrior((), prior.mean[:0], prior.std[:0]))
+    begun = later_state(best.model, rule, key=key)
+    longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    state = fit(begun, data, fitted.smoother, rule, epochs=NOISE_EPOCHS, schedule=Schedule(first=longest))
+    best = simulated.fit(cast(StateSpaceModel, state.best), prior, data)
+    hessian = jnp.asarray(simulated.precision(best, simulated.scale_of(best.error)))
+    state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
+    return fitted._replace(state=state, horizon_note=_horizon_note(fitted, likely, best))
+
+
+def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulated.Simulated) -> str:
+    """Errors of both fits over the horizon of use, and what it means where they disagree."""
+    first, second = (np.sqrt(np.nanmean(of.error[:, :, -1] ** 2, axis=(0, 1))) for of in (likely, best))
+    unit = fitted.model.system.unit
+    each = zip(fitted.rig.measured, first, second, strict=True)
+    parts = [f"{name}: {a:.3g} and {b:.3g} {unit(name)}".rstrip() for name, a, b in each]
+    text = f"errors {best.reach:.3g} s ahead of the fit by likelihood and of the one to such errors, which is kept: "
+    odd = " They differ: something is missing in the equations." if np.any(first > WORSE * second) else ""
+    return f"{text}{', '.join(parts)}.{odd}"
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

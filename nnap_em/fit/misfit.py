@@ -78,7 +78,7 @@ def misfits(fitted: Identified, data: Dataset, error: Mapping[str, Any] | None, 
 
     The random acceleration is the process noise of a rate in a step over the length of the step.
     """
-    if fitted.rise:
+    if fitted.rise or fitted.rig.equations:
         return []
     rig, system, dof = fitted.rig, fitted.model.system, len(fitted.model.system.rates)
     moving = measure_scales(rig, system, data).acceleration

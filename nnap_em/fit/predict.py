@@ -21,6 +21,18 @@ from .identify import Identified, phi_samples
 GIVEN = 1.0  # s of readings before a reported error
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
+GIVEN_SHARE = 0.25
+"""Readings before a reported error of equations, in their pace: two time constants determine a start."""
+
+
+def given_of(fitted: Identified) -> float:
+    """Readings before a reported error [s]."""
+    return GIVEN if fitted.model.system.coordinates else GIVEN_SHARE * fitted.model.pace
+
+
+def horizons_of(fitted: Identified) -> tuple[float, ...]:
+    """Horizons of the reported errors [s]: those of a machine with joints, or as many in the pace of equations."""
+    return tuple(float(f"{h * fitted.model.pace:.3g}") for h in HORIZONS)
 
 
 class Prediction(NamedTuple):
@@ -86,7 +98,7 @@ class Paths(NamedTuple):
         dof = self.nodes.shape[0]
 
         def one(x, u, table, parameters):
-            force = jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table)
+            force = self.model.system.at_ports(jax.vmap(jnp.interp)(x[dof : 2 * dof], self.nodes, table))
             model = self.prior.write(self.model, parameters)
             return model.transition(x, u, force), model.shown(x, u, force)
 
@@ -98,7 +110,7 @@ def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
     model, prior = fitted.model, fitted.m_step.prior
     nodes = fitted.m_step.weights(model).nodes
     deviations = phi_samples(fitted, count, key=key)
-    tables = deviations[:, : nodes.size].reshape(-1, *nodes.shape)
+    tables = deviations[:, : nodes.size].reshape(count, *nodes.shape)
     return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
 
 

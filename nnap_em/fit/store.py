@@ -178,7 +178,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
             # numbers that effects and models have had since
-            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest", "/stop"))
+            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest", "/stop", "/quiet", "/horizon_note"))
             return (
                 value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
             )
@@ -196,7 +196,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
         later = place not in settings and (
-            "/effects/" in place or place.endswith(("/angles", "/branching", "/scales"))
+            "/effects/" in place or place.endswith(("/angles", "/branching", "/scales", "/pace", "/jointless"))
         )  # its default
         if plain(value) != (place in settings) and not later:
             differs(place, "a setting that only one of the two has")
@@ -255,6 +255,7 @@ def _rig(entries: Mapping[str, Any]) -> Rig:
         part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries.get("limits", {}).items()
     }
     values["limits"] = Bounds(**pairs)
+    values["ranges"] = {name: tuple(ends) for name, ends in entries.get("ranges", {}).items()}
     return Rig(**values)
 
 

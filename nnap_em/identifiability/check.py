@@ -14,10 +14,11 @@ from ..data.logs import HELD, Logs
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
+from ..em.equations import motion
 from ..em.readings import onset, reading_noise, resolution
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
-from ..fit.identify import begin
+from ..fit.identify import Identified, begin
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
@@ -35,6 +36,9 @@ SEQUENCES, SECONDS, LEAST = 6, 1.0, 10
 where samples are that slow]: a wrong model loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
+RECORDED, WINDOW = 10.0, 0.25
+"""Length of a recording in slowest time constants, and of the part that must determine the state, in the pace of the
+model."""
 REVERSALS = 20
 """Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
 distance over which friction turns and its size."""
@@ -73,6 +77,8 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     except RigError:
         return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
     system = problem.model.system
+    if rig.equations:
+        return [*amount, *_equations(rig, problem, data)]
     if stiff := list(_stiff(rig, system, data)):
         return [*amount, *stiff]
     scales = measure_scales(rig, system, data)
@@ -92,9 +98,30 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
     ]
 
 
-def _window(dt: float) -> int:
+def _window(dt: float, seconds: float = SECONDS) -> int:
     """Rows that are smoothed with the first model."""
-    return max(round(SECONDS / dt), LEAST)
+    return max(round(seconds / dt), LEAST)
+
+
+def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
+    """Time constants of equations against rows and recordings, noise, and observability of their states."""
+    model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
+    seen = motion(model, data)
+    fastest = 1 / max(seen.fastest, 1e-12)
+    hints = [
+        (not len(seen.rate), "a simulation of the equations runs away: look at signs, units and parameters"),
+        (fastest < rig.dt, "the fastest is over between two rows: sample faster, or look at the units of parameters"),
+        (longest < RECORDED * seen.slowest, f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s"),
+    ]
+    remarks = [hint for holds, hint in hints if holds]
+    constants = f"time constants of the declared equations are {fastest:.3g} to {seen.slowest:.3g} s"
+    text = f"{constants}, rows {rig.dt:g} s apart; predictions are judged up to {model.pace:g} s ahead"
+    yield CheckResult(_mark(remarks, hints[0][0]), "sampling", "; ".join([text, *remarks]))
+    yield from _noise(rig, model, data)
+    rows = min(data.valid.shape[1], _window(rig.dt, WINDOW * model.pace) + 1)
+    head = _first(data, rows)
+    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
+    yield from _observability(model, along, np.asarray(head.valid), rows - 1)
 
 
 def _first(data: Dataset, rows: int) -> Dataset:
@@ -108,7 +135,7 @@ def _first(data: Dataset, rows: int) -> Dataset:
 def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:
     """The parts of Along of one sequence."""
     model, smoother = common
-    prepared, still = prepare(model, seq), jnp.zeros(len(model.system.coordinates))
+    prepared, still = prepare(model, seq), jnp.zeros(len(model.system.ports))
     x, u = smoother(model, prepared, key=jax.random.key(0)).state.mean, prepared.inputs
     slopes = (model.transition, model.emission, lambda x, u: model.rate(x, u, still))
     return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
@@ -128,7 +155,7 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     rows = data.valid.sum(axis=1)
     shortage = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
     short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
-    too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1]
+    too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1] and not rig.equations
     long = "cut them into sequences of some seconds" if too_long else ""
     little = "more would make the curve surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, shortage)
@@ -431,13 +458,15 @@ def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
     return int(np.count_nonzero(np.diff(sign)))
 
 
-def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[CheckResult]:
+def _observability(
+    model: StateSpaceModel, along: Along, valid: np.ndarray, rows: int | None = None
+) -> Iterator[CheckResult]:
     """Observability of the state from readings alone, by the Gramian sum Phi' C' R^-1 C Phi along the logs.
 
     [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
     """
-    names = model.system.coordinates + model.system.rates
-    dof, rows = len(model.system.coordinates), _window(model.dt)
+    names, dof = model.system.states, len(model.system.coordinates)
+    rows = rows or _window(model.dt)
     x = along.x.reshape(-1, len(names))
     scale = np.maximum([_std(one) for one in x.T], 1e-12)
     noise = np.exp(0.5 * np.asarray(model.log_r))

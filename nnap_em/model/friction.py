@@ -134,6 +134,8 @@ class FixedFriction(eqx.Module):
 
     law: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
     scale: Float[Array, " dof"]
+    jointless: bool = eqx.field(static=True, default=False)
+    """True of equations: `scale` is that of pushes at their ports, none of which has a map."""
 
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Torque at joint velocities [N m]."""
@@ -141,7 +143,7 @@ class FixedFriction(eqx.Module):
 
     def nodes(self, count: int) -> Float[Array, "dof 2"]:
         """Two velocities; any would do."""
-        return jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
+        return jnp.zeros((0, 2)) if self.jointless else jnp.asarray([[-1.0, 1.0]] * self.scale.shape[0])
 
     def steepest(self) -> Float[Array, " dof"]:
         """None is learned."""
@@ -156,6 +158,6 @@ class FixedFriction(eqx.Module):
         return self
 
 
-def NoFriction(scale: Float[Array, " dof"]) -> FixedFriction:
-    """A machine that is declared free of friction."""
-    return FixedFriction(jnp.zeros_like, scale)
+def NoFriction(scale: Float[Array, " dof"], *, jointless: bool = False) -> FixedFriction:
+    """A machine that is declared free of friction, or equations."""
+    return FixedFriction(jnp.zeros_like, scale, jointless)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from ..effects.actuator import InputDelay
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..systems.base import AbstractSystem
+from ..systems.plant import AbstractPlant
 from .servo import LAWS, Servo
 
 Effects = Sequence[AbstractEffect]
@@ -25,12 +26,11 @@ class CommandStream(NamedTuple):
 
 
 def reaching(
-    effects: Effects, system: AbstractSystem, u: Float[Array, "time input"], dt: float
+    effects: Effects, system: AbstractPlant, u: Float[Array, "time input"], dt: float
 ) -> Float[Array, "time input"]:
     """Torques at the joints of the commanded torques of a sequence [N m]."""
     for effect in effects:
-        if effect.joint in system.joints:
-            i = system.joints.index(effect.joint)
+        if (i := system.input_of(effect.joint, effect.channel)) is not None:
             u = u.at[:, i].set(effect.drive(effect.input(u[:, i], dt)))
     return u
 
@@ -131,18 +131,18 @@ def driven(
     return jnp.stack(torques)
 
 
-def machine(effects: Effects, system: AbstractSystem, time: Scalar) -> AbstractSystem:
+def machine(effects: Effects, system: Any, time: Scalar) -> Any:
     """The machine as it truly is at some time [s]."""
     for effect in effects:
         system = effect.physics(system, time)
     return system
 
 
-def acceleration(
-    effects: Effects, scene: Scene, memory: Float[Array, " memory"], force: Float[Array, " dof"]
-) -> tuple[Scalar, ...]:
-    """Acceleration of every joint under the inputs, all effects in the scene, and an extra generalised force [N m]."""
-    return scene.system.acceleration(scene.q, scene.v, _total(effects, scene, memory, scene.drive + force))
+def pushed(
+    effects: Effects, scene: Scene, memory: Float[Array, " memory"], push: Float[Array, " port"]
+) -> Float[Array, " port"]:
+    """Push at every port by the inputs, all effects in the scene, and an extra `push` [N m, at a joint]."""
+    return _total(effects, scene, memory, scene.drive + push)
 
 
 def added(
@@ -158,8 +158,8 @@ def added(
 
 
 def _total(
-    effects: Effects, scene: Scene, memory: Float[Array, " memory"], known: Float[Array, " dof"]
-) -> Float[Array, " dof"]:
+    effects: Effects, scene: Scene, memory: Float[Array, " memory"], known: Float[Array, " port"]
+) -> Float[Array, " port"]:
     """`known` with the forces of the effects, and friction as it truly is, on top [N m]."""
     torque = scene.friction
     for effect, part in _memories(effects, memory):

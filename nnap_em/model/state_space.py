@@ -53,7 +53,8 @@ class StateSpaceModel(AbstractModel):
     The state is (q, v), then the memory of the effects in their order.
     """
 
-    system: AbstractSystem
+    system: Any
+    """The known physics, an `AbstractPlant`."""
     unknown: Callable[[Float[Array, " dof"]], Float[Array, " dof"]]
     """Static map of joint velocity to torque, to be learned."""
     start: Gaussian
@@ -71,6 +72,8 @@ class StateSpaceModel(AbstractModel):
     """Laws that the declared physics lacks."""
     servos: tuple[Servo, ...] | None = None
     """Law that makes torque of every input; None where the inputs are torques."""
+    pace: float = eqx.field(static=True, default=1.0)
+    """Time in which the horizons of predictions are counted [s]: 1 s for machines with joints."""
 
     def __str__(self) -> str:
         names = self.system.readable
@@ -97,11 +100,11 @@ class StateSpaceModel(AbstractModel):
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
         """State of the machine at one moment, as effects get it."""
-        dof = len(self.system.coordinates)
-        q, v = x[:dof], x[dof : 2 * dof]
+        q, v = self.system.split(x)
         system = hooks.machine(self.effects, self.system, u.time)
         torque = hooks.driven(self.effects, self.servos, system, u.u, q, v, u.scale) if self.servos else u.u
-        return Scene(system, q, v, system.drive(torque), u.time, self.unknown(v), self.unknown)
+        friction = system.at_ports(self.unknown(v))
+        return Scene(system, q, v, system.drive(torque), u.time, friction, self.unknown, torque)
 
     def driving(
         self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs
@@ -123,16 +126,17 @@ class StateSpaceModel(AbstractModel):
 
     def slopes(self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"]) -> tuple[Scalar, ...]:
         """`rate`, entry by entry."""
-        memory, scene = x[2 * force.shape[0] :], self.scene(x, u)
-        acceleration = hooks.acceleration(self.effects, scene, memory, force)
-        return *scene.v, *acceleration, *hooks.drift(self.effects, scene, memory)
+        memory, scene = x[len(self.system.states) :], self.scene(x, u)
+        push = hooks.pushed(self.effects, scene, memory, force)
+        slopes = scene.system.slopes(scene.q, scene.v, cast(Array, scene.u), push)
+        return *slopes, *hooks.drift(self.effects, scene, memory)
 
     @eqx.filter_jit
     def transition(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " state"]:
         """Mean of the state one sample later."""
-        extra = jnp.zeros(len(self.system.coordinates), x.dtype) if force is None else force
+        extra = jnp.zeros(len(self.system.ports), x.dtype) if force is None else force
         return integrate(lambda x: self.slopes(x, u, extra), x, self.dt, self.steps)
 
     def resolved(self) -> "StateSpaceModel":
@@ -140,6 +144,8 @@ class StateSpaceModel(AbstractModel):
 
         Max over joints and poses of dt (M^-1)_jj |d tau_j / d v_j|, over `STEEP`.
         """
+        if not self.system.coordinates:
+            return self
         q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(self.system.coordinates))), float)
         fastest = self.dt * np.max(
             np.asarray(_mobility(self.system, q)) * np.asarray(cast(Any, self.unknown).steepest())
@@ -164,16 +170,17 @@ class StateSpaceModel(AbstractModel):
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
     ) -> Float[Array, " readable"]:
         """Coordinates, rates, and readings of the sensors beside these, at inputs u and an extra generalised force."""
-        dof, count = len(self.system.coordinates), len(self.system.sensors)
+        states, count = len(self.system.states), len(self.system.sensors)
         if not count:
-            return x[: 2 * dof]
-        extra = jnp.zeros(dof, x.dtype) if force is None else force
+            return x[:states]
+        extra = jnp.zeros(len(self.system.ports), x.dtype) if force is None else force
 
         def senses(x: Float[Array, " state"]) -> Sequence[Scalar]:
             scene = self.scene(x, u)
-            return self.system.senses(scene.q, scene.v, hooks.acceleration(self.effects, scene, x[2 * dof :], extra))
+            push = hooks.pushed(self.effects, scene, x[states:], extra)
+            return scene.system.sensed(scene.q, scene.v, cast(Array, scene.u), push)
 
-        return jnp.concatenate([x[: 2 * dof], jnp.stack(in_loop(senses, x, count))])
+        return jnp.concatenate([x[:states], jnp.stack(in_loop(senses, x, count))])
 
     def readable(
         self, x: Float[Array, " state"], u: Inputs, force: Float[Array, " dof"] | None = None
@@ -184,7 +191,7 @@ class StateSpaceModel(AbstractModel):
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
             """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
             before, reach = u._replace(u=u.before), jnp.minimum(delay, u.age)
-            still = jnp.zeros(len(self.system.coordinates), x.dtype)
+            still = jnp.zeros(len(self.system.ports), x.dtype)
             return self.true(integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3), before, force)
 
         return hooks.read(self.effects, names, self.true(x, u, force), past)
@@ -212,10 +219,10 @@ def _mobility(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Arra
 
 def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) -> StateSpaceModel:
     """`model` with other effects: memory states are dropped or begin at rest."""
-    dof = len(model.system.coordinates)
+    states = len(model.system.states)
     spread = [effect.memory_scale() for effect in effects if effect.memory]
     wide = jnp.concatenate([jnp.ones(0, model.log_q.dtype), *spread])
-    mean = jnp.concatenate([model.start.mean[: 2 * dof], jnp.zeros_like(wide)])
-    cov = jax.scipy.linalg.block_diag(model.start.cov[: 2 * dof, : 2 * dof], jnp.diag((0.1 * wide) ** 2))
-    log_q = jnp.concatenate([model.log_q[: 2 * dof], 2 * jnp.log(1e-3 * wide)])
+    mean = jnp.concatenate([model.start.mean[:states], jnp.zeros_like(wide)])
+    cov = jax.scipy.linalg.block_diag(model.start.cov[:states, :states], jnp.diag((0.1 * wide) ** 2))
+    log_q = jnp.concatenate([model.log_q[:states], 2 * jnp.log(1e-3 * wide)])
     return dataclasses.replace(model, start=Gaussian(mean, cov), log_q=log_q, effects=effects)

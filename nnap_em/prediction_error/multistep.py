@@ -70,8 +70,9 @@ class OpenLoop(NamedTuple):
     """Number of predictions that cover one moment."""
 
 
-def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS) -> Grid:
-    """Starts and horizons on logs of `rows` samples; where these are short the horizons are too."""
+def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS, pace: float = 1.0) -> Grid:
+    """Starts and horizons on logs of `rows` samples, counted in `pace` [s]; where logs are short, horizons are too."""
+    dt = dt / pace
     stride = max(1, round(SPACING / dt))
     longest = max(1, rows // 3 // stride)
     return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
@@ -84,7 +85,8 @@ def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
     """Places in y of the readings compared: measured coordinates and sensors, or where there are none all."""
-    rates = range(dof := len(model.system.coordinates), 2 * dof)
+    dof = len(model.system.coordinates)
+    rates = range(dof, 2 * dof)
     return tuple(i for i, s in enumerate(model.measured) if s not in rates) or tuple(range(len(model.measured)))
 
 
@@ -118,11 +120,11 @@ def open_loop(
 
     It takes indices of sequences: columns of all sequences, or of all candidates at six joints, would be gigabytes.
     """
-    (rows, obs), dof = along.data.y.shape[1:], len(along.model.system.coordinates)
+    (rows, obs), ports = along.data.y.shape[1:], len(along.model.system.ports)
     grid = _grid(along.model, along.data, horizons)
 
     def none(indices) -> Iterable[Columns]:
-        yield Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (dof, obs)))
+        yield Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))
 
     columns, see = [], channels(along.model)
     for indices, part in turns(len(along.state), along.linear, along.gain, along.middle):
@@ -144,17 +146,21 @@ def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.
 
 
 def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
-    return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons)
+    return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons, model.pace)
 
 
 def _wide(
     model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset
 ) -> tuple[Local, Float[Array, "seq time state"]]:
     """The model along its paths, with slopes as wide as predictions err, through the exact transition; and that."""
-    dof = len(model.system.coordinates)
-    rates = jnp.where(data.valid[..., None], path.mean[..., dof : 2 * dof], jnp.nan)
-    rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
-    spread = jnp.concatenate([WIDE * HORIZONS[0] * rms, WIDE * rms, jnp.full(path.mean.shape[-1] - 2 * dof, 1e-6)])
+    dof, states = len(model.system.coordinates), len(model.system.states)
+    rates = jnp.where(data.valid[..., None], path.mean[..., dof:states], jnp.nan)
+    if dof:
+        rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
+        spread = [WIDE * HORIZONS[0] * rms, WIDE * rms]
+    else:
+        spread = [WIDE * jnp.nanstd(rates, axis=(0, 1)) + 1e-9]
+    spread = jnp.concatenate([*spread, jnp.full(path.mean.shape[-1] - states, 1e-6)])
     wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
     linear = locals_along(model, prior, wide, data, CUBATURE)
     exact = each(_exact, model, (path.mean, linear.seq.inputs))

@@ -25,8 +25,10 @@ def white_readings(data: Dataset, model: StateSpaceModel) -> bool:
     """True where the readings of all measured coordinates carry white noise that is sampled as it is.
 
     Where no coordinate is measured, one other reading is enough.  Rates and accelerations are no evidence against it:
-    they may change within a sample.
+    they may change within a sample.  White readings are no proof of right equations, whose horizons are long.
     """
+    if not model.system.coordinates:
+        return False
     lags = [third_differences(y) for y in np.moveaxis(np.asarray(data.y), -1, 0)]
     dof = len(model.system.coordinates)
     coordinates = [lag for lag, place in zip(lags, model.measured, strict=True) if place < dof]

@@ -143,10 +143,11 @@ def discrepancy_columns(
 
     Draws of a Gaussian process whose length is a standard deviation of each signal.
     """
-    dof = len(model.system.coordinates)
+    dof, states = len(model.system.ports), len(model.system.states)
     known = jnp.asarray(data.valid & used[:, None])[..., None]
-    u = jnp.nan_to_num(jnp.asarray(data.u)[..., : len(model.system.joints)])
-    signals = jnp.concatenate([path.mean[..., : 2 * dof], u], axis=-1)
+    inputs = len(model.system.joints) if model.system.coordinates else data.u.shape[-1]
+    u = jnp.nan_to_num(jnp.asarray(data.u)[..., :inputs])
+    signals = jnp.concatenate([path.mean[..., :states], u], axis=-1)
     seen = jnp.where(known, signals, jnp.nan)
     spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)
     unit = (signals - jnp.nanmean(seen, axis=(0, 1), keepdims=True)) / jnp.where(spread > 0, spread, 1.0)

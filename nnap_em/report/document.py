@@ -14,7 +14,7 @@ from .. import __version__
 from ..data.logs import Logs
 from ..data.servo import TORQUE
 from ..fit.identify import FrictionTable, Identified, parameter_table
-from ..fit.predict import GIVEN, HORIZONS, Prediction, horizon_errors, predict
+from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
 from ..identifiability.identifiability import identifiability, sentences
 from ..model.law import PARAMETERS, UNITS, describe, fit_law
 from .tables import INNER
@@ -32,7 +32,9 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
-        "untold": sentences(identifiability(fitted.rig, system, fitted.model.servos or ())),
+        "untold": []
+        if fitted.rig.equations
+        else sentences(identifiability(fitted.rig, system, fitted.model.servos or ())),
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),
@@ -79,7 +81,7 @@ def noise(fitted: Identified) -> dict[str, Any]:
         },
         "process_per_step": {
             name: {"std": std, "unit": system.unit(name)}
-            for name, std in zip(system.coordinates + system.rates, kick, strict=False)  # behind these: memory
+            for name, std in zip(system.states, kick, strict=False)  # behind these: memory
         },
     }
 
@@ -87,17 +89,19 @@ def noise(fitted: Identified) -> dict[str, Any]:
 def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Prediction]:
     """Predictions of the test sequences, from their first readings, by every model."""
     key = jax.random.key(0)
-    return {name: predict(fitted, test.data, GIVEN, key=key) for name, fitted in sides.items()} if test else {}
+    return {n: predict(fitted, test.data, given_of(fitted), key=key) for n, fitted in sides.items()} if test else {}
 
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs) -> dict[str, Any]:
     """Errors of the predictions, for every column and horizon; `reach_s` is where the longest sequence ends."""
-    by_model = {name: horizon_errors(p, sides[name], test.data, GIVEN) for name, p in predicted.items()}
+    first = next(iter(sides.values()))
+    given, horizons = given_of(first), horizons_of(first)
+    by_model = {name: horizon_errors(p, sides[name], test.data, given, horizons) for name, p in predicted.items()}
     t, valid = (np.asarray(a) for a in (test.data.t, test.data.valid))
     return {
-        "given_s": GIVEN,
-        "horizons_s": list(HORIZONS),
-        "reach_s": float(np.max((t - t[:, :1])[valid])) - GIVEN,
+        "given_s": given,
+        "horizons_s": list(horizons),
+        "reach_s": float(np.max((t - t[:, :1])[valid])) - given,
         **by_model,
     }
 

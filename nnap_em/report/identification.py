@@ -28,7 +28,7 @@ from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, page, picture
 from .tables import visited_nodes, write_friction, write_json
-from .wording import reached
+from .wording import reached, sentence
 
 
 def write_identification(
@@ -79,6 +79,7 @@ def write_identification(
         "noise": noise(fitted),
         "parameters": parameters(fitted),
         "stopped": _stopped_early(fitted),
+        "horizon_note": fitted.horizon_note,
         "friction_law": laws,
         "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
         "contacts": [bristle.document() for bristle in bristles],
@@ -107,7 +108,8 @@ def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence
     rested += f", until {fitted.state.stop}" * (fitted.state.stop == REFUSED)
     text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
     first = [f"The fit does not describe the motion, do not use it: {'; '.join(misfit)}."] * bool(misfit)
-    return " ".join([*first, text, *(one.sentence for one in moved(fitted))])
+    notes = [sentence(fitted.horizon_note)] * bool(fitted.horizon_note)
+    return " ".join([*first, text, *notes, *(one.sentence for one in moved(fitted))])
 
 
 def _stopped_early(fitted: Identified) -> str:
@@ -128,6 +130,8 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         log(text)
     if document["stopped"]:
         log(document["stopped"])
+    if document["horizon_note"]:
+        log(document["horizon_note"])
     if document["left_out"]:
         log(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}

@@ -36,12 +36,16 @@ class Names(NamedTuple):
     """Joint (counted from 1) that each input drives."""
     measured: tuple[str, ...]
     sensors: Mapping[str, str] = {}
-    """Those that read no state, with their units."""
+    """Those that read no state, with their units; of equations all that can be read."""
+    units: Mapping[str, str] = {}
+    """Units of equations."""
 
     def unit(self, name: str) -> str:
         """SI unit of a state, a sensor, an input or `time`."""
         if name == "time":
             return "s"
+        if name in self.units:
+            return self.units[name]
         if name in self.sensors:
             return self.sensors[name]
         if name in self.inputs:
@@ -97,6 +101,10 @@ class Residual(NamedTuple):
 def names_of(fitted: Identified) -> Names:
     """Names of the columns of `residual(fitted, ...)`."""
     system, rig = fitted.model.system, fitted.rig
+    if rig.equations:
+        units = {name: system.unit(name) for name in (*system.readable, *rig.input_columns)}
+        sensors = {name: units[name] for name in system.readable}
+        return Names((), (), (), rig.input_columns, (), rig.measured, sensors, units)
     return Names(
         system.coordinates, system.rates, tuple(system.angles), rig.input_columns, tuple(system.joints), rig.measured,
         system.sensors,

@@ -1,13 +1,18 @@
 """The machines that ship: one file each, found by the name that `rig.toml` gives as the model's type."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from ..data.rig import SystemSpec
 from ..machines.from_file import declare
-from . import acrobot, pendubot, pendulum, slide, tree
+from . import acrobot, declared, equations, pendubot, pendulum, slide, tree
 from .base import AbstractSystem
+from .equations import Equations
+from .plant import AbstractPlant
 
-systems: dict[str, type[AbstractSystem]] = {
+systems: dict[str, Any] = {
     "acrobot": acrobot.Acrobot,
     "pendubot": pendubot.Pendubot,
     "pendulum": pendulum.Pendulum,
@@ -31,6 +36,8 @@ specs: dict[str, SystemSpec] = {name: spec(system) for name, system in systems.i
 specs["acrobot"] = spec(acrobot.Acrobot, *acrobot.drives)
 systems["mjcf"] = tree.Tree
 specs["mjcf"] = SystemSpec((), (), {}, 0, declare=declare)  # the file names states and parameters
+systems["equations"] = equations.Equations
+specs["equations"] = SystemSpec((), (), {}, 0, declare=declared.declare)
 
 
 def register(name: str, system: type[AbstractSystem]) -> None:
@@ -44,4 +51,28 @@ def register(name: str, system: type[AbstractSystem]) -> None:
     specs[name] = spec(system)
 
 
-__all__ = ["AbstractSystem", "register", "specs", "systems"]
+def register_equations(
+    name: str,
+    rate: equations.Rate,
+    *,
+    states: Mapping[str, str],
+    inputs: Mapping[str, str],
+    parameters: Sequence[str],
+    units: Mapping[str, str] | None = None,
+) -> None:
+    """Make equations known as `type = name` in `rig.toml`, in this process, by a function `rate(x, u, p)`.
+
+    It gets states, inputs and parameters as attributes (`x.h1`) and returns the derivatives of all states by their
+    names [per second]; `states` and `inputs` have their units, those of parameters are in `units`.
+    """
+    if (
+        equations.functions.get(name, rate) is not rate
+        or systems.get(name, equations.Equations) is not equations.Equations
+    ):
+        raise ValueError(f"{name!r} is taken; give the equations another name")
+    of = equations.Text(dict(states), dict(inputs), {}, {}, tuple(parameters), units=dict(units or {}), function=name)
+    equations.functions[name], systems[name] = rate, equations.Equations
+    specs[name] = SystemSpec((), (), {}, 0, declare=partial(declared.declare, of=of))
+
+
+__all__ = ["AbstractPlant", "AbstractSystem", "Equations", "register", "register_equations", "specs", "systems"]

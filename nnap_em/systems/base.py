@@ -1,42 +1,30 @@
 """Interface of a machine: names, mass matrix and bias force."""
 
 import dataclasses
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..data.units import force_unit, quantities, state_unit
 from ..numerics.gaussian import spd_solve
+from .plant import AbstractPlant, Scalar
 
 
-class AbstractSystem(eqx.Module):
+class AbstractSystem(AbstractPlant):
     """Known rigid-body physics M(q) q'' + c(q, q') = B u + tau, in SI units.
 
     Fields hold the physical parameters as scalars, under the names used in `rig.toml`.
     `coordinates` names q, `rates` names q'; `angles` marks the coordinates that are angles [rad].
     """
 
-    coordinates: ClassVar[tuple[str, ...]]
-    rates: ClassVar[tuple[str, ...]]
-    angles: ClassVar[tuple[bool, ...]]
-    optional: ClassVar[dict[str, float]] = {}
-
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {}
     """Variations of a body: (effect, joint) to (system, amount) -> system and system -> typical amount."""
 
     spots: ClassVar[dict[int, Any]] = {}
     """Places (`bodies.LoadPoint`) of candidate loads of any mass and centre, by the joint that carries them, from 1."""
-
-    sensors: ClassVar[dict[str, str]] = {}
-    """Columns of sensors that are read beside coordinates and rates, in the order of `senses`, and their SI units."""
-
-    joints: eqx.AbstractVar[tuple[int, ...]]
-    """The joint (counted from 1) that each input drives."""
 
     @classmethod
     def declared(cls, parameters: Mapping[str, Array], joints: tuple[int, ...], machine: str) -> "AbstractSystem":
@@ -45,32 +33,9 @@ class AbstractSystem(eqx.Module):
         left = {n: jnp.asarray(v, float) for n, v in cls.optional.items()}
         return cls(**{n: parameters[n] if n in parameters else left[n] for n in names}, joints=joints)
 
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Coordinates, then rates."""
-        return self.coordinates + self.rates
-
-    @property
-    def readable(self) -> tuple[str, ...]:
-        """All that may be measured: coordinates, rates, then sensors."""
-        return self.states + tuple(self.sensors)
-
-    def parameter(self, name: str) -> Any:
-        """A parameter by the name that `rig.toml` gives it."""
-        return getattr(self, name)
-
     def with_parameters(self, values: Mapping[str, Array]) -> "AbstractSystem":
         """The machine with other values of some parameters."""
         return dataclasses.replace(self, **values)
-
-    def least(self, name: str) -> float:
-        """Smallest value that a parameter may be estimated to have."""
-        return -math.inf
-
-    def reached_from(self, before: Any) -> "AbstractSystem":
-        """This machine, or if a step of a fit from `before` led to one that cannot be, one on the way that can."""
-        del before
-        return self
 
     @property
     def gears(self) -> tuple[float, ...]:
@@ -97,6 +62,23 @@ class AbstractSystem(eqx.Module):
         """SI unit of the generalised force at a joint, counted from 1."""
         return force_unit(self.angles[joint - 1])
 
+    def port_unit(self, port: int) -> str:
+        """`force_unit`."""
+        return self.force_unit(port)
+
+    def input_of(self, joint: int | None, channel: str | None) -> int | None:
+        """Index of the input that drives a joint; channels are readings."""
+        return self.joints.index(joint) if joint in self.joints else None
+
+    def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
+        """Coordinates and rates."""
+        dof = len(self.coordinates)
+        return x[:dof], x[dof : 2 * dof]
+
+    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """The torques themselves."""
+        return torque
+
     @abstractmethod
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         """Mass matrix M(q) [kg m^2, or kg on a slide]."""
@@ -117,6 +99,18 @@ class AbstractSystem(eqx.Module):
     ) -> tuple[Float[Array, ""], ...]:
         """Accelerations of all joints under a generalised force [N m, or N], one by one (reason: `integrate`)."""
         return tuple(spd_solve(self.mass(q), force - self.bias(q, v)))
+
+    def slopes(
+        self, q: Float[Array, " dof"], v: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " dof"]
+    ) -> tuple[Scalar, ...]:
+        """Rates, then accelerations under a generalised force, that of the inputs `drive` with it [N m, or N]."""
+        return *v, *self.acceleration(q, v, push)
+
+    def sensed(
+        self, q: Float[Array, " dof"], v: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " dof"]
+    ) -> tuple[Scalar, ...]:
+        """`senses` under a generalised force [N m, or N]."""
+        return tuple(self.senses(q, v, self.acceleration(q, v, push)))
 
     def senses(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], a: Sequence[Float[Array, ""]]

@@ -1,0 +1,179 @@
+"""First model of EM of a plant that is written as equations: scales by its own simulation with the declared numbers."""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..data.dataset import Dataset
+from ..data.rig import Rig
+from ..model.friction import NoFriction
+from ..model.state_space import MOST_STEPS, SUBSTEPS, Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..systems.equations import Equations
+from .prior import ParameterPrior
+from .readings import reading_noise
+
+PACE = 8.0
+"""Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more, and
+errors are those of a free simulation."""
+SHARE = 1 / 3
+"""Longest such time, as a share of a recording: a prediction needs a start before it."""
+STIFF = 0.5
+"""Integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8."""
+HIDDEN = 0.5
+"""Standard deviation of the start of a state that nobody declares or reads, in its size where the equations rest."""
+
+
+class Motion(NamedTuple):
+    """A free simulation of the declared equations, by which scales are measured."""
+
+    x: Float[np.ndarray, "row state"]
+    rate: Float[np.ndarray, "row state"]
+    """Derivatives along it [1/s]."""
+    fastest: float
+    """Largest eigenvalue of the linearised equations [1/s]."""
+    slowest: float
+    """Longest time constant [s]; infinite where nothing decays."""
+
+
+@eqx.filter_jit
+def _rates(system: Equations, x: Float[Array, "row state"], u: Float[Array, "row input"]):
+    """Derivatives and their Jacobians."""
+    still = jnp.zeros(len(system.ports))
+    rate = lambda x, u: jnp.stack(system.slopes(x, x[:0], u, still))  # noqa: E731
+    return jax.vmap(rate)(x, u), jax.vmap(jax.jacfwd(rate))(x, u)
+
+
+def resting(system: Equations, known: dict[int, float], u: Float[np.ndarray, " input"]) -> Float[np.ndarray, " state"]:
+    """State in which the equations are nearest to rest at inputs `u`, with some states as they are `known`.
+
+    Damped Gauss-Newton steps on all rates from 1, or from the known value.
+    """
+    x = np.array([known.get(i, 1.0) for i in range(len(system.states))])
+    free = [i for i in range(len(x)) if i not in known]
+    damping, error = 1e-3, math.inf
+
+    def rates(x: np.ndarray) -> list[np.ndarray]:
+        return [np.asarray(a)[0] for a in _rates(system, jnp.asarray(x[None], float), jnp.asarray(u[None], float))]
+
+    for _ in range(40 if free else 0):
+        rate, slope = rates(x)
+        if not np.isfinite(rate).all():
+            break
+        error, part = float(rate @ rate), slope[:, free]
+        gram = part.T @ part
+        step = np.linalg.lstsq(gram + damping * (np.diag(np.diag(gram)) + 1e-12 * np.eye(len(free))), part.T @ rate)[0]
+        trial = x.copy()
+        trial[free] -= step
+        after = rates(trial)[0]
+        better = np.isfinite(after).all() and after @ after < error
+        x, damping = (trial, 0.3 * damping) if better else (x, 10 * damping)
+        if damping > 1e9:
+            break
+    return x
+
+
+def start_prior(rig: Rig, system: Equations, data: Dataset) -> tuple[Gaussian, tuple[bool, ...]]:
+    """Prior of the first state, and which of its entries nobody declared or read (EM learns those)."""
+    y, u = np.asarray(data.y), np.asarray(data.u)[np.asarray(data.valid)]
+    columns = {system.state_of(name): i for i, name in enumerate(rig.measured)}
+    known = {i: float(np.nanmean(y[..., columns[name]])) for i, name in enumerate(system.states) if name in columns}
+    known |= {i: rig.start[name].mean for i, name in enumerate(system.states) if name in rig.start and i not in known}
+    rest = resting(system, known, u.mean(axis=0))
+    means, stds, learned = [], [], []
+    for i, name in enumerate(system.states):
+        read = name in columns
+        if name in rig.start:
+            mean, std = rig.start[name].mean, max(rig.start[name].std, 1e-9)
+        elif read:
+            signal = y[..., columns[name]]
+            first = np.array([s[np.isfinite(s)][0] for s in signal if np.any(np.isfinite(s))])
+            mean, std = float(first.mean()), float(np.hypot(first.std(), 0.3 * np.nanstd(signal)) + 1e-9)
+        else:
+            mean, std = float(rest[i]), HIDDEN * abs(float(rest[i])) + 1e-9
+            std = std if std > 1e-6 else 1.0
+        means.append(mean)
+        stds.append(std)
+        learned.append(name not in rig.start and not read)
+    return Gaussian(jnp.asarray(means, float), jnp.asarray(np.diag(np.square(stds)), float)), tuple(learned)
+
+
+def motion(model: StateSpaceModel, data: Dataset) -> Motion:
+    """Simulation of all sequences from the mean of the start; where it runs away, its finite part."""
+    valid = np.asarray(data.valid)
+    x = np.asarray(_simulated(model, jnp.asarray(data.u, float)))
+    inside = valid & np.isfinite(x).all(axis=-1)
+    x, u = x[inside], np.asarray(data.u)[inside]
+    rate, slope = (np.asarray(a) for a in _rates(model.system, jnp.asarray(x), jnp.asarray(u, float)))
+    sound = np.isfinite(rate).all(axis=-1) & np.isfinite(slope).all(axis=(1, 2))
+    values = np.linalg.eigvals(slope[sound]) if sound.any() else np.zeros((1, 1))
+    decay = np.median(np.max(np.where(values.real < 0, values.real, -np.inf), axis=1))
+    slowest = -1 / float(decay) if np.isfinite(decay) else math.inf
+    return Motion(x[sound], rate[sound], float(np.percentile(np.abs(values), 99)), slowest)
+
+
+@eqx.filter_jit
+def _simulated(model: StateSpaceModel, u: Float[Array, "seq time input"]) -> Float[Array, "seq time state"]:
+    def one(u):
+        def step(x, row):
+            return model.transition(x, Inputs.held(row)), x
+
+        return jax.lax.scan(step, model.start.mean, u)[1]
+
+    return jax.vmap(one)(u)
+
+
+def pace_of(rig: Rig, slowest: float, rows: int) -> float:
+    """The declared horizon, or some time constants, as far as the recordings are long [s]; of two digits: programs are
+    shared.
+    """
+    pace = rig.horizon or min(PACE * slowest, SHARE * rows * rig.dt)
+    return float(f"{max(pace, 8 * rig.dt):.2g}")
+
+
+def build_equations(rig: Rig, system: Equations, data: Dataset):
+    """Model that EM starts from, with noise as large as motion over a step; the prior of its parameters, entries of the
+    start and readings whose noise is learned, and the log of the variance of the readings' noise in the logs.
+    """
+    start, learned = start_prior(rig, system, data)
+    count, ports = len(system.states), len(system.ports)
+    noise = [rig.noise_std.get(n) for n in rig.measured]
+    least = [max(reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i in range(len(rig.measured))]
+    model = StateSpaceModel(
+        system=system,
+        unknown=NoFriction(jnp.ones(ports), jointless=True),
+        start=start,
+        log_q=jnp.zeros(count),
+        log_r=jnp.asarray([2 * math.log(n or 2 * s) for n, s in zip(noise, least, strict=True)], float),
+        measured=tuple(system.readable.index(name) for name in rig.measured),
+        dt=rig.dt,
+    )
+    seen = motion(model, data)
+    size = np.sqrt(np.mean(seen.rate**2, axis=0)) if len(seen.rate) else np.ones(count)
+    size = np.maximum(size, 1e-3 * size.max() + 1e-12)
+    rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
+    scale = np.concatenate([size, np.full(ports - count, size.max())])
+    free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
+    prior = ParameterPrior(
+        free,
+        jnp.asarray([rig.parameters[n].mean for n in free], float),
+        jnp.asarray([rig.parameters[n].std for n in free], float),
+    )
+    model = StateSpaceModel(
+        system=system,
+        unknown=NoFriction(jnp.asarray(scale, float), jointless=True),
+        start=start,
+        log_q=jnp.asarray(2 * np.log(size * rig.dt), float),
+        log_r=model.log_r,
+        measured=model.measured,
+        dt=rig.dt,
+        substeps=min(max(SUBSTEPS, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / STIFF, 1.0)))), MOST_STEPS),
+        pace=pace_of(rig, seen.slowest, rows),
+    )
+    quiet = jnp.asarray(2 * np.log(least), float)
+    return model, prior, learned, tuple(n is None for n in noise), quiet

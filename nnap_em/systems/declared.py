@@ -1,0 +1,155 @@
+"""Declaration in rig.toml of a plant as equations: [model], [model.unknown] and the columns of [measurement]."""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from ..data.rig import Declaration, SystemSpec, nearest
+from .equations import Text
+from .expression import FUNCTIONS, Formula, FormulaError, parse
+
+_RESERVED = ("type", "inputs", "states", "rates", "unknown", "units")
+_UNITS = 'write names with units, { h1 = "V" }, or names alone, ["h1"]'
+MOST_SIGNALS = 3
+"""Signals of an unknown term at most."""
+
+
+def declare(root: Any, of: Text | None = None) -> Declaration:
+    """The equations of the table [model], or those `of` a Python function; `root` is the whole of rig.toml."""
+    model = root.table("model")
+    own = of or Text({}, {}, {}, {}, ())
+    if of is None:
+        for key in ("states", "rates"):
+            if key not in model.items:
+                model.refuse(key, "missing", 'write states = { h1 = "V" } and rates = { h1 = "k * u - h1" }')
+    units = {name: _unit(table, name) for table in [model.table("units", absent={})] for name in table.items}
+    states, inputs = (_named(model, key, had) for key, had in (("states", own.states), ("inputs", own.inputs)))
+    parameters = {key: model.quantity(key) for key in model.items if key not in _RESERVED}
+    unknown = model.table("unknown", absent={})
+    _distinct(model, states, inputs, parameters, unknown.items)
+    if of is not None:
+        model.check(("type", *of.parameters), ("units", "unknown"))
+    terms = {name: _term(unknown, name, states, inputs) for name in unknown.items}
+    known = (*states, *inputs, *parameters, *(name for name, (port, _) in terms.items() if not port))
+    rates = {} if of is not None else _rates(model, states, known)
+    readings = _readings(root.table("measurement"), states, known)
+    if of is None:
+        _used(model, (*rates.values(), *readings.values()), parameters, inputs)
+        _used(unknown, (*rates.values(), *readings.values()), [n for n, (port, _) in terms.items() if not port])
+    text = Text(
+        states,
+        inputs,
+        {name: formula.text for name, formula in rates.items()},
+        {name: formula.text for name, formula in readings.items()},
+        tuple(parameters),
+        {name: signals for name, (port, signals) in terms.items() if not port},
+        {name: (port, signals) for name, (port, signals) in terms.items() if port},
+        {**own.units, **_inherited(readings, states), **units},
+        own.function,
+    )
+    spec = SystemSpec(tuple(states), tuple(parameters), {}, 0, sensors=tuple(readings))
+    return Declaration(spec, parameters, tuple(inputs), tuple(range(1, len(inputs) + 1)), equations=text.packed)
+
+
+def _named(model: Any, key: str, had: Mapping[str, str]) -> dict[str, str]:
+    """Names with their units, empty where none is declared."""
+    items = model.items.get(key, dict(had) or ([] if key == "inputs" else None))
+    if isinstance(items, list):
+        return dict.fromkeys(map(str, model.distinct(key, str)), "") if items else {}
+    if not isinstance(items, Mapping):
+        model.refuse(key, None if key in model.items else "missing", _UNITS)
+    if had:
+        return dict(items)
+    table = model.table(key)
+    return {name: _unit(table, name) for name in table.items}
+
+
+def _unit(table: Any, name: str) -> str:
+    """The unit of a name."""
+    unit = table.items[name]
+    if not isinstance(unit, str) or not unit:
+        table.refuse(
+            name, f"missing unit (found {unit!r})", f'write its unit, {name} = "V", or for all names alone, ["{name}"]'
+        )
+    return unit
+
+
+def _distinct(model: Any, *parts: Collection[str]) -> None:
+    """Refuse names that are no names, that formulas use otherwise, and names that stand twice."""
+    seen: set[str] = set()
+    for name in (name for part in parts for name in part):
+        if not name.isidentifier() or name in (*FUNCTIONS, "time"):
+            model.refuse(name, f"{name!r} cannot be a name in a formula", "use letters, digits and _, but no function")
+        if name in seen:
+            model.refuse(
+                name, "this name stands twice", "give states, inputs, parameters and unknown terms names of their own"
+            )
+        seen.add(name)
+
+
+def _rates(model: Any, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
+    """The formula of every state."""
+    rates = model.table("rates")
+    for name in rates.items:
+        if name not in states:
+            rates.refuse(name, "a rate of no state", nearest(name, states))
+    for name in states:
+        if name not in rates.items:
+            rates.refuse(name, "a state without rate", f'write {name} = "..." , its derivative by time [1/s]')
+    return {name: _formula(rates, name, known) for name in states}
+
+
+def _formula(table: Any, key: str, known: Collection[str]) -> Formula:
+    text = table.items[key]
+    text = str(text) if type(text) in (int, float) else text
+    if not isinstance(text, str):
+        table.refuse(key, hint="write a formula in quotation marks")
+    try:
+        return parse(text, known)
+    except FormulaError as error:
+        problem, _, hint = str(error).rpartition("; ")
+        return table.refuse(key, problem, hint)
+
+
+def _readings(measurement: Any, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
+    """Formulas of the columns that are no states."""
+    columns = measurement.value("columns")
+    if not isinstance(columns, Mapping):
+        for name in columns if isinstance(columns, list) else ():
+            if name not in states:
+                hint = f'{nearest(str(name), states)}; or write what it reads, columns = {{ {name} = "2 * h" }}'
+                measurement.refuse("columns", f"{name!r} is no state", hint)
+        return {}
+    table = measurement.table("columns")
+    every = {name: _formula(table, name, known) for name in table.items}
+    for name, formula in every.items():
+        if name in states and formula.text != name:
+            table.refuse(
+                name, "a column with the name of a state, but another formula", "name the state or the column otherwise"
+            )
+    return {name: formula for name, formula in every.items() if name not in states}
+
+
+def _inherited(readings: Mapping[str, Formula], states: Mapping[str, str]) -> dict[str, str]:
+    """Units of columns that read a state as it is."""
+    return {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
+
+
+def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:
+    """State that an unknown term enters, or nothing where it stands in a formula, and its signals."""
+    table = unknown.table(name)
+    table.check(("signals",), ("enters",))
+    signals = table.distinct("signals", str)
+    if not 1 <= len(signals) <= MOST_SIGNALS:
+        table.refuse("signals", hint=f"write one to {MOST_SIGNALS} states or inputs")
+    for signal in signals:
+        if signal not in (*states, *inputs):
+            table.refuse("signals", f"{signal!r} is no state or input", nearest(signal, (*states, *inputs)))
+    return (table.choice("enters", states) if "enters" in table.items else ""), signals
+
+
+def _used(table: Any, formulas: Collection[Formula], *parts: Collection[str]) -> None:
+    """Refuse names that no formula has."""
+    used = {name for formula in formulas for name in formula.names}
+    for name in (name for part in parts for name in part):
+        if name not in used:
+            table.refuse(name, "no equation and no reading uses it", "use it, or take it out")

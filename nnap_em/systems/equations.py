@@ -1,0 +1,187 @@
+"""A plant that is written as equations: formulas of rig.toml, or a Python function of states, inputs and parameters."""
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..data.units import quantities
+from .expression import Formula, parse
+from .plant import AbstractPlant, Scalar
+
+
+class Text(NamedTuple):
+    """Equations as they are declared; `packed` is the same in one line."""
+
+    states: dict[str, str]
+    """States and their units."""
+    inputs: dict[str, str]
+    rates: dict[str, str]
+    """Formula of the derivative of every state; empty where a Python function has them."""
+    readings: dict[str, str]
+    """Formula of every column that is no state."""
+    parameters: tuple[str, ...]
+    terms: Mapping[str, tuple[str, ...]] = {}
+    """Unknown terms that stand in formulas by their names, and their signals."""
+    enters: Mapping[str, tuple[str, tuple[str, ...]]] = {}
+    """Unknown terms that are added to the rate of a state: the state, and their signals."""
+    units: Mapping[str, str] = {}
+    """Units of parameters and readings, as far as they are declared."""
+    function: str = ""
+    """Name of the Python function."""
+
+    @property
+    def packed(self) -> str:
+        """All of it as JSON."""
+        return json.dumps(self._asdict(), ensure_ascii=False)
+
+    def unit(self, name: str) -> str:
+        """Unit of a state, input, parameter or reading; empty where it has none."""
+        return {**self.states, **self.inputs, **self.units}.get(name, "")
+
+
+@functools.cache
+def unpacked(text: str) -> Text:
+    """Equations as `Text.packed` writes them."""
+    entries = json.loads(text)
+    terms = {name: tuple(signals) for name, signals in entries["terms"].items()}
+    enters = {name: (state, tuple(signals)) for name, (state, signals) in entries["enters"].items()}
+    return Text(**{**entries, "parameters": tuple(entries["parameters"]), "terms": terms, "enters": enters})
+
+
+@functools.cache
+def _formulas(text: str) -> tuple[tuple[Formula, ...], tuple[Formula, ...]]:
+    """Rates in the order of the states, and readings."""
+    of = unpacked(text)
+    known = (*of.states, *of.inputs, *of.parameters, *of.terms)
+    rates = tuple(parse(of.rates[name], known) for name in of.states) if of.rates else ()
+    return rates, tuple(parse(formula, known) for formula in of.readings.values())
+
+
+Rate = Callable[[Any, Any, Any], Mapping[str, Any]]
+functions: dict[str, Rate] = {}
+"""Python functions `rate(x, u, p)` by the name of their plant."""
+
+
+class Equations(AbstractPlant):
+    """x' = f(x, u, p) + push, y = g(x, u, p); an unknown term is a port whose push stands where its name does."""
+
+    joints: ClassVar[tuple[int, ...]] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    values: dict[str, Float[Array, ""]]
+    """Parameters."""
+    text: str = eqx.field(static=True)
+    """`Text.packed`."""
+
+    @classmethod
+    def declared(cls, parameters: Mapping[str, Array], joints: tuple[int, ...], text: str) -> "Equations":
+        """The equations of these numbers."""
+        return cls(dict(parameters), text)
+
+    @property
+    def of(self) -> Text:
+        """The declaration."""
+        return unpacked(self.text)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """States in their order."""
+        return tuple(self.of.states)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Inputs in their order."""
+        return tuple(self.of.inputs)
+
+    @property
+    def ports(self) -> tuple[str, ...]:
+        """States, to whose rates something may add, then unknown terms."""
+        return (*self.of.states, *self.of.terms)
+
+    @property
+    def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Columns with a formula, and their units."""
+        return {name: self.unit(name) for name in self.of.readings}
+
+    @property
+    def senses_push(self) -> bool:
+        """True where an unknown term stands in the formula of a reading."""
+        return any(set(formula.names) & set(self.of.terms) for formula in _formulas(self.text)[1])
+
+    def parameter(self, name: str) -> Any:
+        """A parameter by its name."""
+        return self.values[name]
+
+    def with_parameters(self, values: Mapping[str, Array]) -> "Equations":
+        """The equations with other values of some parameters."""
+        return replace(self, values={**self.values, **values})
+
+    def __str__(self) -> str:
+        numbers = {name: float(value) for name, value in self.values.items()}
+        return f"Equations of {', '.join(self.states)}: {quantities(numbers, self.unit)}".rstrip(": ")
+
+    def unit(self, name: str) -> str:
+        """Unit of a state, sensor, input or parameter."""
+        return self.of.unit(name)
+
+    def port_unit(self, port: int) -> str:
+        """Unit of the push at a port, counted from 1."""
+        name = self.ports[port - 1]
+        return per_second(self.unit(name)) if name in self.of.states else self.unit(name)
+
+    def input_of(self, joint: int | None, channel: str | None) -> int | None:
+        """Index of an input by its name."""
+        return self.inputs.index(channel) if channel in self.inputs else None
+
+    def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " rate"]]:
+        """All states, and nothing."""
+        return x[: len(self.of.states)], x[:0]
+
+    def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
+        """None: inputs stand in the equations."""
+        return jnp.zeros(len(self.ports), u.dtype)
+
+    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
+        """None: there are no joints."""
+        return jnp.zeros(len(self.ports), torque.dtype)
+
+    def named(
+        self, q: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " port"] | None = None
+    ) -> dict[str, Scalar]:
+        """All numbers of a formula by their names; unknown terms are 0 without a `push`."""
+        of, count = self.of, len(self.of.states)
+        terms = [jnp.zeros((), q.dtype)] * len(of.terms) if push is None else list(push[count:])
+        states, inputs = ({n: a[i] for i, n in enumerate(names)} for names, a in ((of.states, q), (of.inputs, u)))
+        return {**self.values, **states, **inputs, **dict(zip(of.terms, terms, strict=True))}
+
+    def slopes(self, q, v, u, push):
+        """Derivatives of all states."""
+        values, of = self.named(q, u, push), self.of
+        if of.function:
+            parts = (of.states, of.inputs, self.values)
+            by_name = functions[of.function](*(SimpleNamespace(**{n: values[n] for n in part}) for part in parts))
+            rates = [by_name[name] for name in of.states]
+        else:
+            rates = [formula.of(values) for formula in _formulas(self.text)[0]]
+        return tuple(jnp.asarray(rate, q.dtype) + push[i] for i, rate in enumerate(rates))
+
+    def sensed(self, q, v, u, push):
+        """Values of the formulas of readings."""
+        values = self.named(q, u, push)
+        return tuple(jnp.asarray(formula.of(values), q.dtype) for formula in _formulas(self.text)[1])
+
+    def state_of(self, column: str) -> str | None:
+        """The state that a column reads as it is; None where it reads something else."""
+        formula = self.of.readings.get(column, column)
+        return formula if formula in self.of.states else None
+
+
+def per_second(unit: str) -> str:
+    """Unit of a rate; of what has no declared unit too."""
+    return f"{unit}/s" if unit else "1/s"

@@ -1,0 +1,115 @@
+"""Formulas of rig.toml: text in, function of named numbers out; parsed, never evaluated as Python."""
+
+import ast
+import difflib
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from .plant import Scalar
+
+Values = Mapping[str, Any]
+TINY = 1e-12
+"""Smallest argument of a root or logarithm: below, its value is that here, and its slope 0."""
+
+FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "sqrt": (1, lambda x: jnp.where(x > TINY, jnp.sqrt(jnp.maximum(x, TINY)), 0.0)),
+    "exp": (1, jnp.exp),
+    "log": (1, lambda x: jnp.log(jnp.maximum(x, TINY))),
+    "abs": (1, jnp.abs),
+    "sign": (1, jnp.sign),
+    "min": (2, jnp.minimum),
+    "max": (2, jnp.maximum),
+    "sin": (1, jnp.sin),
+    "cos": (1, jnp.cos),
+    "tanh": (1, jnp.tanh),
+    "where": (3, jnp.where),
+}
+"""Functions of formulas with the number of their arguments."""
+_OPERATORS: dict[type, Callable[..., Any]] = {
+    ast.Add: lambda a, b: a + b, ast.Sub: lambda a, b: a - b, ast.Mult: lambda a, b: a * b,
+    ast.Div: lambda a, b: a / b, ast.Pow: lambda a, b: a**b, ast.USub: lambda a: -a, ast.UAdd: lambda a: a,
+    ast.Lt: lambda a, b: a < b, ast.LtE: lambda a, b: a <= b, ast.Gt: lambda a, b: a > b, ast.GtE: lambda a, b: a >= b,
+}  # fmt: skip
+
+
+class FormulaError(ValueError):
+    """A mistake in a formula: the place in its text, the problem and the remedy."""
+
+
+class Formula(NamedTuple):
+    """A formula of named numbers."""
+
+    text: str
+    names: tuple[str, ...]
+    """Names in it, in their order."""
+    of: Callable[[Values], Scalar]
+    """Its value."""
+
+
+def parse(text: str, known: Collection[str]) -> Formula:
+    """The formula of a text in `known` names: + - * / ^, comparisons in `where`, and `FUNCTIONS`.
+
+    Raises FormulaError at the first mistake.
+    """
+    try:
+        tree = ast.parse(text.replace("^", "**"), mode="eval").body
+    except SyntaxError as error:
+        raise FormulaError(
+            f"{_mark(text, (error.offset or 1) - 1)}: not a formula; write such as k * sqrt(h)"
+        ) from None
+    names: dict[str, None] = {}
+
+    def refuse(node: ast.AST, problem: str, hint: str) -> None:
+        raise FormulaError(f"{_mark(text, getattr(node, 'col_offset', 0))}: {problem}; {hint}")
+
+    def built(node: ast.AST) -> Callable[[Values], Any]:
+        match node:
+            case ast.Constant(value=bool() | str()):
+                refuse(node, f"{node.value!r} is no number", "write numbers and names")
+            case ast.Constant(value=int() | float() as value):
+                number = float(value)
+                return lambda values: number
+            case ast.Name(id=name) if name in known:
+                names[name] = None
+                return lambda values: values[name]
+            case ast.Name(id=name):
+                refuse(node, f"unknown name {name!r}", _nearest(name, known))
+            case ast.UnaryOp(op=op, operand=one) if type(op) in _OPERATORS:
+                operate, first = _OPERATORS[type(op)], built(one)
+                return lambda values: operate(first(values))
+            case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
+                operate, first, second = _OPERATORS[type(op)], built(left), built(right)
+                return lambda values: operate(first(values), second(values))
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATORS:
+                operate, first, second = _OPERATORS[type(op)], built(left), built(right)
+                return lambda values: operate(first(values), second(values))
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+                if name not in FUNCTIONS:
+                    refuse(node, f"unknown function {name!r}", _nearest(name, FUNCTIONS))
+                count, function = FUNCTIONS[name]
+                if len(arguments) != count:
+                    refuse(node, f"{name} takes {count} arguments, found {len(arguments)}", "correct it")
+                parts = [built(one) for one in arguments]
+                return lambda values: function(*(part(values) for part in parts))
+        refuse(node, f"{type(node).__name__} is not part of formulas", f"use + - * / ^ and {', '.join(FUNCTIONS)}")
+        raise AssertionError  # `refuse` raises
+
+    of = built(tree)
+    return Formula(text, tuple(names), of)
+
+
+def _mark(text: str, column: int) -> str:
+    """Place in a text, of which Python has seen every ^ as two characters."""
+    seen = 0
+    for place, letter in enumerate(text):
+        if seen >= column:
+            return f"at character {place + 1} of {text!r}"
+        seen += 2 if letter == "^" else 1
+    return f"at the end of {text!r}"
+
+
+def _nearest(name: str, known: Collection[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return (f"did you mean {close[0]!r}? " if close else "") + f"possible here: {', '.join(known)}"

@@ -1,0 +1,233 @@
+"""Plants that are written as equations: formulas, declaration, model, errors over long horizons."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+
+from nnap_em.data.dataset import Dataset, pad
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.em.build import build_system
+from nnap_em.em.equations import motion
+from nnap_em.fit.identify import begin, identify
+from nnap_em.fit.store import load, save
+from nnap_em.model.state_space import Inputs
+from nnap_em.prediction_error import simulated
+from nnap_em.systems import Equations, register_equations, specs
+from nnap_em.systems.expression import FormulaError, parse
+
+HEAD = 'format = 1\nname = "r"\n'
+TAIL = '[sampling]\ndt = 0.5\ninput_hold = "zero-order"\nclock = "sequence"\n'
+CHAIN = """[model]
+type = "equations"
+inputs = { u = "V" }
+states = { a = "V", b = "V" }
+rates = { a = "k*u - a/ta", b = "(a - b)/tb" }
+k = { mean = 1.0, std = 0.5 }
+ta = { mean = 4.0, std = 2.0 }
+tb = 2.0
+[measurement]
+columns = { y = "b" }
+"""
+
+
+def _rig(folder: Path, model: str = CHAIN, sampling: str = TAIL):
+    (folder / "rig.toml").write_text(HEAD + model + sampling)
+    return read_rig(folder / "rig.toml", specs)
+
+
+def _chain(k=1.3, ta=3.0, tb=2.0, rows=240, noise=0.01, seed=0) -> Dataset:
+    """Two lags in series, exact for inputs that are held, by the matrix exponential."""
+    rng, dt = np.random.default_rng(seed), 0.5
+    u = np.repeat(rng.uniform(0, 2, rows // 8 + 1), 8)[:rows]
+    whole = np.array([[-1 / ta, 0.0, k], [1 / tb, -1 / tb, 0.0], [0.0, 0.0, 0.0]])
+    step = scipy.linalg.expm(dt * whole)
+    x, out = np.array([1.0, 0.5]), []
+    for one in u:
+        out.append(x[1])
+        x = (step @ np.append(x, one))[:2]
+    y = np.array(out) + noise * rng.standard_normal(rows)
+    return pad([(dt * np.arange(rows), u[:, None], y[:, None])])
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a + b*2^2 - -b", 2 + 3 * 4 + 3),
+        ("2^a^2/8", 2**4 / 8),
+        ("-a^2", -4.0),
+        ("sqrt(b)*exp(-a) + log(b) + abs(-a)", math.sqrt(3) * math.exp(-2) + math.log(3) + 2),
+        ("min(a, b) + max(a, b)*tanh(a)", 2 + 3 * math.tanh(2)),
+        ("sin(a)*cos(b) + sign(a - b)", math.sin(2) * math.cos(3) - 1),
+        ("where(a > b, 1, 10) + where(a <= 2, 5, 7)", 15.0),
+        ("1e-3*a", 2e-3),
+    ],
+)
+def test_a_formula_has_the_value_of_the_same_text_in_python(text, value):
+    found = parse(text, ("a", "b")).of({"a": jnp.asarray(2.0), "b": jnp.asarray(3.0)})
+    np.testing.assert_allclose(found, value, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "hint"),
+    [
+        ("k1*sqrt(h3)", "at character 9", "did you mean 'h1'"),
+        ("k1^2*sqr(h1)", "at character 6", "did you mean 'sqrt'"),
+        ("sqrt(h1, k1)", "at character 1", "takes 1 arguments, found 2"),
+        ("k1 +* h1", "at character 5", "not a formula"),
+        ("__import__('os')", "at character 1", "unknown function"),
+        ("h1.real", "at character 1", "Attribute is not part of formulas"),
+        ("[h1]", "at character 1", "List is not part"),
+        ("h1 if k1 else 2", "at character 1", "IfExp is not part"),
+        ("'a'", "at character 1", "is no number"),
+    ],
+)
+def test_a_mistake_in_a_formula_has_its_place_and_a_hint(text, place, hint):
+    with pytest.raises(FormulaError) as error:
+        parse(text, ("h1", "k1"))
+    assert place in str(error.value)
+    assert hint in str(error.value)
+
+
+def test_a_root_has_no_slope_without_end_and_no_value_below_zero():
+    root = lambda x: parse("sqrt(x)", ("x",)).of({"x": x})  # noqa: E731
+    for x in (-1.0, 0.0):
+        assert root(jnp.asarray(x)) == 0.0
+        assert jax.grad(root)(jnp.asarray(x)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right", "words"),
+    [
+        ('b = "(a - b)/tb" }', 'b = "(a - b)/tc" }', "[model.rates] b: at character 9"),
+        (', b = "(a - b)/tb" }', " }", "[model.rates] b: a state without rate"),
+        ('b = "(a - b)/tb" }', 'b = "(a - b)/2" }', "[model] tb: no equation and no reading uses it"),
+        ('{ u = "V" }', '{ u = "" }', "[model.inputs] u: missing unit"),
+        ('{ y = "b" }', '{ y = "c" }', "[measurement.columns] y: at character 1"),
+        ('{ y = "b" }', '["c"]', "'c' is no state; possible here: a, b"),
+        ('a = "V", b', 'a = "V", sqrt', "cannot be a name"),
+        ("[mea", "[model.unknown]\nf = { signals = ['c'], enters = 'a' }\n[mea", "'c' is no state or input"),
+        ("[mea", "[model.unknown]\nf = { signals = ['a'] }\n[mea", "[model.unknown] f: no equation"),
+    ],
+)
+def test_a_mistake_in_the_declaration_is_named_by_file_key_and_place(tmp_path, wrong, right, words):
+    assert wrong in CHAIN
+    with pytest.raises(RigError) as error:
+        _rig(tmp_path, CHAIN.replace(wrong, right))
+    assert str(error.value).startswith(f"{tmp_path / 'rig.toml'}: ")
+    assert words in str(error.value)
+
+
+def test_a_declaration_is_the_same_after_writing_it(tmp_path):
+    model = CHAIN.replace("[measurement]", '[model.unknown]\nf = { signals = ["a", "u"], enters = "b" }\n[measurement]')
+    model += "range = { y = [0, 10] }\n"
+    rig = _rig(tmp_path, model, TAIL + "horizon = 20.0\n")
+    write_rig(rig, tmp_path / "again.toml")
+    assert read_rig(tmp_path / "again.toml", specs) == rig
+    assert rig.horizon == 20.0
+    assert dict(rig.ranges) == {"y": (0.0, 10.0)}
+
+
+def test_a_step_is_that_of_the_matrix_exponential(tmp_path):
+    model = begin(_rig(tmp_path), _chain(), key=jax.random.key(0)).model
+    model = dataclasses.replace(model, substeps=20)
+    x, u = np.array([0.7, -0.2]), 1.5
+    whole = np.array([[-1 / 4, 0.0, 1.0], [1 / 2, -1 / 2, 0.0], [0.0, 0.0, 0.0]])
+    exact = (scipy.linalg.expm(0.5 * whole) @ np.append(x, u))[:2]
+    np.testing.assert_allclose(model.transition(jnp.asarray(x), Inputs.held(jnp.asarray([u]))), exact, rtol=1e-8)
+    np.testing.assert_allclose(model.emission(jnp.asarray(x), Inputs.held(jnp.asarray([u]))), [-0.2])
+
+
+def test_a_python_function_is_the_same_plant_as_its_text(tmp_path):
+    def rate(x, u, p):
+        return {"b": (x.a - x.b) / p.tb, "a": p.k * u.u - x.a / p.ta}
+
+    names = {"states": {"a": "V", "b": "V"}, "inputs": {"u": "V"}, "parameters": ("k", "ta", "tb")}
+    register_equations("test_chain", rate, **names)
+    lines = [line for line in CHAIN.splitlines() if not line.startswith(("inputs", "states", "rates"))]
+    text = _rig(tmp_path)
+    python = _rig(tmp_path, "\n".join(lines).replace('"equations"', '"test_chain"') + "\n")
+    first, second = (build_system(rig) for rig in (text, python))
+    q, u, push = jnp.asarray([0.3, 0.8]), jnp.asarray([0.4]), jnp.asarray([0.1, -0.2])
+    np.testing.assert_array_equal(first.slopes(q, q[:0], u, push), second.slopes(q, q[:0], u, push))
+    assert python.input_columns == text.input_columns == ("u",)
+
+
+def test_an_unknown_term_is_a_port_where_its_name_stands():
+    of = {"terms": {"f": ["a"]}, "enters": {}, "units": {}, "function": "", "parameters": ["k"]}
+    of |= {"states": {"a": "m"}, "inputs": {}, "rates": {"a": "-k*f"}, "readings": {"y": "a + 2*f"}}
+    plant = Equations.declared({"k": jnp.asarray(3.0)}, (), json.dumps(of))
+    q, none = jnp.asarray([1.0]), jnp.zeros(0)
+    assert plant.ports == ("a", "f")
+    assert plant.senses_push
+    assert [float(a) for a in plant.slopes(q, none, none, jnp.asarray([0.5, 2.0]))] == [-5.5]
+    assert [float(a) for a in plant.sensed(q, none, none, jnp.asarray([0.5, 2.0]))] == [5.0]
+
+
+def test_time_constants_are_those_of_the_eigenvalues(tmp_path):
+    data = _chain()
+    seen = motion(begin(_rig(tmp_path), data, key=jax.random.key(0)).model, data)
+    np.testing.assert_allclose([seen.slowest, seen.fastest], [4.0, 0.5], rtol=1e-9)
+
+
+def test_readings_at_the_ends_of_their_range_are_not_read(tmp_path):
+    rig = _rig(tmp_path, CHAIN + "range = { y = [0, 1.5] }\n")
+    (tmp_path / "train").mkdir()
+    y = np.minimum(0.1 * np.arange(30) + 0.01 * (-1.0) ** np.arange(30), 1.5)
+    rows = "\n".join(f"{0.5 * i},1,{one}" for i, one in enumerate(y))
+    (tmp_path / "train" / "a.csv").write_text(f"time,u,y\n{rows}\n")
+    with pytest.warns(UserWarning, match="at the end of the declared range"):
+        logs = read_logs(tmp_path / "train", rig, trust=True)
+    np.testing.assert_array_equal(np.isnan(np.asarray(logs.data.y)[0, :, 0]), y >= 1.5)
+    assert [m.kind for m in logs.masked] == ["range"]
+
+
+def test_derivatives_of_open_loop_errors_are_those_of_differences(tmp_path):
+    data = _chain()
+    fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
+    prior = fitted.m_step.prior
+    here = simulated.simulated(fitted.model, prior, data)
+    assert np.isfinite(here.error).all()
+    for i, step in enumerate(1e-5 * np.eye(2)):
+        ahead, behind = (
+            simulated.simulated(prior.write(fitted.model, jnp.asarray(here.z + sign * step)), prior, data).error
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(here.columns[..., i], -(ahead - behind) / 2e-5, rtol=1e-5, atol=1e-7)
+
+
+def test_a_fit_to_open_loop_errors_is_that_of_scipy(tmp_path):
+    data = _chain(noise=0.05)
+    fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
+    prior, scale = fitted.m_step.prior, np.full((1, 1, 2, 1), 1.0)  # no error is beyond Huber's bend
+    best = simulated.fit(fitted.model, prior, data, scale=scale)
+
+    def rows(z):
+        one = simulated.simulated(prior.write(fitted.model, jnp.asarray(z)), prior, data)
+        return np.concatenate([one.error.ravel() / np.sqrt(one.overlap), one.z])
+
+    np.testing.assert_allclose(best.z, scipy.optimize.least_squares(rows, np.zeros(2)).x, atol=2e-3)
+
+
+def test_identify_finds_the_parameters_and_the_hidden_state(tmp_path):
+    data, rig = _chain(), _rig(tmp_path)
+    fitted = identify(rig, data, key=jax.random.key(0))
+    k, ta = (float(fitted.model.system.values[name]) for name in ("k", "ta"))
+    np.testing.assert_allclose([k, ta], [1.3, 3.0], rtol=0.03)
+    assert "They differ" not in (fitted.horizon_note or "")
+    save(tmp_path / "model.npz", fitted)
+    again = load(tmp_path / "model.npz")
+    assert again.rig == rig
+    leaves = (jax.tree.leaves(eqx.filter(one.model, eqx.is_array)) for one in (again, fitted))
+    for a, b in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert again.model.pace == fitted.model.pace

@@ -153,7 +153,8 @@ def verdict(
     grows = growth(error)
     if not grows:
         return text + "."
-    at, horizon = error["horizons_s"].index(1.0), f"{min(1.0, error.get('reach_s', 1.0)):.3g} s"
+    judged = error.get("judged_s", 1.0)
+    at, horizon = error["horizons_s"].index(judged), f"{min(judged, error.get('reach_s', judged)):.3g} s"
     ratios = [(c, error["before"][c][at], error["after"][c][at]) for c in sorted(grows, key=grows.__getitem__)]
     if sum(grows.values()) >= 0:
         column, before, after = ratios[-1]
@@ -169,9 +170,10 @@ def verdict(
 
 def growth(error: Mapping[str, Any]) -> dict[str, float]:
     """Log of the test error 1 s ahead with the accepted effects over that without, by column; known ones alone."""
-    if 1.0 not in (error.get("horizons_s") or []):
+    judged = error.get("judged_s", 1.0)
+    if judged not in (error.get("horizons_s") or []):
         return {}
-    at, before, after = error["horizons_s"].index(1.0), error["before"], error["after"]
+    at, before, after = error["horizons_s"].index(judged), error["before"], error["after"]
     pairs = {column: (before[column][at], after[column][at]) for column in before if column in after}
     known = {column: pair for column, pair in pairs.items() if all(map(finite, pair))}
     return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in known.items()}
@@ -180,6 +182,9 @@ def growth(error: Mapping[str, Any]) -> dict[str, float]:
 def _sized(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
     name, curve = with_article(words(key_of(finding.effect))), finding.curve
+    sizes = {n: f"{with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in finding.parameters.items()}
+    if phrase := finding.effect.phrase(sizes):
+        return phrase
     for symbol, estimate in finding.parameters.items():
         return f"{name} ({symbol} = {with_std(estimate.value, estimate.std)} {estimate.unit}".rstrip(" -") + ")"
     if curve is None:

@@ -29,6 +29,7 @@ from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, renamed, silent
 from .backward import backward
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
+from .equations import search_equations
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
@@ -227,9 +228,11 @@ def close_the_loop(
         stages.update(seen)
         return outcome
 
-    if len(data.t) < 2:
+    if len(data.t) < 2 and not rig.equations:
         log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
     before = identified(data)
+    if rig.equations:
+        return search_equations(before, data, log, end)
     if white:
         context = SearchContext(before, stages, data, MultiStep(), effort, log, until=end)
         return _branching(search(context, white=True, release=finished))

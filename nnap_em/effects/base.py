@@ -5,7 +5,8 @@ A new effect is one new file in this folder; the catalogue finds it.
 
 import dataclasses
 import inspect
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Mapping
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -67,6 +68,26 @@ class Around(NamedTuple):
     """True where a friction map is learned."""
     inputs: tuple[str, ...]
     """Column of every input."""
+    sizes: Mapping[str, tuple[float, float]] = {}
+    """Ranges of states and inputs, of equations."""
+    ends: tuple[tuple[float, float], ...] = ()
+    """Ranges of the readings, of equations."""
+
+    @property
+    def open_ports(self) -> tuple[str, ...]:
+        """Ports of equations."""
+        return () if self.system.coordinates else self.system.ports
+
+    @property
+    def ordered(self) -> list[tuple[str, str]]:
+        """Pairs of different states of equations, in either order."""
+        states = () if self.system.coordinates else self.system.states
+        return list(itertools.permutations(states, 2))
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Pairs of different states of equations."""
+        return [pair for pair in self.ordered if pair[0] < pair[1]]
 
     @property
     def joints(self) -> range:
@@ -195,6 +216,10 @@ class AbstractEffect(eqx.Module):
     def values(self) -> dict[str, Scalar]:
         """The reported parameters under the vocabulary's names."""
         return {name: getattr(self, name) for name in self.units}
+
+    def phrase(self, sizes: dict[str, str]) -> str:
+        """Noun of a sentence with its numbers, as texts by their names; empty where the name of the law serves."""
+        return ""
 
     def units_on(self, system: AbstractSystem) -> dict[str, str]:
         """Units of the reported parameters on this machine and channel."""

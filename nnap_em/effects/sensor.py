@@ -25,7 +25,7 @@ class SensorBias(SensorEffect):
 
     def same_as(self, system, measured):
         """A tilt of the base the other way, for the first angle."""
-        tilts = self.channel == system.coordinates[0] and BaseTilt.weighs(system)
+        tilts = self.channel in system.coordinates[:1] and BaseTilt.weighs(system)
         return (("base_tilt", None, None, ()),) if tilts else ()
 
     def reading(self, value, past):

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
+from ..effects.equations import NODES, UnknownTerm
 from ..model.friction import NoFriction
-from ..model.state_space import MOST_STEPS, SUBSTEPS, Inputs, StateSpaceModel
+from ..model.state_space import MOST_STEPS, Inputs, StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
 from ..systems.equations import Equations
 from .prior import ParameterPrior
@@ -33,6 +34,7 @@ class Motion(NamedTuple):
     """A free simulation of the declared equations, by which scales are measured."""
 
     x: Float[np.ndarray, "row state"]
+    u: Float[np.ndarray, "row input"]
     rate: Float[np.ndarray, "row state"]
     """Derivatives along it [1/s]."""
     fastest: float
@@ -114,7 +116,7 @@ def motion(model: StateSpaceModel, data: Dataset) -> Motion:
     values = np.linalg.eigvals(slope[sound]) if sound.any() else np.zeros((1, 1))
     decay = np.median(np.max(np.where(values.real < 0, values.real, -np.inf), axis=1))
     slowest = -1 / float(decay) if np.isfinite(decay) else math.inf
-    return Motion(x[sound], rate[sound], float(np.percentile(np.abs(values), 99)), slowest)
+    return Motion(x[sound], u[sound], rate[sound], float(np.percentile(np.abs(values), 99)), slowest)
 
 
 @eqx.filter_jit
@@ -134,6 +136,65 @@ def pace_of(rig: Rig, slowest: float, rows: int) -> float:
     """
     pace = rig.horizon or min(PACE * slowest, SHARE * rows * rig.dt)
     return float(f"{max(pace, 8 * rig.dt):.2g}")
+
+
+def unknown_terms(system: Equations, seen: Motion, names: tuple[str, ...]) -> tuple[UnknownTerm, ...]:
+    """The declared unknown terms, zero, free of what a change of the parameters `names` does along the motion."""
+    of, out = system.of, []
+    places = [(name, name, signals) for name, signals in of.terms.items()]
+    places += [(name, state, signals) for name, (state, signals) in of.enters.items()]
+    for label, port, signals in places:
+        every = dict(zip((*system.states, *system.inputs), np.concatenate([seen.x, seen.u], axis=1).T, strict=True))
+        values = np.stack([every[name] for name in signals], axis=1)
+        low, high = values.min(axis=0), values.max(axis=0)
+        out.append(free_term(system, seen, names, port, signals, low, np.maximum(high, low + 1e-9), label))
+    return tuple(out)
+
+
+def free_term(
+    system: Equations,
+    seen: Motion,
+    names: tuple[str, ...],
+    port: str,
+    signals: tuple[str, ...],
+    low: Float[np.ndarray, " axis"],
+    high: Float[np.ndarray, " axis"],
+    label: str = "",
+) -> UnknownTerm:
+    """An unknown term at a port, zero: its basis is orthogonal to the slopes of all rates by the parameters."""
+    count = NODES[len(signals)] ** len(signals)
+    plain = UnknownTerm(jnp.zeros(count), np.eye(count), low, high, channel=port, reads=signals, label=label)
+    every = (*system.states, *system.inputs)
+    index = np.asarray([every.index(name) for name in signals])
+    moved, slopes = _directions(
+        system, plain, names, system.ports.index(port), index, jnp.asarray(seen.x), jnp.asarray(seen.u)
+    )
+    overlap = np.einsum("rsp,rsn->pn", np.asarray(slopes), np.asarray(moved))
+    size = np.linalg.norm(overlap, axis=1, keepdims=True)
+    _, strength, axes = np.linalg.svd(overlap / np.where(size > 0, size, 1.0))
+    rank = int(np.sum(strength > 1e-9 * max(float(strength.max(initial=0.0)), 1e-300)))
+    basis = axes[rank:]
+    return UnknownTerm(jnp.zeros(len(basis)), basis, low, high, channel=port, reads=signals, label=label)
+
+
+@eqx.filter_jit
+def _directions(system: Equations, term: UnknownTerm, names: tuple[str, ...], port: int, index, x, u):
+    """Change of all rates by the basis functions of a term, and by the parameters, along a motion."""
+    still = jnp.zeros(len(system.ports))
+
+    def one(x, u):
+        rate = lambda push: jnp.stack(system.slopes(x, x[:0], u, push))  # noqa: E731
+        by_push = jax.jacfwd(rate)(still)[:, port]
+
+        def by_values(values):
+            changed = system.with_parameters(dict(zip(names, values, strict=True)))
+            return jnp.stack(changed.slopes(x, x[:0], u, still))
+
+        slopes = jax.jacfwd(by_values)(jnp.stack([system.values[name] for name in names])) if names else still[:0]
+        slopes = slopes if names else jnp.zeros((x.shape[0], 0))
+        return by_push[:, None] * term.grid(jnp.concatenate([x, u])[index])[None], slopes
+
+    return jax.vmap(one)(x, u)
 
 
 def build_equations(rig: Rig, system: Equations, data: Dataset):
@@ -172,8 +233,14 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
         log_r=model.log_r,
         measured=model.measured,
         dt=rig.dt,
-        substeps=min(max(SUBSTEPS, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / STIFF, 1.0)))), MOST_STEPS),
+        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / STIFF, 1.0)))), MOST_STEPS),
         pace=pace_of(rig, seen.slowest, rows),
     )
+    terms = unknown_terms(system, seen, free)
+    for place, term in enumerate(terms):  # as large as what moves the port
+        size = np.full(term.weights.shape, scale[system.ports.index(str(term.channel))])
+        names = (*prior.names, f"{place}.weights")
+        prior = ParameterPrior(names, jnp.append(prior.mean, 0 * size), jnp.append(prior.std, jnp.asarray(size)))
+    model = with_effects(model, terms)
     quiet = jnp.asarray(2 * np.log(least), float)
     return model, prior, learned, tuple(n is None for n in noise), quiet

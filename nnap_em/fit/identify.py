@@ -98,10 +98,10 @@ def begin(
     smoother: MakeSmoother = CubatureSmoother,
     effects: tuple[AbstractEffect, ...] = (),
 ) -> Identified:
-    """The problem before the first epoch; `effects` join the model as they are."""
+    """The problem before the first epoch; `effects` join the model as they are, or take the place of unknown terms."""
     key_build, key_fit = jax.random.split(key)
     model, rule, bank = build(rig, data, key=key_build)
-    full = with_effects(model, effects)
+    full = with_effects(model, effects) if effects else model
     rule = eqx.tree_at(lambda m: m.shape, rule, full.log_q)
     return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
 
@@ -183,20 +183,27 @@ def _simulating(fitted: Identified, data: Dataset) -> Identified:
 
     Likelihood alone trades long for short predictions: process noise of a hidden state stands for all that is slow.
     """
-    prior, key = fitted.m_step.prior, fitted.state.key
+    prior = fitted.m_step.prior
     likely = simulated.simulated(fitted.model, prior, data)
     scale = simulated.scale_of(likely.error)
     declared = prior.write(fitted.model, jnp.zeros_like(prior.mean))
-    cost = lambda of: simulated.cost(of.error, scale, of.overlap, simulated.observed(of)) + of.z @ of.z  # noqa: E731
+    cost = lambda of: simulated.cost(of.error, scale, simulated.observed(of)) + of.z @ of.z  # noqa: E731
     best = min((simulated.fit(model, prior, data, scale=scale) for model in (declared, fitted.model)), key=cost)
+    fitted = fitted_to_horizon(fitted._replace(state=fitted.state._replace(best=best.model)), data)
+    return fitted._replace(horizon_note=_horizon_note(fitted, likely, simulated.simulated(fitted.model, prior, data)))
+
+
+def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
+    """Equations with noise by EM at their parameters, then parameters by errors over the horizon of use."""
+    prior, data = fitted.m_step.prior, jax.device_put(data)
     rule = eqx.tree_at(lambda rule: rule.prior, fitted.m_step, ParameterPrior((), prior.mean[:0], prior.std[:0]))
-    begun = later_state(best.model, rule, key=key)
+    begun = later_state(fitted.model, rule, key=fitted.state.key)
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     state = fit(begun, data, fitted.smoother, rule, epochs=NOISE_EPOCHS, schedule=Schedule(first=longest))
     best = simulated.fit(cast(StateSpaceModel, state.best), prior, data)
     hessian = jnp.asarray(simulated.precision(best, simulated.scale_of(best.error)))
     state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
-    return fitted._replace(state=state, horizon_note=_horizon_note(fitted, likely, best))
+    return fitted._replace(state=state)
 
 
 def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulated.Simulated) -> str:

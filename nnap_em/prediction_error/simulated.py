@@ -1,15 +1,19 @@
 """Open-loop errors of a model with their exact derivatives, and a fit to them by Levenberg-Marquardt's method.
 
-    e(z) = y_{k+h} - g(x_{k+h}(z)),   x_k(z) the state that the filter of the model z has at row k
+    e(z) = y_{k+h} - g(x_{k+h}(z)),   x_k the state that a filter has at row k
 
-The derivatives go through filter and simulation, unlike those of `multistep`, which are linear about a smoothed path:
-a model of a few equations may be wrong by as much as its signals move, and its parameters move by as much as they are
-large. [Ljung 1999, "System Identification", 2nd ed., chapter 7, for prediction errors; More 1978, "The
-Levenberg-Marquardt algorithm", LNM 630]
+The derivatives go through the simulation, unlike those of `multistep`, which are linear about a smoothed path: a model
+of a few equations may be wrong by as much as its signals move, and its parameters move by as much as they are large.
+Over the horizons here a start hardly matters: it is filtered once, and again when the parameters have moved.
+[Ljung 1999, "System Identification", 2nd ed., chapter 7, for prediction errors; More 1978, "The Levenberg-Marquardt
+algorithm", LNM 630]
 """
 
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,18 +25,20 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
-from .multistep import Grid, grid_of
+from .multistep import Grid
 
 HORIZONS = (0.5, 1.0)
 """Horizons of the errors, in the pace of the model: four and eight of its slowest time constants, or as declared. Fits
 to nearer ones trade parameters for errors of the start: on two tanks without their overflow .12 and .25 more made a
 free simulation worse by a tenth."""
+APART = 1 / 8
+"""Distance of independent errors, in the pace of the model: one slowest time constant."""
 HUBER = 3.0
 """Errors of more standard deviations weigh less."""
 FALLS = 1e-4
 """Share by which a step must lower the squared error for another one to follow."""
-STEPS = 30
-"""Steps at most."""
+STEPS, PASSES = 30, 3
+"""Steps at most from the same starts, and how often these are filtered."""
 
 Errors = Float[np.ndarray, "seq start horizon obs"]
 
@@ -48,36 +54,81 @@ class Simulated(NamedTuple):
     """Reading minus prediction; NaN where there is none."""
     columns: Float[np.ndarray, "seq start horizon obs param"]
     """Derivatives of the predictions by z."""
-    overlap: float
-    """Number of errors that count as one: predictions that cover one moment."""
     reach: float
     """Longest horizon [s]."""
 
 
 def grid(model: StateSpaceModel, data: Dataset) -> Grid:
-    """Starts and horizons of the errors."""
+    """Starts and horizons of the errors: starts so far apart that errors are independent."""
     rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    return grid_of(model.dt, rows, HORIZONS, model.pace)
+    stride = max(1, round(APART * model.pace / model.dt))
+    longest = max(1, rows // 2 // stride)
+    return Grid(stride, tuple(stride * min(longest, max(1, round(h / APART))) for h in HORIZONS))
 
 
-def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset) -> Simulated:
-    """The open-loop errors of a model, and how its estimated parameters move the predictions."""
-    at, z = grid(model, data), prior.read(model)
-    error, columns = each(_errors, (model, prior, at, z), jax.device_put(data))
-    overlap = at.ages[-1] / at.stride
-    return Simulated(
-        model, prior, np.asarray(z), np.asarray(error), np.asarray(columns), overlap, at.ages[-1] * model.dt
+Starts = Float[Array | np.ndarray, "seq start state"]
+
+
+def filtered(model: StateSpaceModel, data: Dataset) -> Starts:
+    """States at all starts by the filter of a model."""
+    return each(_filtered, (model, grid(model, data)), jax.device_put(data))
+
+
+def _filtered(common, seq: Dataset) -> Float[Array, "start state"]:
+    model, grid = common
+    return ekf(model, model.start, prepare(model, seq), TANGENT).state.mean[grid.starts(seq.t.shape[0])]
+
+
+def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begin: Starts | None = None) -> Simulated:
+    """The open-loop errors of a model, and how its estimated parameters move the predictions; from the states `begin`,
+    or those that its own filter has.
+    """
+    begin = filtered(model, data) if begin is None else begin
+    return together([model], [prior], data, begin)[0]
+
+
+GROUPS = (1, 16, 64)
+"""Numbers of models whose errors are computed at once, a program for each: a simulation is a long loop, whose steps
+take as long for one as for many."""
+
+
+def together(
+    models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], data: Dataset, begin: Starts
+) -> list[Simulated]:
+    """`simulated` of models of one structure."""
+    at, count = grid(models[0], data), len(data.t)
+    numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
+    static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
+    out = []
+    for first in range(0, len(models), GROUPS[-1]):
+        some = numbers[first : first + GROUPS[-1]]
+        size = next(size for size in GROUPS if size >= len(some))
+        stacked = jax.tree.map(_stacked(size, count), *some)
+        tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin))
+        error, columns = each(_errors, (static, at), (stacked, Dataset(*tiled[0]), tiled[1]))
+        for i, (_, _, z) in enumerate(some):
+            part = slice(i * count, (i + 1) * count)
+            model, prior = models[first + i], priors[first + i]
+            values = np.asarray(error[part]), np.asarray(columns[part])
+            out.append(Simulated(model, prior, np.asarray(z), *values, at.ages[-1] * model.dt))
+    return out
+
+
+def _stacked(size: int, count: int) -> Callable[..., np.ndarray]:
+    """Arrays of some models as one of `size`, the last repeated, each for `count` sequences."""
+    return lambda *each_one: np.repeat(
+        np.stack([np.asarray(a) for a in (*each_one, *each_one[-1:] * (size - len(each_one)))]), count, axis=0
     )
 
 
-def _errors(common, seq: Dataset) -> tuple[Float[Array, "start horizon obs"], Float[Array, "start horizon obs param"]]:
-    model, prior, grid, z = common
+def _errors(common, one) -> tuple[Float[Array, "start horizon obs"], Float[Array, "start horizon obs param"]]:
+    (static, grid), (numbers, seq, begin) = common, one
+    model, prior, z = eqx.combine(numbers, static)
     starts = grid.starts(seq.t.shape[0])
 
     def predicted(z):
         changed = prior.write(model, z)
         ready = prepare(changed, seq)
-        begin = ekf(changed, changed.start, ready, TANGENT).state.mean[starts]
         row = lambda k: jax.tree.map(lambda a: a[k], ready.inputs)  # noqa: E731
 
         def step(x, h):
@@ -99,10 +150,10 @@ def scale_of(error: Errors) -> Float[np.ndarray, "1 1 horizon obs"]:
     return np.sqrt(np.ma.filled(square.mean(axis=(0, 1), keepdims=True), 1.0)) + 1e-12
 
 
-def cost(error: Errors, scale, overlap, counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None) -> float:
-    """Squared errors in scales, each as much as it is independent; linear beyond `HUBER` [Huber 1964]."""
+def cost(error: Errors, scale, counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None) -> float:
+    """Squared errors in scales; linear beyond `HUBER` [Huber 1964]."""
     size = np.where(np.isfinite(error), np.minimum(np.abs(error) / scale, 30.0), 30.0)
-    each_one = np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER)) / overlap
+    each_one = np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER))
     return float(np.sum(np.where(counts if counts is not None else True, each_one, 0.0)))
 
 
@@ -117,7 +168,7 @@ def normal(
     """Score and information of the parameters by the errors that count, without the prior."""
     keep = counts & np.isfinite(of.error) & np.isfinite(of.columns).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        weight = np.minimum(1.0, HUBER * scale / np.abs(of.error)) / scale**2 / of.overlap
+        weight = np.minimum(1.0, HUBER * scale / np.abs(of.error)) / scale**2
     columns, error, weight = of.columns[keep], of.error[keep], weight[keep]
     return columns.T @ (weight * error), (columns * weight[:, None]).T @ columns
 
@@ -130,30 +181,55 @@ def fit(
     scale: Float[np.ndarray, "1 1 horizon obs"] | None = None,
     counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None,
     steps: int = STEPS,
+    begin: Starts | None = None,
 ) -> Simulated:
     """`model` with the parameters of the smallest open-loop errors under their prior; noise and start stay.
 
     `counts` are the starts whose errors count; a `scale` of the errors that is not given is that of the first model.
+    Without states to `begin` from they are filtered, `PASSES` times.
     """
-    best = simulated(model, prior, data)
-    known = observed(best) & (counts if counts is not None else True)
-    scale = scale_of(best.error) if scale is None else scale
-    loss = lambda one: cost(one.error, scale, one.overlap, known) + float(one.z @ one.z)  # noqa: E731
-    value, damping = loss(best), 1e-2
+    if begin is None:
+        for _ in range(PASSES):
+            begin = filtered(model, data)
+            best = fit(model, prior, data, scale=scale, counts=counts, steps=steps, begin=begin)
+            model = best.model
+        return simulated(model, prior, data)
+    return fit_all([model], [prior], data, scale=scale, counts=counts, steps=steps, begin=begin)[0]
+
+
+def fit_all(
+    models: Sequence[StateSpaceModel],
+    priors: Sequence[ParameterPrior],
+    data: Dataset,
+    *,
+    begin: Starts,
+    scale: Float[np.ndarray, "1 1 horizon obs"] | None = None,
+    counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None,
+    steps: int = STEPS,
+) -> list[Simulated]:
+    """`fit` of models of one structure, side by side."""
+    best = together(models, priors, data, begin)
+    known = observed(best[0]) & (counts if counts is not None else True)
+    scale = scale_of(best[0].error) if scale is None else scale
+    loss = lambda one: cost(one.error, scale, known) + float(one.z @ one.z)  # noqa: E731
+    values, damping, open_ = [loss(one) for one in best], [1e-2] * len(best), list(range(len(best)))
     for _ in range(steps):
-        score, information = normal(best, scale, known)
-        score, information = score - best.z, information + np.eye(len(best.z))
-        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), score)
-        trial = simulated(prior.write(best.model, jnp.asarray(best.z + step)), prior, data)
-        after = loss(trial)
-        if after < value:
-            gain, best, value, damping = 1 - after / value, trial, after, max(0.2 * damping, 1e-6)
-            if gain < FALLS:
-                break
-        else:
-            damping *= 8
-            if damping > 1e5:
-                break
+        ahead = []
+        for i in open_:
+            score, information = normal(best[i], scale, known)
+            score, information = score - best[i].z, information + np.eye(len(best[i].z))
+            step = np.linalg.solve(information + damping[i] * np.diag(np.diag(information)), score)
+            ahead.append(best[i].prior.write(best[i].model, jnp.asarray(best[i].z + step)))
+        trials = together(ahead, [priors[i] for i in open_], data, begin) if open_ else []
+        for i, trial in zip(list(open_), trials, strict=True):
+            after = loss(trial)
+            if after < values[i]:
+                gain, best[i], values[i] = 1 - after / values[i], trial, after
+                damping[i] = max(0.2 * damping[i], 1e-6)
+            else:
+                gain, damping[i] = math.inf, 8 * damping[i]
+            if gain < FALLS or damping[i] > 1e5:
+                open_.remove(i)
     return best
 
 

@@ -52,7 +52,7 @@ def write_diagnosis(
     partial = left["after"].without_effects() if accepted else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
-    nodes = visited_nodes(velocities)
+    nodes = visited_nodes(velocities) if names.rates else np.zeros((0, 2))
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if closed.before.rig.friction}
     for name, table in tables.items():
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
@@ -110,39 +110,45 @@ def _error_pictures(
             picture("error", "Learned friction", caption, friction_figure(tables, names, title="Learned friction"))
         )
     if test:
-        out += _prediction_pictures(predicted, names, test)
+        out += _prediction_pictures(predicted, names, test, error["given_s"] if error else GIVEN)
     return out
 
 
-def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test: Logs) -> list[Picture]:
+def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test: Logs, given: float) -> list[Picture]:
     """Test sequences to choose from, the longest ones first; as many as there is room for."""
     rows = np.sum(np.asarray(test.data.valid), axis=1)
     out: list[Picture] = []
     for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST]:
-        out.append(_prediction_picture(predicted, names, test, i))
+        out.append(_prediction_picture(predicted, names, test, i, given))
         if sum(len(picture.image) for picture in out) > ROOM and len(out) > 1:
             out.pop()
             break
     return out if len(out) > 1 else [picture._replace(choice="") for picture in out]
 
 
-def _prediction_picture(predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int) -> Picture:
+def _prediction_picture(
+    predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int, given: float
+) -> Picture:
     rows = np.asarray(test.data.valid[number])
     sides = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predicted.items()}
     t, y = (np.asarray(a[number])[rows] for a in (test.data.t, test.data.y))
-    caption = f"Predicted from its first second ({test.files[number]})."
-    figure = prediction_figure(t, y, names, sides, GIVEN)
+    caption = f"Predicted from its first {'second' if given == GIVEN else f'{given:g} s'} ({test.files[number]})."
+    figure = prediction_figure(t, y, names, sides, given)
     return picture("error", "One test sequence", caption, figure, test.files[number])
 
 
 def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: Names) -> list[Picture]:
-    return [
+    force = [
         picture(
             "residual",
             "The force that the declared model lacks",
             "What the smoothed motion needs beyond the declared model, against everything that could cause it.",
             residual_figure(partial, names, left.get("after")),
-        ),
+        )
+        for _ in names.coordinates[:1]
+    ]
+    return [
+        *force,
         picture(
             "residual",
             "One-step errors",
@@ -178,7 +184,7 @@ def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> li
 
 def _experiment(rig: Rig) -> list[str]:
     """The command that designs the next experiment."""
-    if not rig.input_columns:
+    if not rig.input_columns or rig.equations:
         return []
     return ["nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."]
 

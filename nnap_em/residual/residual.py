@@ -68,15 +68,16 @@ class Residual(NamedTuple):
 
     innovation: Float[np.ndarray, "seq time obs"]
     """Reading minus its one-step prediction, over the standard deviation of that; NaN where not measured."""
-    force: Float[np.ndarray, "seq time dof"]
-    """Generalised force that the model lacks between a row and the next [N m, or N]; NaN behind the last row."""
-    force_std: Float[np.ndarray, "seq time dof"]
+    force: Float[np.ndarray, "seq time port"]
+    """Generalised force that the model lacks between a row and the next [N m, or N], of equations the missing rate of
+    every state; NaN behind the last row."""
+    force_std: Float[np.ndarray, "seq time port"]
     """Standard deviation of it given all readings."""
-    partial_force: Float[np.ndarray, "seq time dof"]
+    partial_force: Float[np.ndarray, "seq time port"]
     """The force that the model without its effects lacks, on the paths smoothed with them: the component-plus-residual
     of a regression.  The paths of a model that lacks much are wrong themselves.
     [Larsen & McCleary 1972, Technometrics 14, 781]"""
-    partial_force_std: Float[np.ndarray, "seq time dof"]
+    partial_force_std: Float[np.ndarray, "seq time port"]
     state: Float[np.ndarray, "seq time state"]
     """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
@@ -115,27 +116,29 @@ def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
     """The fields of a `Residual` that come from smoothing, of one sequence."""
     model, (seq, posterior) = common, one
     dof, plain, prepared = len(model.system.coordinates), with_effects(model, ()), prepare(model, seq)
+    states = len(model.system.states)
+    pushed = slice(dof, states)  # rates; of equations, which have no coordinates, all states
     filtered = relinearised(model, posterior.state, prepared, CUBATURE)
 
     def force(system, x, change):
-        nodes = change @ system.mass(x[:dof]).T / model.dt
+        nodes = (change @ system.mass(x[:dof]).T if dof else change) / model.dt
         return jnp.mean(nodes, axis=0), jnp.std(nodes, axis=0)
 
     def both(x, kick, u, command):
-        change = kick[:, dof : 2 * dof]
+        change = kick[:, pushed]
         remaining = force(hooks.machine(model.effects, model.system, u.time), x, change)
         if not model.effects:
             return *remaining, *remaining
         # change of the rates by the effects over one sample
-        by_effects = model.transition(x, u)[dof : 2 * dof] - plain.transition(x[: 2 * dof], command)[dof:]
+        by_effects = model.transition(x, u)[pushed] - plain.transition(x[:states], command)[dof:]
         return *remaining, *force(model.system, x, change + by_effects[None])
 
     steps = jax.tree.map(lambda a: a[:-1], (posterior.state.mean, prepared.inputs, plain.inputs(seq)))
     forces = jax.vmap(both)(steps[0], posterior.kick, *steps[1:])
-    last = jnp.full((1, dof), jnp.nan, seq.y.dtype)
+    last = jnp.full((1, states - dof), jnp.nan, seq.y.dtype)
     forces = [jnp.concatenate([jnp.where(seq.valid[1:, None], a, jnp.nan), last]) for a in forces]
     innovation = jnp.where(prepared.observed, filtered.innovation, jnp.nan)
-    state, predicted = (g.mean[:, : 2 * dof] for g in (posterior.state, filtered.predicted))
+    state, predicted = (g.mean[:, :states] for g in (posterior.state, filtered.predicted))
     return innovation, *forces, state, predicted, prepared.inputs.u
 
 

@@ -1,0 +1,351 @@
+"""Laws that equations may lack: flows into and between states, by states and inputs.
+
+Each is a `Flow`: one formula for all of them, so that a search compiles one program for all.
+"""
+
+import itertools
+import math
+from functools import partial
+from typing import Any, ClassVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .base import AbstractEffect, Around, Candidate, Scalar, SensorEffect, a, known, one
+
+EDGE = 0.02
+"""Width of a step at a level, as a share of the range of its signal."""
+STRONG = 5.0
+"""Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
+the signal."""
+LEVELS = (0.3, 0.6, 0.8)
+"""Places in the range of a signal where the search for a level begins."""
+
+
+FORMS = (
+    "",
+    " in proportion to {0}",
+    " in proportion to {0} - {1}",
+    " in proportion to {0} {1}",
+    " with the square of {0}",
+    "",
+    " of {1}",
+)
+"""Words of the forms of a flow, with the names of its signals."""
+KINDS = 7
+"""Forms of a flow."""
+
+
+class Flow(AbstractEffect):
+    """strength g(signals), which enters `source`, and times share `target`.
+
+    g is one of 1, p, p - q, p q, p |p|, p above a level (p - level), and q where p is above a level, by `kind`, of the
+    signals p and q that `first` and `second` pick of states and inputs.
+    """
+
+    name: ClassVar[str] = "flow"
+    strength: Scalar
+    level: Scalar
+    share: Scalar
+    kind: Float[Array, " kind"] = known()
+    first: Float[Array, " signal"] = known()
+    second: Float[Array, " signal"] = known()
+    source: Float[Array, " port"] = known()
+    target: Float[Array, " port"] = known()
+    edge: Any = known()
+
+    def force(self, scene, memory):
+        values = jnp.concatenate([scene.q, cast(Array, scene.u)])
+        p, q = self.first @ values, self.second @ values
+        over, edge = jnp.maximum(p - self.level, 0.0), jnp.maximum(self.edge, 1e-12)
+        step = q * jax.nn.sigmoid((p - self.level) / edge)
+        forms = jnp.stack([jnp.ones_like(p), p, p - q, p * q, p * jnp.abs(p), over, step])
+        return self.strength * (self.kind @ forms) * (self.source + self.share * self.target)
+
+
+class PortEffect(AbstractEffect):
+    """A law of some signals at a port, or from one to another."""
+
+    kind: ClassVar[int]
+    """Its place among the forms of `Flow`."""
+    leaves: ClassVar[bool] = False
+    """True where it leaves its port."""
+    reports: ClassVar[tuple[str, ...]] = ("strength",)
+    """Numbers that it has and reports; the others stay as they are."""
+
+    reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
+    """Names of its signals."""
+    to: str | None = eqx.field(static=True, default=None, kw_only=True)
+    """Port that a share of it enters."""
+    strength: Scalar = eqx.field(kw_only=True, converter=a)
+    level: Scalar = eqx.field(kw_only=True, default=0.0, converter=a)
+    share: Scalar = eqx.field(kw_only=True, default=1.0, converter=a)
+    edge: Any = known(kw_only=True, default=0.0)
+
+    def flow(self, system) -> Flow:
+        """The law as the formula of all."""
+        signals, ports = (*system.states, *system.inputs), system.ports
+
+        def one_of(names: tuple[str, ...], name: str | None) -> Float[np.ndarray, " name"]:
+            return np.asarray([float(other == name) for other in names])
+
+        first, second = (one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
+        source = (-1.0 if self.leaves else 1.0) * one_of(ports, self.channel)
+        target = (1.0 if self.leaves else -1.0) * one_of(ports, self.to)
+        kind = np.eye(KINDS)[self.kind]
+        kind, first, second, source, target = (jnp.asarray(a, float) for a in (kind, first, second, source, target))
+        return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
+
+    def force(self, scene, memory):
+        return self.flow(scene.system).force(scene, memory)
+
+    def values(self):
+        return {name: getattr(self, name) for name in self.reports}
+
+    def units_on(self, system):
+        """Those of its port and signals."""
+        signals = [system.unit(name) for name in self.reads]
+        port = system.port_unit(system.ports.index(self.channel) + 1)
+        per = [signals[:1], [], signals[:1], signals[:2], signals[:1] * 2, signals[:1], signals[1:2]][self.kind]
+        per = [unit for unit in per if unit] if self.kind else []
+        strength = f"{port}/({' '.join(per)})" if len(per) > 1 else f"{port}/{per[0]}" if per else port
+        if len(per) == 1 and port == f"{per[0]}/s":
+            strength = "1/s"
+        return {"strength": strength, "level": signals[0] if signals else "", "share": "-"}
+
+    def phrase(self, sizes):
+        """A flow with its signals, level and share, as a reader would say it."""
+        source = f"out of {self.channel}" if self.leaves else f"into {self.channel}"
+        way = f"from {self.channel} to {self.to}" if self.to else source
+        form = FORMS[self.kind].format(*self.reads)
+        level = f" above {self.reads[0]} = {sizes['level']}" if "level" in sizes else ""
+        share = f" (share {sizes['share']})" if "share" in sizes else f" ({sizes['strength']})"
+        return f"a flow {way}{form}{level}{share}"
+
+    def inputs_named(self):
+        return (*self.reads, *([self.to] if self.to else []))
+
+    def signals(self, system):
+        return self.reads
+
+    def possible(self) -> bool:
+        """A flow that leaves a state has a positive strength, and no more of it arrives than leaves, but for errors."""
+        return (not self.leaves or float(self.strength) > 0) and ("share" not in self.reports or self._shared())
+
+    def _shared(self) -> bool:
+        return 0.0 < float(self.share) < 1.5
+
+    @classmethod
+    def at(
+        cls, around: Around, port: str, of: tuple[str, ...], to: str | None = None, level: float | None = None
+    ) -> Candidate:
+        """The law at a port, of signals, from a level on, with strengths of the size of what moves the port."""
+        rate = float(around.torque[around.system.ports.index(port)])
+        ends = [around.sizes[name] for name in of]
+        width, reach = [high - low for low, high in ends], [max(abs(low), abs(high)) for low, high in ends]
+        typical = (1.0, *reach[:1], *width[:1], math.prod(reach), *[r * r for r in reach[:1]], *width[:1], *reach[1:2])
+        spread = STRONG * rate / max(typical[cls.kind] if of else 1.0, 1e-12)
+
+        def make(strength: float, level: float, share: float):
+            edge = EDGE * width[0] if of else 0.0
+            return cls(strength=strength, level=level, share=share, edge=edge, channel=port, reads=of, to=to)
+
+        has, none = cls.reports, 1e-12
+        start = make(0.0, level or 0.0, 0.7 if "share" in has else 1.0)
+        probe = make(0.04 * spread, level or 0.0, 0.7 if "share" in has else 1.0)
+        wide = make(spread, 0.3 * width[0] if "level" in has else none, 0.3 if "share" in has else none)
+        return Candidate(start, (probe,), wide)
+
+
+def _levels(around: Around, name: str) -> list[float]:
+    """Levels at which a search begins."""
+    low, high = around.sizes[name]
+    return [low + share * (high - low) for share in LEVELS]
+
+
+class ConstantFlow(PortEffect):
+    """strength."""
+
+    name: ClassVar[str] = "constant_flow"
+    confirm: ClassVar[str] = "Leave all inputs at zero and watch the state drift."
+    kind: ClassVar[int] = 0
+
+    @classmethod
+    def candidates(cls, around):
+        return [cls.at(around, port, ()) for port in around.open_ports]
+
+
+class LinearFlow(PortEffect):
+    """strength p: a leak where p is the state itself, else a coupling."""
+
+    name: ClassVar[str] = "linear_flow"
+    confirm: ClassVar[str] = "Hold all else still, change this signal alone, and watch the rate of the state."
+    kind: ClassVar[int] = 1
+
+    @classmethod
+    def candidates(cls, around):
+        return [cls.at(around, port, (name,)) for port in around.open_ports for name in around.sizes]
+
+
+class SquareFlow(PortEffect):
+    """strength p |p|."""
+
+    name: ClassVar[str] = "square_flow"
+    confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
+    kind: ClassVar[int] = 4
+
+    @classmethod
+    def candidates(cls, around):
+        return [cls.at(around, port, (name,)) for port in around.open_ports for name in around.sizes]
+
+
+class ProductFlow(PortEffect):
+    """strength p q."""
+
+    name: ClassVar[str] = "product_flow"
+    confirm: ClassVar[str] = "Change one of the two signals while the other is zero: the rate must stay."
+    kind: ClassVar[int] = 3
+
+    @classmethod
+    def candidates(cls, around):
+        pairs = [tuple(pair) for pair in itertools.combinations(around.sizes, 2)]
+        return [cls.at(around, port, pair) for port in around.open_ports for pair in pairs]
+
+
+class ThresholdFlow(PortEffect):
+    """strength (p - level) where p is above the level."""
+
+    name: ClassVar[str] = "threshold_flow"
+    confirm: ClassVar[str] = "Raise this signal slowly and watch where the rate of the state begins to change."
+    kind: ClassVar[int] = 5
+    reports: ClassVar[tuple[str, ...]] = ("strength", "level")
+
+    @classmethod
+    def candidates(cls, around):
+        places = [(port, name) for port in around.open_ports for name in around.sizes]
+        return [cls.at(around, port, (n,), level=level) for port, n in places for level in _levels(around, n)]
+
+
+class Exchange(PortEffect):
+    """strength (p - q) leaves the state p and enters the state q, as heat and pressure do."""
+
+    name: ClassVar[str] = "exchange"
+    confirm: ClassVar[str] = "Bring one of the two states up with all inputs off, and watch the other follow."
+    kind: ClassVar[int] = 2
+    leaves: ClassVar[bool] = True
+
+    @classmethod
+    def candidates(cls, around):
+        return [cls.at(around, one, (one, other), to=other) for one, other in around.pairs]
+
+
+class Transfer(PortEffect):
+    """strength (p - level) leaves the state p above a level, and a share of it enters another."""
+
+    name: ClassVar[str] = "transfer"
+    confirm: ClassVar[str] = "Fill the first state above the level and watch where the flow goes."
+    kind: ClassVar[int] = 5
+    leaves: ClassVar[bool] = True
+    reports: ClassVar[tuple[str, ...]] = ("level", "share", "strength")
+
+    @classmethod
+    def candidates(cls, around):
+        each = [(one, other, level) for one, other in around.ordered for level in _levels(around, one)]
+        return [cls.at(around, one, (one,), to=other, level=level) for one, other, level in each]
+
+
+class Overflow(PortEffect):
+    """strength u leaves the state p while it is above a level, and a share of it enters another."""
+
+    name: ClassVar[str] = "overflow"
+    confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
+    kind: ClassVar[int] = 6
+    leaves: ClassVar[bool] = True
+    reports: ClassVar[tuple[str, ...]] = ("level", "share", "strength")
+
+    @classmethod
+    def candidates(cls, around):
+        each = [(one, other, level) for one, other in around.ordered for level in _levels(around, one)]
+        return [
+            cls.at(around, one, (one, u), to=other, level=level) for one, other, level in each for u in around.inputs
+        ]
+
+
+class Bend(SensorEffect):
+    """value + bend (value - low)^2 / (high - low), of the range of the reading."""
+
+    name: ClassVar[str] = "sensor_bend"
+    confirm: ClassVar[str] = "Compare the sensor with another one at three places of its range."
+    units: ClassVar[dict[str, str]] = {"bend": "-"}
+    bend: Scalar
+    low: Any = known()
+    high: Any = known()
+
+    @classmethod
+    def candidates(cls, around):
+        if around.system.coordinates:
+            return []
+        return [
+            one(partial(cls, low=low, high=high, channel=name), 0.0, 0.02, 0.5)
+            for name, (low, high) in zip(around.measured, around.ends, strict=True)
+        ]
+
+    def reading(self, value, past):
+        return value + self.bend * (value - self.low) ** 2 / (self.high - self.low)
+
+
+NODES = {1: 9, 2: 5, 3: 4}
+"""Basis functions along each signal of an unknown term, by the number of its signals."""
+
+
+class UnknownTerm(AbstractEffect):
+    """sum_i w_i phi_i(signals) at a port, of Gaussian basis functions on a grid, free of the span of the parameters.
+
+    phi = T psi, psi on the grid: T takes out of it what a change of the parameters does to the rate of the port along
+    the logs, so that the two do not compete.
+    """
+
+    name: ClassVar[str] = "unknown_term"
+    named: ClassVar[bool] = False
+    confirm: ClassVar[str] = "Hold all signals but one still, and move that one through its range."
+    weights: Float[Array, " basis"]
+    basis: Any = known()
+    """T."""
+    low: Any = known()
+    high: Any = known()
+    reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
+    """Names of its signals."""
+    label: str = eqx.field(static=True, default="", kw_only=True)
+    """Name in rig.toml; empty for one that a search proposes."""
+
+    def grid(self, values: Float[Array, " axis"]) -> Float[Array, " node"]:
+        """Basis functions of the grid at values of the signals; beyond the ends those of the end."""
+        count, out = NODES[len(self.reads)], jnp.ones(1, values.dtype)
+        for i in range(len(self.reads)):
+            centres = jnp.linspace(self.low[i], self.high[i], count)
+            width = (self.high[i] - self.low[i]) / (count - 1)
+            inside = jnp.clip(values[i], self.low[i], self.high[i])
+            out = (out[:, None] * jnp.exp(-0.5 * ((inside - centres) / width) ** 2)[None]).ravel()
+        return out
+
+    def at(self, values: Float[Array, " axis"]) -> Scalar:
+        """The function at values of its signals."""
+        return self.weights @ (self.basis @ self.grid(values))
+
+    def force(self, scene, memory):
+        system: Any = scene.system
+        every = dict(zip((*system.states, *system.inputs), (*scene.q, *cast(Array, scene.u)), strict=True))
+        value = self.at(jnp.stack([every[name] for name in self.reads]))
+        return jnp.zeros_like(scene.drive).at[system.ports.index(self.channel)].set(value)
+
+    def values(self):
+        return {}
+
+    def inputs_named(self):
+        return self.reads
+
+    def signals(self, system):
+        return self.reads

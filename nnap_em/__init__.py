@@ -41,9 +41,10 @@ if TYPE_CHECKING:
     from .smoother.particle import ParticleSmoother
     from .smoother.posterior import Posterior
     from .storage.files import StoreError
-    from .systems import AbstractSystem, register, specs
+    from .systems import AbstractPlant, AbstractSystem, register, register_equations, root, specs
 
 __all__ = [
+    "AbstractPlant",
     "AbstractSystem",
     "Branch",
     "CheckResult",
@@ -100,6 +101,8 @@ __all__ = [
     "read_logs",
     "read_rig",
     "register",
+    "register_equations",
+    "root",
     "save",
     "simulate",
     "smooth",
@@ -145,7 +148,7 @@ _homes = {
     "smoother.mixture": ("MixtureSmoother",),
     "smoother.posterior": ("Posterior",),
     "fit.store": ("load", "save"),
-    "systems": ("AbstractSystem", "register", "specs"),
+    "systems": ("AbstractPlant", "AbstractSystem", "register", "register_equations", "root", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}
 

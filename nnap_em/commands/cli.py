@@ -49,6 +49,7 @@ examples:
   nnap-em init mine/train/01.csv                    the same: rig.toml stands beside train/
   nnap-em init run.mcap --system acrobot --out mine with a table [import] of what was found where
   nnap-em init run.mcap --model arm.xml --out mine  joints, motors and sensors by the names of the file
+  nnap-em init log.csv --model equations --out mine states, inputs and rates to be written as formulas
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
@@ -190,7 +191,10 @@ def parser() -> argparse.ArgumentParser:
     machine = init.add_mutually_exclusive_group()
     machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
     machine.add_argument(
-        "--model", metavar="FILE", type=Path, help="the machine as MJCF or URDF, which stays where it is"
+        "--model",
+        metavar="FILE",
+        type=Path,
+        help='the machine as MJCF or URDF, which stays where it is, or "equations" to be written',
     )
     init.add_argument(
         "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"

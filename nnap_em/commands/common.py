@@ -121,6 +121,12 @@ def read_bench(folder: Path, trust: bool, further: Sequence[Path] = ()) -> Bench
     return Bench(rig, train, test)
 
 
+def require_joints(rig: Rig, what: str) -> None:
+    """Raise DataError where a command needs a machine with joints, and the rig is written as equations."""
+    if rig.equations:
+        raise DataError(f"{what}: rig {rig.name!r} is written as equations; this needs a machine with joints")
+
+
 def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     """The training logs of a data set, and of further folders: those in train/, or in the folder itself."""
     first, *others = folders

@@ -17,13 +17,14 @@ from ..fit.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
 from ..storage.log import Log
 from ..systems import specs
-from .common import Bench, read_training, resumable
+from .common import Bench, read_training, require_joints, resumable
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
     """Design, and report."""
     began = time.perf_counter()
     stored = read(model_file(args.folder))
+    require_joints(stored.fitted.rig, "design")
     fitted, bench = _logs(args, stored)
     key, question, laws = jax.random.key(args.seed), vars(args)["for"], _wanted(args, fitted)
     check_question(question, fitted, bool(laws))

@@ -14,11 +14,15 @@ from ..portable.mjcf import write_mjcf
 from ..portable.online import write_observer
 from ..portable.urdf import write_urdf
 from ..storage.log import Log
+from .common import require_joints
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
+    for option in ("mjcf", "urdf", "c"):
+        if getattr(args, option) is not None:
+            require_joints(fitted.rig, f"--{option}")
     if args.mjcf is not None:
         for line in write_mjcf(fitted, args.mjcf, alone=args.alone):
             log(f"{args.mjcf} has no place for {line}")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ..data.dataset import DataError
 from ..data.formats import column_names
+from ..draft.equations import draft_equations
 from ..draft.from_log import draft
 from ..draft.from_machine import draft_machine
 from ..draft.from_topics import draft_recorded
@@ -21,7 +22,9 @@ def run(args: argparse.Namespace, log: Log) -> None:
     path = (args.out or home) / "rig.toml"
     if path.exists():
         raise DataError(f"{path}: is there already; give another --out, or remove it")
-    if args.model is not None:
+    if args.model == Path("equations"):
+        drafted = draft_equations(args.log)
+    elif args.model is not None:
         drafted = draft_machine(args.log, args.model, path.parent)
     else:
         drafted = (draft if _ours(args.log) else draft_recorded)(args.log, args.system, specs)

@@ -169,19 +169,20 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
     declared = len(before.model.effects)
     first = simulated.simulated(before.model, before.m_step.prior, data)
     search = Search(before, data, simulated.scale_of(first.error), log, until)
-    around, steps, complete = around_of(before, data), [], True
+    around, steps, complete, left = around_of(before, data), [], True, 1.0
     kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     while len(hypothesis.model.effects) - declared < MOST:
         if time.monotonic() > until:
             complete = False
             break
-        chosen, step = _round(search, hypothesis, every)
+        chosen, even, step = _round(search, hypothesis, every, left)
         steps.append(step)
         if chosen is None:
             break
+        left *= 1 - chosen.share
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Found(math.nan, math.nan, math.nan, (), chosen.share, chosen.share)
+            record = Found(math.nan, math.nan, math.nan, even, chosen.share, chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
@@ -199,8 +200,13 @@ def _with_numbers(hypothesis: Hypothesis, case: Case) -> Any:
     return eqx.tree_at(lambda m: m.system, with_effects(hypothesis.model, effects), lean.system)
 
 
-def _round(search: Search, hypothesis: Hypothesis, every: Sequence[Candidate]) -> tuple[Case | None, Step]:
-    """The laws that pass, if any do: single ones first, then pairs."""
+def _round(
+    search: Search, hypothesis: Hypothesis, every: Sequence[Candidate], remaining: float
+) -> tuple[Case | None, tuple[Key, ...], Step]:
+    """The laws that pass, if any do, single ones first, then pairs; and single ones that explain the same.
+
+    Of the first error a share `remaining` is left, and a later law must remove as much of the first as a first one.
+    """
     lean = hypothesis.refitted(
         with_effects(hypothesis.model, tuple(_lean(effect, search) for effect in hypothesis.model.effects))
     )
@@ -216,15 +222,15 @@ def _round(search: Search, hypothesis: Hypothesis, every: Sequence[Candidate]) -
     judged = search.judged(lean, singles[:SHORTLIST], base)
     for case in judged:
         _report(search, case)
-    passing, tried = [case for case in judged if _passes(case, SHARE)], [*judged]
-    if not passing and time.monotonic() < search.until:
+    passing, tried = [case for case in judged if _passes(case, SHARE / remaining)], [*judged]
+    if not passing and remaining > PAIR and time.monotonic() < search.until:
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
         pairs = sorted(search.fit(lean, joined, steps=QUICK), key=lambda case: case.loss)
         pairs = search.judged(lean, [case for case in pairs if _sound(case)][:JUDGED], base)
         for case in pairs:
             _report(search, case)
-        passing = [case for case in pairs if _passes(case, PAIR)]
+        passing = [case for case in pairs if _passes(case, PAIR / remaining)]
         tried += pairs
     listed = tuple((case.keys[0], 1 - case.loss / null.loss) for case in singles)
     refitted = tuple((case.keys[-1], case.share) for case in tried)
@@ -235,7 +241,8 @@ def _round(search: Search, hypothesis: Hypothesis, every: Sequence[Candidate]) -
         suspects = tuple(Suspect(case.keys[0], case.share, 0.0) for case in near[:4])
     accepted = best.keys[0] if best else None
     step = Step(rows, listed, refitted, accepted, len(fresh), "share of the squared error", suspects=suspects)
-    return best, step
+    even = [case for case in passing if best and len(case.laws) == 1 and case.share >= EQUIVALENT * best.share]
+    return best, tuple(case.keys[0] for case in even if case is not best), step
 
 
 def _best_of_keys(cases: Sequence[Case]) -> list[Case]:

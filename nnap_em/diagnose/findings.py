@@ -15,7 +15,6 @@ from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..fit.identify import friction_table
 from ..numerics.digits import finite, number, share_of, with_std
-from ..systems import AbstractSystem
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
 from .outcome import Closed
@@ -29,9 +28,7 @@ class Estimate(NamedTuple):
     unit: str
 
 
-def estimates(
-    effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: AbstractSystem
-) -> dict[str, Estimate]:
+def estimates(effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: Any) -> dict[str, Estimate]:
     """The reported parameters of an effect; standard deviations by the delta method from those of its own numbers."""
 
     (values, slopes), unit = _reported(effect), effect.units_on(system)

@@ -214,7 +214,7 @@ def close_the_loop(
     stages: Stages = {}
 
     white = white_readings(data, begin(rig, data, key=key).model)
-    held = rig if white else _held(rig)
+    held = rig if white or rig.equations else _held(rig)
 
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}

@@ -7,14 +7,12 @@ import dataclasses
 import inspect
 import itertools
 from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-from ..systems.base import AbstractSystem
 
 Scalar = Float[Array, ""]
 CHANNEL = "unit of the channel"
@@ -23,7 +21,7 @@ CHANNEL = "unit of the channel"
 class Scene(NamedTuple):
     """State of the machine at one moment, as effects get it."""
 
-    system: AbstractSystem
+    system: Any
     q: Float[Array, " dof"]
     """Coordinates; of equations all states."""
     v: Float[Array, " rate"]
@@ -42,7 +40,7 @@ class Scene(NamedTuple):
 class Around(NamedTuple):
     """Sizes that candidates are built from, all read off the logs and the declared physics."""
 
-    system: AbstractSystem
+    system: Any
     torque: Float[np.ndarray, " dof"]
     """Typical torque of gravity and drive [N m]."""
     speed: Float[np.ndarray, " dof"]
@@ -114,7 +112,7 @@ class Around(NamedTuple):
 
 
 @eqx.filter_jit
-def _still(system: AbstractSystem) -> Float[Array, " dof"]:
+def _still(system: Any) -> Float[Array, " dof"]:
     """Inertia behind every joint with all joints at zero."""
     return jnp.diagonal(system.mass(jnp.zeros(len(system.coordinates))))
 
@@ -221,7 +219,7 @@ class AbstractEffect(eqx.Module):
         """Noun of a sentence with its numbers, as texts by their names; empty where the name of the law serves."""
         return ""
 
-    def units_on(self, system: AbstractSystem) -> dict[str, str]:
+    def units_on(self, system: Any) -> dict[str, str]:
         """Units of the reported parameters on this machine and channel."""
         if self.channel in system.readable:
             return {name: unit.replace(CHANNEL, system.unit(self.channel)) for name, unit in self.units.items()}
@@ -242,7 +240,7 @@ class AbstractEffect(eqx.Module):
         """Arguments of the function, for laws without a name in the vocabulary."""
         return ()
 
-    def signals(self, system: AbstractSystem) -> tuple[str, ...]:
+    def signals(self, system: Any) -> tuple[str, ...]:
         """Arguments of its force at its joint: coordinates, rates, "time", `input_of` a joint."""
         return ()
 
@@ -250,7 +248,7 @@ class AbstractEffect(eqx.Module):
         """The same law with more of a form, to be tried once it is found."""
         return []
 
-    def same_as(self, system: AbstractSystem, measured: tuple[str, ...]) -> tuple[tuple, ...]:
+    def same_as(self, system: Any, measured: tuple[str, ...]) -> tuple[tuple, ...]:
         """Laws that are the same model on this machine, by name, joint, channel and inputs."""
         return ()
 
@@ -258,7 +256,7 @@ class AbstractEffect(eqx.Module):
         """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False
 
-    def curve(self, cov: Float[np.ndarray, "param param"], system: AbstractSystem) -> Curve | None:
+    def curve(self, cov: Float[np.ndarray, "param param"], system: Any) -> Curve | None:
         """A learned function of one signal, its parameters of covariance `cov`; None for a law given by numbers."""
         return None
 
@@ -278,7 +276,7 @@ class AbstractEffect(eqx.Module):
         """Torque of the drive that reaches the joint, at one moment [N m, or N]."""
         return torque
 
-    def physics(self, system: AbstractSystem, time: Scalar) -> AbstractSystem:
+    def physics(self, system: Any, time: Scalar) -> Any:
         """The machine as it truly is."""
         return system
 
@@ -332,7 +330,12 @@ def input_of(joint: int | None) -> str:
 
 def known(**options):
     """A field with a number that no fit moves; an array all the same, so that another number is no other program."""
-    return eqx.field(converter=a, metadata={"known": True}, **options)
+    return eqx.field(converter=_array, metadata={"known": True}, **options)
+
+
+def _array(value: Any) -> Any:
+    """Numbers of any shape as an array of the default precision."""
+    return jnp.asarray(value, float)
 
 
 def fields(effect: AbstractEffect) -> tuple[str, ...]:

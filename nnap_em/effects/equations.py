@@ -47,6 +47,7 @@ class Flow(AbstractEffect):
     """
 
     name: ClassVar[str] = "flow"
+    confirm: ClassVar[str] = "Change one signal of it at a time."
     strength: Scalar
     level: Scalar
     share: Scalar
@@ -109,15 +110,15 @@ class PortEffect(AbstractEffect):
         """Those of its port and signals."""
         signals = [system.unit(name) for name in self.reads]
         port = system.port_unit(system.ports.index(self.channel) + 1)
-        per = [signals[:1], [], signals[:1], signals[:2], signals[:1] * 2, signals[:1], signals[1:2]][self.kind]
-        per = [unit for unit in per if unit] if self.kind else []
+        per = [[], signals[:1], signals[:1], signals[:2], signals[:1] * 2, signals[:1], signals[1:2]][self.kind]
+        per = [unit for unit in per if unit]
         strength = f"{port}/({' '.join(per)})" if len(per) > 1 else f"{port}/{per[0]}" if per else port
         if len(per) == 1 and port == f"{per[0]}/s":
             strength = "1/s"
         return {"strength": strength, "level": signals[0] if signals else "", "share": "-"}
 
     def phrase(self, sizes):
-        """A flow with its signals, level and share, as a reader would say it."""
+        """A flow with its signals, level and share, in words."""
         source = f"out of {self.channel}" if self.leaves else f"into {self.channel}"
         way = f"from {self.channel} to {self.to}" if self.to else source
         form = FORMS[self.kind].format(*self.reads)

@@ -29,6 +29,17 @@ MEANINGS = {
     "eddy_brake": "A brake that works at some angles, as by a magnet.",
     "joint_flexibility": "The transmission between motor and joint gives elastically.",
     "motor_back_emf": "The torque of the motor falls with its speed.",
+    "constant_flow": "A state gains or loses at a constant rate.",
+    "linear_flow": "A state gains or loses in proportion to a signal: a leak where it is its own, else a coupling.",
+    "square_flow": "A state gains or loses with the square of a signal.",
+    "product_flow": "A state gains or loses in proportion to the product of two signals.",
+    "threshold_flow": "A state gains or loses once a signal is above a level.",
+    "exchange": "One state loses to another in proportion to their difference, as heat does.",
+    "transfer": "Above a level one state loses, and another gains a share of it.",
+    "overflow": "Above a level of a state its inflow goes elsewhere, a share of it into another state.",
+    "sensor_bend": "A sensor bends: what it reads is a curve of the value.",
+    "unknown_term": "A rate as a function of these signals, outside the vocabulary of effects.",
+    "flow": "A flow.",
     "unknown_function": "A force as a function of these signals, outside the vocabulary of effects.",
 }
 WORDS = {

@@ -10,6 +10,7 @@ from ..machines.from_file import declare
 from . import acrobot, declared, equations, pendubot, pendulum, slide, tree
 from .base import AbstractSystem
 from .equations import Equations
+from .expression import root
 from .plant import AbstractPlant
 
 systems: dict[str, Any] = {
@@ -75,4 +76,4 @@ def register_equations(
     specs[name] = SystemSpec((), (), {}, 0, declare=partial(declared.declare, of=of))
 
 
-__all__ = ["AbstractPlant", "AbstractSystem", "Equations", "register", "register_equations", "specs", "systems"]
+__all__ = ["AbstractPlant", "AbstractSystem", "Equations", "register", "register_equations", "root", "specs", "systems"]

@@ -13,8 +13,14 @@ Values = Mapping[str, Any]
 TINY = 1e-12
 """Smallest argument of a root or logarithm: below, its value is that here, and its slope 0."""
 
+
+def root(x: Any) -> Any:
+    """Square root, with value and slope 0 below 0: a level that a filter takes below its floor stays finite."""
+    return jnp.where(x > TINY, jnp.sqrt(jnp.maximum(x, TINY)), 0.0)
+
+
 FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
-    "sqrt": (1, lambda x: jnp.where(x > TINY, jnp.sqrt(jnp.maximum(x, TINY)), 0.0)),
+    "sqrt": (1, root),
     "exp": (1, jnp.exp),
     "log": (1, lambda x: jnp.log(jnp.maximum(x, TINY))),
     "abs": (1, jnp.abs),

@@ -1,0 +1,68 @@
+"""A first rig.toml of equations from the columns of a log: what follows the time are inputs, then readings."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.rig import toml_text
+from ..data.units import is_time, named_unit
+from ..em.readings import reading_noise, resolution
+from .from_log import HEAD, Draft, meaning, numbers, sampling
+
+STEPS = 0.5
+"""Share of equal neighbours from which on a column is taken for an input: that of a reading changes in every row."""
+
+
+def draft_equations(path: Path) -> Draft:
+    """The rig.toml for a CSV log, with one state for each reading and rates to be written.
+
+    Raises DataError where the log cannot be read.
+    """
+    table = numbers(path)
+    columns = {name: values for name, values in table.items() if not is_time(name)}
+    inputs = {name for name, values in columns.items() if _input(name, values)}
+    inputs = inputs or set(list(columns)[:1])
+    readings = [name for name in columns if name not in inputs]
+    names = {name: f"x{i}" for i, name in enumerate(readings, 1)}
+    commanded = ", ".join(toml_text(name) for name in columns if name in inputs)
+    lines = [
+        "[model]",
+        'type = "equations"',
+        f'inputs = [{commanded}]    # with units: {{ pump = "V" }}',
+        f'states = [{", ".join(map(toml_text, names.values()))}]    # those not read, too; with units: {{ h1 = "V" }}',
+        "# Derivatives of the states by time [1/s]; a number is trusted, { mean = 0.05, std = 0.03 } is estimated.",
+        '# rates = ...    # such as { x1 = "k*pump - a*sqrt(x1)" }, and then k = { mean = 1.0, std = 1.0 }, ...',
+        *sampling(table, [meaning("time")] if "time" in table else []),
+        "",
+        "[measurement]",
+        f"columns = {{ {', '.join(f'{toml_text(name)} = {toml_text(state)}' for name, state in names.items())} }}",
+        *_ranges({name: columns[name] for name in readings}),
+        "",
+        "[measurement.noise_std]    # read off the high frequencies; what is left out is estimated",
+        *(f"# {toml_text(name)} = {reading_noise(columns[name][None]):.2g}" for name in readings),
+        "",
+        "[start]    # the state in the first row, where it is known but not measured",
+        *(f"# {state} = {{ mean = 0.0, std = 0.5 }}" for state in names.values()),
+    ]
+    head = HEAD.replace("# SI units: s, kg, m, rad, N m.  Fill", "# Units are yours; time is in s.  Fill")
+    units = [f"column {name!r}: its name ends in the unit {unit}" for name in columns if (unit := named_unit(name)[1])]
+    title = toml_text(path.resolve().parent.name or "rig")
+    return Draft("\n".join([head.format(name=title), *lines]) + "\n", tuple(units))
+
+
+def _input(name: str, values: Float[np.ndarray, " time"]) -> bool:
+    """True for a column that is called as an input, or that stands still most of the time."""
+    still = float(np.mean(np.diff(values) == 0)) if len(values) > 1 else 0.0
+    return meaning(name).kind == "input" or (still > STEPS and resolution(values[None]) == 0.0)
+
+
+def _ranges(columns: dict[str, Float[np.ndarray, " time"]]) -> list[str]:
+    """Ends that some readings share, as a comment."""
+    out = {}
+    for name, values in columns.items():
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        if max(np.sum(values == low), np.sum(values == high)) > 3:
+            out[name] = [low, high]
+    text = ", ".join(f"{toml_text(name)} = {ends}" for name, ends in out.items())
+    return [f"# range = {{ {text} }}    # readings at the ends of a sensor's range are not read"] if out else []

@@ -1,0 +1,197 @@
+"""Laws that equations may lack, unknown terms, and the search for them."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nnap_em.data.dataset import pad
+from nnap_em.data.rig import read_rig
+from nnap_em.diagnose.equations import BLOCKS, FOLDS, folds, search_equations
+from nnap_em.draft.equations import draft_equations
+from nnap_em.effects import Scene, catalogue
+from nnap_em.em.equations import free_term, motion, unknown_terms
+from nnap_em.fit.identify import begin, identify
+from nnap_em.model.simulate import paper_model
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.systems import Equations, register_equations, specs
+from nnap_em.systems.acrobot import table_i
+
+PLANT = {
+    "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "a - b"}, "readings": {},
+    "parameters": [], "terms": {}, "enters": {}, "units": {}, "function": "",
+}  # fmt: skip
+
+
+def _pushes(effect, a=2.0, b=0.5, u=3.0):
+    system = Equations({}, json.dumps(PLANT))
+    q, inputs, none = jnp.asarray([a, b]), jnp.asarray([u]), jnp.zeros(2)
+    scene = Scene(system, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
+    return np.asarray(effect.force(scene, jnp.zeros(0)))
+
+
+LAWS = {
+    "constant_flow": (("a", (), None), [0.3, 0.0]),
+    "linear_flow": (("b", ("a",), None), [0.0, 0.3 * 2.0]),
+    "square_flow": (("b", ("a",), None), [0.0, 0.3 * 4.0]),
+    "product_flow": (("a", ("b", "u"), None), [0.3 * 0.5 * 3.0, 0.0]),
+    "threshold_flow": (("b", ("a",), None), [0.0, 0.3 * (2.0 - 1.2)]),
+    "exchange": (("a", ("a", "b"), "b"), [-0.3 * 1.5, 0.3 * 1.5]),
+    "transfer": (("a", ("a",), "b"), [-0.3 * 0.8, 0.7 * 0.3 * 0.8]),
+    "overflow": (("a", ("a", "u"), "b"), [-0.3 * 3.0, 0.7 * 0.3 * 3.0]),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_pushes_as_its_formula_says(name):
+    (port, reads, to), expected = LAWS[name]
+    share = 1.0 if name == "exchange" else 0.7
+    law = catalogue[name](strength=0.3, level=1.2, share=share, edge=1e-3, channel=port, reads=reads, to=to)
+    np.testing.assert_allclose(_pushes(law), expected, rtol=1e-12)
+    below = dataclasses.replace(law, level=jnp.asarray(2.5))
+    assert np.abs(_pushes(below)).max() < 1e-100 or "level" not in law.reports
+
+
+def test_units_of_a_law_are_those_of_its_port_and_signals():
+    system = Equations({}, json.dumps(PLANT))
+    of = lambda name, port, reads: catalogue[name](strength=0.1, channel=port, reads=reads).units_on(system)["strength"]  # noqa: E731
+    assert of("constant_flow", "a", ()) == "m/s"
+    assert of("linear_flow", "a", ("b",)) == "1/s"
+    assert of("linear_flow", "a", ("u",)) == "m/s/V"
+    assert of("product_flow", "a", ("b", "u")) == "m/s/(m V)"
+
+
+def test_a_bent_sensor_reads_a_curve():
+    bend = catalogue["sensor_bend"](jnp.asarray(0.2), low=1.0, high=5.0, channel="a")
+    np.testing.assert_allclose(bend.reading(jnp.asarray(3.0), lambda delay: jnp.nan), 3.0 + 0.2 * 4.0 / 4.0)
+
+
+def test_every_start_is_left_out_once():
+    masks = np.stack(folds((2, 20, 1, 1)))
+    np.testing.assert_array_equal(masks.sum(axis=0), 1)
+    assert len(masks) == FOLDS
+    assert np.count_nonzero(np.diff(masks[0].ravel())) >= BLOCKS // FOLDS
+
+
+# --- with logs
+
+RIG = """format = 1
+name = "r"
+[model]
+type = "equations"
+inputs = { u = "V" }
+states = { a = "V", b = "V" }
+rates = { a = "k*u - a/ta", b = "(a - b)/2" }
+k = { mean = 1.0, std = 0.3 }
+ta = { mean = 4.0, std = 1.0 }
+UNKNOWN
+[sampling]
+dt = 0.5
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = { y = "b", z = "a" }
+"""
+
+
+def _rig(folder: Path, unknown: str = ""):
+    (folder / "rig.toml").write_text(RIG.replace("UNKNOWN", unknown))
+    return read_rig(folder / "rig.toml", specs)
+
+
+def _logs(coupling: float, rows: int = 400, noise: float = 0.02):
+    """Euler steps of a millisecond of the declared equations, and a flow in proportion to b^2 out of a."""
+    rng, dt = np.random.default_rng(1), 0.5
+    u = np.repeat(rng.uniform(0, 2, rows // 10 + 1), 10)[:rows]
+    a, b, out = 1.0, 1.0, []
+    for one in u:
+        out.append((b, a))
+        for _ in range(500):
+            a, b = a + dt / 500 * (1.2 * one - a / 3.5 - coupling * b * b), b + dt / 500 * (a - b) / 2
+    y = np.array(out) + noise * rng.standard_normal((rows, 2))
+    return pad([(dt * np.arange(rows), u[:, None], y)])
+
+
+def test_an_unknown_term_does_not_compete_with_the_parameters(tmp_path):
+    """What its basis does to the rates along the motion is orthogonal to what a change of a parameter does."""
+    data = _logs(0.0)
+    model = begin(_rig(tmp_path), data, key=jax.random.key(0)).model
+    seen = motion(model, data)
+    term = free_term(model.system, seen, ("k", "ta"), "a", ("a", "u"), seen.x.min(axis=0), seen.x.max(axis=0))
+    values = jnp.asarray(np.stack([seen.x[:, 0], seen.u[:, 0]], axis=1))
+    basis = np.asarray(jax.vmap(term.grid)(values)) @ np.asarray(term.basis).T
+    slopes = np.stack([seen.u[:, 0], seen.x[:, 0] / 16.0], axis=1)  # of k u - a / ta at ta = 4
+    size = np.linalg.norm(basis, axis=0)[:, None] * np.linalg.norm(slopes, axis=0)[None]
+    assert np.abs(basis.T @ slopes / np.maximum(size, 1e-9)).max() < 1e-6
+    assert term.weights.shape == (25 - 2,)
+
+
+def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
+    data = _logs(0.0)
+    fitted = begin(
+        _rig(tmp_path, '[model.unknown]\nf = { signals = ["b"], enters = "a" }'), data, key=jax.random.key(0)
+    )
+    (term,) = fitted.model.effects
+    assert (term.channel, term.reads, term.label) == ("a", ("b",), "f")
+    assert fitted.m_step.prior.names == ("k", "ta", "0.weights")
+    system, seen = fitted.model.system, motion(fitted.model, data)
+    assert len(unknown_terms(system, seen, ("k", "ta"))) == 1
+    one = dataclasses.replace(term, weights=jnp.ones_like(term.weights))
+    moved = dataclasses.replace(fitted.model, effects=(one,))
+    x, u = jnp.asarray([1.0, 1.0]), Inputs.held(jnp.asarray([1.0]))
+    rate = lambda model: np.asarray(model.rate(x, u, jnp.zeros(2)))  # noqa: E731
+    added = float(np.sum(np.asarray(term.basis) @ np.asarray(term.grid(x[1:]))))
+    np.testing.assert_allclose(rate(moved) - rate(fitted.model), [added, 0.0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
+def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names):
+    data = _logs(coupling)
+    before = identify(_rig(tmp_path), data, key=jax.random.key(0))
+    closed = search_equations(before, data, lambda text: None)
+    assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
+
+
+def test_an_acrobot_as_equations_moves_as_the_built_in_one():
+    """To 1e-12, friction included."""
+    built = paper_model()
+
+    def rate(x, u, p):
+        m22, c2 = p.I2 + p.m2 * p.lc2**2, p.m2 * p.l1 * p.lc2
+        m12 = m22 + c2 * jnp.cos(x.theta2)
+        m11 = p.I1 + p.m1 * p.lc1**2 + p.m2 * p.l1**2 + m12 + c2 * jnp.cos(x.theta2)
+        outer = p.m2 * p.lc2 * p.g * jnp.sin(x.theta1 + x.theta2)
+        h = c2 * jnp.sin(x.theta2)
+        friction = built.unknown(jnp.stack([x.dtheta1, x.dtheta2]))
+        f1 = friction[0] + h * x.dtheta2 * (2 * x.dtheta1 + x.dtheta2) - outer
+        f1 = f1 - (p.m1 * p.lc1 + p.m2 * p.l1) * p.g * jnp.sin(x.theta1)
+        f2 = u.u + friction[1] - outer - h * x.dtheta1**2
+        free = m11 * m22 - m12**2
+        a1, a2 = (m22 * f1 - m12 * f2) / free, (m11 * f2 - m12 * f1) / free
+        return {"theta1": x.dtheta1, "theta2": x.dtheta2, "dtheta1": a1, "dtheta2": a2}
+
+    states = {"theta1": "rad", "theta2": "rad", "dtheta1": "rad/s", "dtheta2": "rad/s"}
+    register_equations("test_acrobot", rate, states=states, inputs={"u": "N m"}, parameters=tuple(table_i))
+    text = {**PLANT, "states": states, "inputs": {"u": "N m"}, "rates": {}, "function": "test_acrobot"}
+    text |= {"parameters": list(table_i)}
+    system = Equations({name: jnp.asarray(value) for name, value in table_i.items()}, json.dumps(text))
+    model = StateSpaceModel(system, lambda v: v, built.start, built.log_q, built.log_r, (0, 2), built.dt)
+    for seed in range(5):
+        x = jax.random.normal(jax.random.key(seed), (4,)) * jnp.asarray([2.0, 2.0, 4.0, 6.0])
+        u = Inputs.held(jnp.asarray([0.2]))
+        np.testing.assert_allclose(model.transition(x, u), built.transition(x, u), rtol=1e-12, atol=1e-12)
+
+
+def test_a_draft_of_equations_needs_only_the_rates(tmp_path):
+    rows = "\n".join(f"{0.5 * i},{i // 20},{np.sin(i / 9):.6f}" for i in range(200))
+    (tmp_path / "log.csv").write_text(f"time,pump,level\n{rows}\n")
+    draft = draft_equations(tmp_path / "log.csv")
+    assert draft.missing == {"model": ["rates"]}
+    text = draft.text.replace("# rates = ...", 'rates = { x1 = "0.1*pump - x1" }')
+    (tmp_path / "rig.toml").write_text(text)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert (rig.input_columns, rig.measured, rig.dt) == (("pump",), ("level",), 0.5)

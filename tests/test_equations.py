@@ -195,11 +195,14 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(tmp_path):
     data = _chain()
     fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
     prior = fitted.m_step.prior
-    here = simulated.simulated(fitted.model, prior, data)
+    begin_at = simulated.filtered(fitted.model, data)
+    here = simulated.simulated(fitted.model, prior, data, begin_at)
     assert np.isfinite(here.error).all()
     for i, step in enumerate(1e-5 * np.eye(2)):
         ahead, behind = (
-            simulated.simulated(prior.write(fitted.model, jnp.asarray(here.z + sign * step)), prior, data).error
+            simulated.simulated(
+                prior.write(fitted.model, jnp.asarray(here.z + sign * step)), prior, data, begin_at
+            ).error
             for sign in (1, -1)
         )
         np.testing.assert_allclose(here.columns[..., i], -(ahead - behind) / 2e-5, rtol=1e-5, atol=1e-7)

@@ -110,6 +110,8 @@ def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
     model, prior = fitted.model, fitted.m_step.prior
     nodes = fitted.m_step.weights(model).nodes
     deviations = phi_samples(fitted, count, key=key)
+    if not model.system.coordinates:
+        deviations = deviations.at[0].set(0.0)
     tables = deviations[:, : nodes.size].reshape(count, *nodes.shape)
     return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
 
@@ -125,11 +127,16 @@ def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Arra
     spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
     start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
     kick = jax.random.normal(key_noise, (mean.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
+    nominal = not model.system.coordinates  # the first path is that of the model itself, and the mean
+    if nominal:
+        start, kick = start.at[0].set(mean[last]), kick.at[:, 0].set(0.0)
 
     def step(x, slices):
         k, u, kick = slices
         following, shown = common.advance(x, u)
         x = jnp.where(k >= last, following + kick, x)
+        if nominal:
+            return x, (shown[0], jnp.sqrt(jnp.nanmean((shown - shown[:1]) ** 2, axis=0)))
         return x, (jnp.mean(shown, axis=0), jnp.std(shown, axis=0))
 
     _, (m, s) = jax.lax.scan(step, start, (rows, u, kick))
@@ -160,7 +167,8 @@ def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArra
     """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
 
     Uncertainty of the present state, of friction and parameters, and process noise are in it; measurement noise is
-    not.
+    not. The mean is that of sample paths, of equations the path of the model itself: over many time constants paths
+    with wide parameters and noise are no more what equations are used for.
     """
     known = given_samples(data, given)
     posterior = smooth(fitted, data._replace(valid=known))

@@ -161,7 +161,8 @@ def verdict(
         )
     column, before, after = ratios[0]
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
-    falls = f"the {horizon} prediction error of {column} falls from {before:.3g} to {after:.3g}"
+    of = "error of a free simulation" if "judged_s" in error else f"{horizon} prediction error"
+    falls = f"the {of} of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
 
 

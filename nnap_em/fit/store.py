@@ -178,7 +178,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
             # numbers that effects and models have had since
-            since = "/effects/" in place or place.endswith(("/servos", "/unknown/rest", "/stop", "/quiet", "/horizon_note"))
+            later = ("/servos", "/unknown/rest", "/stop", "/quiet", "/horizon_note")
+            since = "/effects/" in place or place.endswith(later)
             return (
                 value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
             )

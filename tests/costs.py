@@ -30,6 +30,8 @@ SECONDS = {
     "test_em.py": 38,
     "test_screen.py": 36,
     "test_effects.py": 32,
+    "test_equation_laws.py": 60,
+    "test_equations.py": 30,
     "test_import.py": 31,
     "test_shapes.py": 30,
     "test_payload.py": 30,

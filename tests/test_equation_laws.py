@@ -11,6 +11,7 @@ import pytest
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnose import equations
 from nnap_em.diagnose.equations import BLOCKS, FOLDS, folds, search_equations
 from nnap_em.draft.equations import draft_equations
 from nnap_em.effects import Scene, catalogue
@@ -149,7 +150,8 @@ def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
 
 
 @pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
-def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names):
+def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names, monkeypatch):
+    monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 300
     data = _logs(coupling)
     before = identify(_rig(tmp_path), data, key=jax.random.key(0))
     closed = search_equations(before, data, lambda text: None)

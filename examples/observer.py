@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 import nnap_em
 
 STIFFNESS, DAMPING, MOST = 1.5, 0.12, 0.8
-"""Of the controller [N m/rad, N m s/rad], and its largest torque [N m]."""
+"""Gains of the controller [N m/rad, N m s/rad], and its largest torque [N m]."""
 PUSH = 5.0
 """Time of the push, of 3 rad/s on the elbow [s]."""
 

@@ -12,13 +12,14 @@ import pytest
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnose import equations
-from nnap_em.diagnose.equations import BLOCKS, FOLDS, folds, search_equations
+from nnap_em.diagnose.equations import FOLDS, folds, search_equations
 from nnap_em.draft.equations import draft_equations
 from nnap_em.effects import Scene, catalogue
 from nnap_em.em.equations import free_term, motion, unknown_terms
 from nnap_em.fit.identify import begin, identify
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.prediction_error.multistep import Grid
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.acrobot import table_i
 
@@ -71,11 +72,15 @@ def test_a_bent_sensor_reads_a_curve():
     np.testing.assert_allclose(bend.reading(jnp.asarray(3.0), lambda delay: jnp.nan), 3.0 + 0.2 * 4.0 / 4.0)
 
 
-def test_every_start_is_left_out_once():
-    masks = np.stack(folds((2, 20, 1, 1)))
+def test_a_reading_is_in_one_part_whichever_start_predicts_it():
+    at = Grid(2, (10, 20))
+    masks = np.stack(folds(at, 2, 100))
     np.testing.assert_array_equal(masks.sum(axis=0), 1)
-    assert len(masks) == FOLDS
-    assert np.count_nonzero(np.diff(masks[0].ravel())) >= BLOCKS // FOLDS
+    assert masks.shape == (FOLDS, 2, len(at.starts(100)), 2, 1)
+    row = at.starts(100)[:, None] + np.asarray(at.ages)[None]
+    for part in masks[..., 0]:
+        for sequence in part:
+            assert not set(row[sequence]) & set(row[~sequence])
 
 
 # --- with logs
@@ -118,7 +123,7 @@ def _logs(coupling: float, rows: int = 400, noise: float = 0.02):
 
 
 def test_an_unknown_term_does_not_compete_with_the_parameters(tmp_path):
-    """What its basis does to the rates along the motion is orthogonal to what a change of a parameter does."""
+    """The changes of the rates by its basis, along the motion, are orthogonal to those by the parameters."""
     data = _logs(0.0)
     model = begin(_rig(tmp_path), data, key=jax.random.key(0)).model
     seen = motion(model, data)

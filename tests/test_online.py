@@ -201,7 +201,7 @@ def test_numbers_that_a_program_may_change(plain):
 
 
 def test_an_fmu_is_valid_and_plays_as_the_observer(plain, tmp_path):
-    """What it shows at the end of a step is the prediction there from the readings of its beginning."""
+    """The outputs at the end of a step are the prediction there from the readings of its beginning."""
     fmpy = pytest.importorskip("fmpy")
     from fmpy.validation import validate_fmu
 

@@ -403,7 +403,7 @@ def test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readin
 
 @pytest.mark.parametrize(("worth", "name"), [(0.5, "air_drag"), (0.55, "air_drag"), (0.56, "dead_zone")])
 def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth, name):
-    """Of a law that removes half of the error, by what removes more than ten ninths of that."""
+    """A law that removes half of the error gives way to one that removes more than ten ninths of that."""
     law = _law("dead_zone", 1.0)
     other = _case(law, worth)._replace(after=BARE.plus(law, _candidate("dead_zone")))
     other = other._replace(refit=Refit(other.after.model, RULE, None, np.zeros(6), None))

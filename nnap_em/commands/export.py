@@ -20,7 +20,7 @@ from .common import require_joints
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
-    for option in ("mjcf", "urdf", "c"):
+    for option in ("mjcf", "urdf", "c", "observer", "fmu"):
         if getattr(args, option) is not None:
             require_joints(fitted.rig, f"--{option}")
     if args.mjcf is not None:

@@ -23,6 +23,7 @@ from ..em.equations import motion
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..prediction_error import simulated
+from ..prediction_error.multistep import Grid
 from ..storage.log import Log
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, words
@@ -35,7 +36,7 @@ SHARE, PAIR = 0.15, 0.3
 SUSPECT = 0.08
 """Share from which on a law is listed as a suspect."""
 FOLDS, BLOCKS = 4, 8
-"""Parts that are left out in turn, each of every fourth block of the starts."""
+"""Parts that are left out in turn, each of every fourth block of the rows."""
 SHORTLIST, PARTNERS, JUDGED = 8, 30, 16
 """Laws that are judged on parts left out, laws of which pairs are tried, and pairs that are judged."""
 MOST = 3
@@ -101,8 +102,8 @@ class Search(NamedTuple):
                 cases[i] = Case(tuple(every[i][0]), of, self.loss(of) + float(of.z @ of.z))
         return [cases[i] for i in range(len(every))]
 
-    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq start 1 1"] | None = None) -> float:
-        """Squared error of the starts that count."""
+    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq start #horizon 1"] | None = None) -> float:
+        """Squared error of the predictions that count."""
         known = simulated.observed(of)
         return simulated.cost(of.error, self.scale, known if counts is None else known & counts)
 
@@ -117,16 +118,19 @@ class Search(NamedTuple):
     def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> list[list[float]]:
         """Squared errors of every case on every part by the fit to the others."""
         every, out = [(case.laws, case.effects) for case in cases], [[] for _ in cases]
-        for counts in folds(cases[0].of.error.shape) if cases else ():
+        for counts in folds(simulated.grid(self.before.model, self.data), *self.data.t.shape) if cases else ():
             for errors, case in zip(out, self.fit(hypothesis, every, counts=~counts, steps=STEPS), strict=True):
                 errors.append(self.loss(case.of, counts))
         return out
 
 
-def folds(shape: tuple[int, ...]) -> list[Bool[np.ndarray, "seq start 1 1"]]:
-    """Masks of the starts of every part; blocks go on over all sequences."""
-    block = np.arange(shape[0] * shape[1]) * BLOCKS // max(shape[0] * shape[1], 1)
-    return [(block % FOLDS == part).reshape(shape[0], shape[1], 1, 1) for part in range(FOLDS)]
+def folds(at: Grid, sequences: int, rows: int) -> list[Bool[np.ndarray, "seq start horizon 1"]]:
+    """Masks of the errors of every part, by the rows whose readings are predicted: a fit without a part has none of
+    its readings, although predictions that it counts pass over it.  Blocks go on over all sequences.
+    """
+    row = at.starts(rows)[:, None] + np.asarray(at.ages)[None]
+    block = (np.arange(sequences)[:, None, None] * rows + row) * BLOCKS // (sequences * rows)
+    return [(block % FOLDS == part)[..., None] for part in range(FOLDS)]
 
 
 def _lean(effect: AbstractEffect, search: Search) -> AbstractEffect:

@@ -118,9 +118,11 @@ def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cub
 
     `branches`: Gaussians at most, where an angle is not read; one where all are.  A reading that depends on the input
     of its own row, an acceleration, counts one row later.
-    Raises ValueError where a law of the command has no form for one row.
+    Raises ValueError where a law of the command has no form for one row, and for a rig that is written as equations.
     """
     rig, model = fitted.rig, fitted.model
+    if rig.equations:
+        raise ValueError(f"observer: rig {rig.name!r} is written as equations; this needs a machine with joints")
     return Observer(
         *functions(model, fitted.bank.angles, restart_prior(model), branches if fitted.bank.angles else 1, linearise),
         model.system.coordinates + model.system.rates,

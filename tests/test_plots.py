@@ -11,7 +11,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.effects.base import Curve
 from nnap_em.fit.identify import FrictionTable
-from nnap_em.fit.predict import Prediction
+from nnap_em.fit.predict import GIVEN, Prediction
 from nnap_em.report.diagnosis import _prediction_pictures
 from nnap_em.report.effect_plots import effect_figure, screen_figure
 from nnap_em.report.error_plots import error_figure, prediction_figure
@@ -86,9 +86,10 @@ def test_the_longest_test_sequences_are_those_to_choose_from():
     data = Dataset(residual.t, residual.u, residual.state, valid)
     files = tuple(f"{n}.csv" for n in length)
     prediction = Prediction(jnp.asarray(residual.state), jnp.ones_like(residual.state), jnp.asarray(valid))
-    pictures = _prediction_pictures({"before": prediction}, names, Logs(files, data, ()))
+    pictures = _prediction_pictures({"before": prediction}, names, Logs(files, data, ()), GIVEN)
     assert [picture.choice for picture in pictures] == ["200.csv", "100.csv", "90.csv", "80.csv", "70.csv"]
-    (alone,) = _prediction_pictures({"before": prediction}, names, Logs(files[:1], Dataset(*(a[:1] for a in data)), ()))
+    one = Logs(files[:1], Dataset(*(a[:1] for a in data)), ())
+    (alone,) = _prediction_pictures({"before": prediction}, names, one, GIVEN)
     assert alone.choice == ""
 
 
@@ -96,11 +97,11 @@ def test_sequences_for_which_a_page_has_no_room_are_left_out(monkeypatch):
     residual, names = _residual(1), _names(1)
     prediction = Prediction(*(jnp.asarray(a) for a in (residual.state, np.ones_like(residual.state), residual.valid)))
     logs = Logs(tuple("abcdefgh"), Dataset(residual.t, residual.u, residual.state, residual.valid), ())
-    whole = _prediction_pictures({"before": prediction}, names, logs)
+    whole = _prediction_pictures({"before": prediction}, names, logs, GIVEN)
     for count in (1, 3):
         room = sum(len(picture.image) for picture in whole[:count]) + 1
         monkeypatch.setattr("nnap_em.report.diagnosis.ROOM", room)
-        assert len(_prediction_pictures({"before": prediction}, names, logs)) == count
+        assert len(_prediction_pictures({"before": prediction}, names, logs, GIVEN)) == count
 
 
 def test_a_rounded_drawing_is_smaller_and_in_the_same_places():

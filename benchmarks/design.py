@@ -31,10 +31,10 @@ import nnap_em
 from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.limits import Bounds
-from nnap_em.design.criteria import after
-from nnap_em.design.experiment import Design, design_experiment
-from nnap_em.design.rivals import Law, Rivals
-from nnap_em.diagnose.rivals import instead
+from nnap_em.diagnosis.rivals import instead
+from nnap_em.experiment.criteria import after
+from nnap_em.experiment.experiment import Design, design
+from nnap_em.experiment.rivals import Law, Rivals
 from nnap_em.fit.identify import Identified, friction_table, identify
 from nnap_em.storage.files import cores, replace_text
 
@@ -51,14 +51,14 @@ def logs(case: plant.Case, folder: Path):
     return rig, nnap_em.read_logs(folder / "train", rig).data
 
 
-def play(case: plant.Case, design: Design, seed: int) -> tuple[np.ndarray, Dataset]:
+def play(case: plant.Case, designed: Design, seed: int) -> tuple[np.ndarray, Dataset]:
     """What the machine does with a design: its states, and the logs of it."""
     machine, rng = plant.build(case), np.random.default_rng([seed, 7])
-    u = design.u[..., 0]
-    start = design.start + rng.standard_normal(design.start.shape) * [0.03, 0.03, 0.0, 0.0]
+    u = designed.u[..., 0]
+    start = designed.start + rng.standard_normal(designed.start.shape) * [0.03, 0.03, 0.0, 0.0]
     x = plant.simulate(machine, start, u, np.zeros(len(u)), case.process * rng.standard_normal((*u.shape, machine.dof)))
     y = plant.readings(machine._replace(case=case._replace(seed=10_000 + seed)), x)
-    return x, pad([(design.t, a[:, None], b) for a, b in zip(u, y, strict=True)])
+    return x, pad([(designed.t, a[:, None], b) for a, b in zip(u, y, strict=True)])
 
 
 def joined(*parts: Dataset) -> Dataset:
@@ -80,10 +80,10 @@ def near_rest(case: plant.Case, fitted: Identified, grid: np.ndarray) -> dict[st
     return {"stated": rms(table.std), "true": rms(np.asarray(table.torque) - truth)}
 
 
-def expected(design: Design, information, grid: np.ndarray) -> list[float]:
+def expected(designed: Design, information, grid: np.ndarray) -> list[float]:
     """The band that a design promises, rms over `grid`."""
-    nodes = np.asarray(design.fit.nodes)
-    cov = after(np.asarray(design.fit.cov), information.information)[: nodes.size, : nodes.size]
+    nodes = np.asarray(designed.fit.nodes)
+    cov = after(np.asarray(designed.fit.cov), information.information)[: nodes.size, : nodes.size]
     out = []
     for j, v in enumerate(grid):
         weights = np.stack([np.interp(v, nodes[j], row) for row in np.eye(nodes.shape[1])], axis=1)
@@ -92,11 +92,11 @@ def expected(design: Design, information, grid: np.ndarray) -> list[float]:
     return out
 
 
-def broken(design: Design, x: np.ndarray) -> list[bool]:
+def broken(designed: Design, x: np.ndarray) -> list[bool]:
     """Which sequences leave the limits."""
-    low, high = design.limits.lowest, design.limits.highest
-    u, most = design.u, design.limits.rate * (design.t[1] - design.t[0])
-    tame = (u >= design.limits.low - 1e-9).all((1, 2)) & (u <= design.limits.high + 1e-9).all((1, 2))
+    low, high = designed.limits.lowest, designed.limits.highest
+    u, most = designed.u, designed.limits.rate * (designed.t[1] - designed.t[0])
+    tame = (u >= designed.limits.low - 1e-9).all((1, 2)) & (u <= designed.limits.high + 1e-9).all((1, 2))
     tame &= (np.abs(np.diff(u, axis=1)) <= most + 1e-9).all((1, 2))
     return (~(tame & (x >= low).all((1, 2)) & (x <= high).all((1, 2)))).tolist()
 
@@ -118,17 +118,20 @@ def friction(seed: int, out: Path, quick: bool = False, rate: float | None = Non
     first, key = some(data, slice(SEQUENCES)), jax.random.key(seed)
     (base,) = allowed([identify(rig, first, key=key)], first, rate)
     began = time.perf_counter()
-    design = design_experiment(base, first, key=key, question="friction", seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
+    designed = design(base, first, key=key, question="friction", seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
     seconds = time.perf_counter() - began
-    _, new = play(case, design, seed)
+    _, new = play(case, designed, seed)
     fits = {"first": base, "more": identify(rig, data, key=key), "designed": identify(rig, joined(first, new), key=key)}
-    grid = np.linspace(-design.slow, design.slow, 41).T
-    plays = [b for n in range(PLAYS) for b in broken(design, play(case, design, 100 * seed + n)[0])]
+    grid = np.linspace(-designed.slow, designed.slow, 41).T
+    plays = [b for n in range(PLAYS) for b in broken(designed, play(case, designed, 100 * seed + n)[0])]
     return {
         "seed": seed,
         "design_s": seconds,
         **{name: near_rest(case, fitted, grid) for name, fitted in fits.items()},
-        "expected": {"designed": expected(design, design.expected, grid), "more": expected(design, design.old, grid)},
+        "expected": {
+            "designed": expected(designed, designed.expected, grid),
+            "more": expected(designed, designed.old, grid),
+        },
         "broken": int(np.sum(plays)),
         "plays": len(plays),
     }
@@ -210,14 +213,17 @@ def _discriminated(
     pair = Rivals((str(laws[own]), str(laws[other])), fits[own], fits[other])
     began = time.perf_counter()
     fits = allowed(fits, first, rate)
-    design = design_experiment(
+    designed = design(
         fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
     )
-    assert design.apart is not None
-    seconds, (_, new) = time.perf_counter() - began, play(case, design, seed)
+    assert designed.apart is not None
+    seconds, (_, new) = time.perf_counter() - began, play(case, designed, seed)
     leads = ahead(rig, joined(first, new), laws, key)[0]
     more = math.nan if quick else ahead(rig, data, laws, key)[0]
-    far = {side: design.apart.distance(t).tolist() for side, t in (("designed", design.expected), ("old", design.old))}
+    far = {
+        side: designed.apart.distance(t).tolist()
+        for side, t in (("designed", designed.expected), ("old", designed.old))
+    }
     return row | {"more": more, "designed": leads, "distance": far, "design_s": seconds}
 
 

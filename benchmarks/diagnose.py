@@ -33,8 +33,8 @@ import plant
 from nnap_em.commands.common import set_up
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose.findings import entry, findings
-from nnap_em.diagnose.search import close_the_loop
+from nnap_em.diagnosis.findings import entry, findings
+from nnap_em.diagnosis.search import diagnose
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.storage.files import replace_text
 from nnap_em.systems import specs
@@ -115,10 +115,10 @@ def run(name: str, out: Path) -> None:
         rig = read_rig(folder / "rig.toml", specs)
         train, test = (read_logs(folder / part, rig).data for part in ("train", "test"))
         began = time.perf_counter()
-        closed = close_the_loop(rig, train, key=jax.random.key(0), log=record["log"].append)
-        reported = findings(closed)
+        diagnosis = diagnose(rig, train, key=jax.random.key(0), log=record["log"].append)
+        reported = findings(diagnosis)
         error = {}
-        for side, fitted in (("before", closed.before), ("after", closed.after)):
+        for side, fitted in (("before", diagnosis.before), ("after", diagnosis.after)):
             prediction = predict(fitted, test, 1.0, key=jax.random.key(0))
             error[side] = horizon_errors(prediction, fitted, test, 1.0)
         record["seconds"] = time.perf_counter() - began

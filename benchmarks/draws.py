@@ -23,11 +23,11 @@ import numpy as np
 
 from nnap_em.commands.common import set_up
 from nnap_em.data.formats import read_csv
+from nnap_em.export.draws import TABLE, write_draws
 from nnap_em.fit.identify import Identified, identify
 from nnap_em.fit.predict import Paths, drawn_paths
 from nnap_em.model.simulate import Experiment, declared, examples, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.portable.draws import TABLE, write_draws
 
 SEQUENCES, TESTS, STEPS = 8, 20, 300
 """Recordings of a fit, recordings of its test, and intervals of each."""

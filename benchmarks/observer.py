@@ -25,12 +25,12 @@ from observer_c import SANITIZED, held, paper_rig, play, replay, rough, wild
 import nnap_em
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
+from nnap_em.export.online import write_observer
 from nnap_em.fit.identify import Identified, begin, identify
 from nnap_em.fit.observer import RESTARTED, Observer, functions, observer, restart_prior
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.portable.online import write_observer
 from nnap_em.smoother.kalman import CUBATURE
 
 

@@ -24,8 +24,8 @@ from machines import arm
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Rig, read_rig
-from nnap_em.diagnose.findings import findings
-from nnap_em.diagnose.search import close_the_loop
+from nnap_em.diagnosis.findings import findings
+from nnap_em.diagnosis.search import diagnose
 from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.systems import specs
 
@@ -142,7 +142,7 @@ def searched(folder: Path, joints: int, shape: tuple[int, int], seed: int, undec
         limit = LIMIT * float(np.abs(KP[0] * (free.u - free.y) - KD[0] * rate)[..., 0].max())
     data = simulated(path, joints, *shape, seed, undeclared, limit)
     began = time.perf_counter()
-    reported = findings(close_the_loop(rig, data, key=jax.random.key(seed)))
+    reported = findings(diagnose(rig, data, key=jax.random.key(seed)))
     laws = "; ".join(
         f"{one.effect.name} of joint {one.effect.joint} "
         + ", ".join(f"{name} {number.value:.4g} ± {number.std:.1g}" for name, number in one.parameters.items())

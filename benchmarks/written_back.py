@@ -24,7 +24,7 @@ from nnap_em import identify
 from nnap_em.commands.common import set_up
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
-from nnap_em.portable.mjcf import write_mjcf
+from nnap_em.export.mjcf import write_mjcf
 from nnap_em.systems import specs
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))

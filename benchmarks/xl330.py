@@ -33,8 +33,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, read_rig
-from nnap_em.diagnose.findings import findings
-from nnap_em.diagnose.search import close_the_loop
+from nnap_em.diagnosis.findings import findings
+from nnap_em.diagnosis.search import diagnose
 from nnap_em.effects.base import AbstractEffect, a
 from nnap_em.effects.friction import LoadFriction
 from nnap_em.effects.mounting import BaseTilt
@@ -162,7 +162,7 @@ def fitted(rig: Rig, folder: Path, laws: tuple[AbstractEffect, ...], search: flo
     """The fit of the six logs, with `laws`, or with those that a search of some seconds finds."""
     data, key = read_logs(folder / "train", rig).data, jax.random.key(seed)
     if search:
-        outcome = close_the_loop(rig, data, key=key, seconds=search, log=print)
+        outcome = diagnose(rig, data, key=key, seconds=search, log=print)
         for finding in findings(outcome):
             numbers = ", ".join(f"{name} {x.value:.4g} ± {x.std:.1g}" for name, x in finding.parameters.items())
             print(f"found: {finding.effect.name} {numbers}", flush=True)

@@ -14,7 +14,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
-from nnap_em.portable.placement import PLACES, REASONS
+from nnap_em.export.placement import PLACES, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -84,7 +84,7 @@ def _place(name: str) -> str:
 
 def verdict() -> str:
     """A row for each number that decides whether an effect enters a model or leaves it."""
-    body = ast.parse((ROOT / "nnap_em/diagnose/verdict.py").read_text()).body
+    body = ast.parse((ROOT / "nnap_em/diagnosis/verdict.py").read_text()).body
     rows = ["| number | value | meaning |", "| --- | --- | --- |"]
     for number, text in itertools.pairwise(body):
         if isinstance(number, ast.Assign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):

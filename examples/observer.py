@@ -46,7 +46,7 @@ class Run(NamedTuple):
         return float(np.sqrt(np.mean((self.true[:, 1] - self.target) ** 2)))
 
 
-def closed_loop(case: plant.Case, online: nnap_em.Observer, seconds: float, seed: int, reads: bool) -> Run:
+def closed_loop(case: plant.Case, online: nnap_em.results.Observer, seconds: float, seed: int, reads: bool) -> Run:
     """The plant under the controller; `reads`: with readings, else the observer is the model alone."""
     true, rng, rows = plant.build(case), np.random.default_rng([seed, 48]), round(seconds / plant.DT)
     start = np.array([[1.0, plant.THETA2_STD * rng.standard_normal(), 0.0, 0.0]])
@@ -100,8 +100,8 @@ def main() -> int:
     rig = nnap_em.read_rig(args.out / "rig" / "rig.toml", nnap_em.specs)
     fitted = nnap_em.identify(rig, nnap_em.read_logs(args.out / "rig" / "train", rig).data, key=jax.random.key(0))
     nnap_em.save(args.out / "fit" / "model.npz", fitted)
-    nnap_em.write_observer(fitted, args.out / "arm.c")
-    nnap_em.write_fmu(fitted, args.out / "arm.fmu")
+    nnap_em.export.write_observer(fitted, args.out / "arm.c")
+    nnap_em.export.write_fmu(fitted, args.out / "arm.fmu")
     online = nnap_em.observer(fitted)
     runs = {
         name: closed_loop(case, online, args.seconds, args.seed, reads)

@@ -79,11 +79,11 @@ friction_figure({"as declared": nnap_em.friction_table(fitted, velocity)}, names
 # %% [markdown]
 # ## A finding
 #
-# `close_the_loop` fits, searches the catalogue of effects for what the declared physics lacks, adds it, and fits again.
+# `diagnose` fits, searches the catalogue of effects for what the declared physics lacks, adds it, and fits again.
 
 # %%
-closed = nnap_em.close_the_loop(rig, train.data, key=jax.random.key(0))
-found = nnap_em.findings(closed)
+diagnosis = nnap_em.diagnose(rig, train.data, key=jax.random.key(0))
+found = nnap_em.findings(diagnosis)
 for finding in found:
     print(finding.sentence)
 
@@ -91,7 +91,7 @@ for finding in found:
 # The truth is 30 N/m about 0.05 m. This is the force that the declared model lacks, against the position:
 
 # %%
-left = residual(closed.after, train.data)
+left = residual(diagnosis.after, train.data)
 figure = Figure(figsize=(5, 3), layout="constrained")
 axes = figure.subplots()
 axes.plot(left.state[..., 0].ravel(), left.partial_force[..., 0].ravel(), ".", color="#8A8A8A", ms=2)
@@ -113,7 +113,7 @@ def errors(model):
 
 
 horizons = (0.1, 0.2, 0.4, 0.5)
-error = {"horizons_s": horizons, "before": errors(closed.before), "after": errors(closed.after)}
+error = {"horizons_s": horizons, "before": errors(diagnosis.before), "after": errors(diagnosis.after)}
 error_figure(error, names)
 
 # %% [markdown]
@@ -122,8 +122,8 @@ error_figure(error, names)
 # Which inputs should the machine play next, so that its friction near rest is known better?
 
 # %%
-design = nnap_em.design_experiment(
-    closed.after, train.data, key=jax.random.key(2), question="friction", seconds=4.0, sequences=2
+design = nnap_em.design(
+    diagnosis.after, train.data, key=jax.random.key(2), question="friction", seconds=4.0, sequences=2
 )
 figure = Figure(figsize=(5, 3), layout="constrained")
 axes = figure.subplots()

@@ -1,6 +1,8 @@
 """Identify what a physics model of a machine does not know, from logs, and find what it lacks.
 
-The names below are loaded at their first use, so that `import nnap_em` costs nothing and sets nothing up.
+The main jobs are functions of the package; the rest is in `smoothers`, `export`, `systems`, `results`, `errors`,
+`paper` and `parallel`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing and sets nothing
+up.
 """
 
 import importlib
@@ -9,82 +11,34 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .comparison.compare import CompareError, Comparison, compare
-    from .data.dataset import DataError, Dataset, pad
-    from .data.logs import DataWarning, Logs, read_logs
-    from .data.rig import Rig, RigError, RigWarning, read_rig, write_rig
-    from .design.experiment import Design, design_experiment
-    from .design.limits import DesignError
-    from .diagnose.findings import Finding, findings
-    from .diagnose.outcome import Closed
-    from .diagnose.search import close_the_loop
-    from .em.loop import EMState, FitError, Schedule
-    from .fit.branches import Branch, branches
+    from . import errors, export, paper, parallel, results, smoothers, systems
+    from .comparison.compare import compare
+    from .data.dataset import Dataset, pad
+    from .data.logs import read_logs
+    from .data.rig import Rig, read_rig, write_rig
+    from .diagnosis.findings import findings
+    from .diagnosis.outcome import Diagnosis
+    from .diagnosis.search import diagnose
+    from .experiment.experiment import design
     from .fit.identify import Identified, friction_table, identify, parameter_table
-    from .fit.observer import Observation, Observer, observer
-    from .fit.predict import Prediction, horizon_errors, predict, smooth
+    from .fit.observer import observer
+    from .fit.predict import horizon_errors, predict, smooth
     from .fit.store import load, save
-    from .identifiability.check import CheckResult, check
-    from .model.friction import FrictionNetwork
-    from .model.simulate import Experiment, examples, paper_experiment, paper_model, simulate
-    from .model.state_space import StateSpaceModel
-    from .numerics.parallel import all_devices, over
-    from .portable.c99 import write_c
-    from .portable.draws import write_draws
-    from .portable.export import ExportError, export
-    from .portable.fmu import write_fmu
-    from .portable.mjcf import write_mjcf
-    from .portable.online import write_observer
-    from .portable.urdf import write_urdf
-    from .smoother.gaussian import ExtendedKalmanSmoother
-    from .smoother.mixture import MixtureSmoother
-    from .smoother.particle import ParticleSmoother
-    from .smoother.posterior import Posterior
-    from .storage.files import StoreError
-    from .systems import AbstractPlant, AbstractSystem, register, register_equations, root, specs
+    from .identifiability.check import check
+    from .model.simulate import simulate
+    from .systems import register, register_equations, specs
 
 __all__ = [
-    "AbstractPlant",
-    "AbstractSystem",
-    "Branch",
-    "CheckResult",
-    "Closed",
-    "CompareError",
-    "Comparison",
-    "DataError",
-    "DataWarning",
     "Dataset",
-    "Design",
-    "DesignError",
-    "EMState",
-    "Experiment",
-    "ExportError",
-    "ExtendedKalmanSmoother",
-    "Finding",
-    "FitError",
-    "FrictionNetwork",
+    "Diagnosis",
     "Identified",
-    "Logs",
-    "MixtureSmoother",
-    "Observation",
-    "Observer",
-    "ParticleSmoother",
-    "Posterior",
-    "Prediction",
     "Rig",
-    "RigError",
-    "RigWarning",
-    "Schedule",
-    "StateSpaceModel",
-    "StoreError",
     "__version__",
-    "all_devices",
-    "branches",
     "check",
-    "close_the_loop",
     "compare",
-    "design_experiment",
-    "examples",
+    "design",
+    "diagnose",
+    "errors",
     "export",
     "findings",
     "friction_table",
@@ -92,68 +46,48 @@ __all__ = [
     "identify",
     "load",
     "observer",
-    "over",
     "pad",
-    "paper_experiment",
-    "paper_model",
+    "paper",
+    "parallel",
     "parameter_table",
     "predict",
     "read_logs",
     "read_rig",
     "register",
     "register_equations",
-    "root",
+    "results",
     "save",
     "simulate",
     "smooth",
+    "smoothers",
     "specs",
-    "write_c",
-    "write_draws",
-    "write_fmu",
-    "write_mjcf",
-    "write_observer",
+    "systems",
     "write_rig",
-    "write_urdf",
 ]
 _homes = {
-    "identifiability.check": ("CheckResult", "check"),
-    "data.dataset": ("DataError", "Dataset", "pad"),
-    "data.logs": ("DataWarning", "Logs", "read_logs"),
-    "design.experiment": ("Design", "design_experiment"),
-    "design.limits": ("DesignError",),
-    "comparison.compare": ("CompareError", "Comparison", "compare"),
-    "diagnose.findings": ("Finding", "findings"),
-    "em.loop": ("EMState", "FitError", "Schedule"),
-    "portable.export": ("ExportError", "export"),
-    "portable.c99": ("write_c",),
-    "portable.draws": ("write_draws",),
-    "portable.fmu": ("write_fmu",),
-    "portable.online": ("write_observer",),
-    "portable.mjcf": ("write_mjcf",),
-    "portable.urdf": ("write_urdf",),
-    "storage.files": ("StoreError",),
-    "model.friction": ("FrictionNetwork",),
-    "fit.branches": ("Branch", "branches"),
+    "comparison.compare": ("compare",),
+    "data.dataset": ("Dataset", "pad"),
+    "data.logs": ("read_logs",),
+    "data.rig": ("Rig", "read_rig", "write_rig"),
+    "diagnosis.findings": ("findings",),
+    "diagnosis.outcome": ("Diagnosis",),
+    "diagnosis.search": ("diagnose",),
+    "experiment.experiment": ("design",),
     "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
-    "fit.observer": ("Observation", "Observer", "observer"),
-    "diagnose.search": ("close_the_loop",),
-    "diagnose.outcome": ("Closed",),
-    "model.state_space": ("StateSpaceModel",),
-    "numerics.parallel": ("all_devices", "over"),
-    "smoother.particle": ("ParticleSmoother",),
-    "fit.predict": ("Prediction", "horizon_errors", "predict", "smooth"),
-    "data.rig": ("Rig", "RigError", "RigWarning", "read_rig", "write_rig"),
-    "model.simulate": ("Experiment", "examples", "paper_experiment", "paper_model", "simulate"),
-    "smoother.gaussian": ("ExtendedKalmanSmoother",),
-    "smoother.mixture": ("MixtureSmoother",),
-    "smoother.posterior": ("Posterior",),
+    "fit.observer": ("observer",),
+    "fit.predict": ("horizon_errors", "predict", "smooth"),
     "fit.store": ("load", "save"),
-    "systems": ("AbstractPlant", "AbstractSystem", "register", "register_equations", "root", "specs"),
+    "identifiability.check": ("check",),
+    "model.simulate": ("simulate",),
+    "systems": ("register", "register_equations", "specs"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}
+_namespaces = ("errors", "export", "paper", "parallel", "results", "smoothers", "systems")
 
 
 def __getattr__(name: str) -> Any:
+    if name in _namespaces:
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _home:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_home[name]}"), name)

@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from nnap_em import CompareError, compare
+from nnap_em import compare
 from nnap_em.commands import cli
 from nnap_em.comparison.compare import CHANGED, LEAST_SHARED, Comparison, corrected_tests, number, shared
 from nnap_em.comparison.pooling import LEAST_VARIANCE, joint_test, pool
 from nnap_em.data.rig import Declared
-from nnap_em.diagnose.hypothesis import Hypothesis
+from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.effects.base import one
 from nnap_em.effects.friction import LoadFriction
+from nnap_em.errors import CompareError
 from nnap_em.fit.identify import Identified, identify
 from nnap_em.fit.store import save
 from nnap_em.model.simulate import declared, examples, sweep_experiment

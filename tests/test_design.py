@@ -18,15 +18,15 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
-from nnap_em.design.criteria import Discrimination, Friction, Information, Several, after, share
-from nnap_em.design.experiment import design_experiment
-from nnap_em.design.information import Contrast, Fit, columns_of, contrast, information, known, linearised
-from nnap_em.design.limits import DesignError, Limits, limits_of
-from nnap_em.design.play import Motions, allowed, motions
-from nnap_em.design.rivals import Law, open_pairs, rivals
-from nnap_em.design.search import Effort
-from nnap_em.design.signals import FAMILIES, drawn, mutated, played
 from nnap_em.em.weights import Weights
+from nnap_em.experiment.criteria import Discrimination, Friction, Information, Several, after, share
+from nnap_em.experiment.experiment import design
+from nnap_em.experiment.information import Contrast, Fit, columns_of, contrast, information, known, linearised
+from nnap_em.experiment.limits import DesignError, Limits, limits_of
+from nnap_em.experiment.play import Motions, allowed, motions
+from nnap_em.experiment.rivals import Law, open_pairs, rivals
+from nnap_em.experiment.search import Effort
+from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
 from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import drawn_paths
 from nnap_em.fit.store import load
@@ -188,36 +188,38 @@ def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
 def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide):
     """The design is played by the model that made the logs, with noise of its own."""
     _, rig, data, fitted = slide
-    truth = nnap_em.examples["slide"]().model
+    truth = nnap_em.paper.examples["slide"]().model
     plan = {"question": "m", "seconds": 6.0, "sequences": 4, "effort": SMALL}
-    design = design_experiment(fitted, data, key=jax.random.key(1), **plan)
-    made = nnap_em.simulate(truth, jnp.asarray(design.start), jnp.asarray(design.u), key=jax.random.key(9)).data
+    designed = design(fitted, data, key=jax.random.key(1), **plan)
+    made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
     value, stated = parameter_table(identify(rig, both, key=jax.random.key(0)))["m"]
-    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(design.fit.cov), expected.information)[-1, -1])  # noqa: E731
-    assert 1 / 1.5 < std(design.expected) / stated < 1.5
+    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(designed.fit.cov), expected.information)[-1, -1])  # noqa: E731
+    assert 1 / 1.5 < std(designed.expected) / stated < 1.5
     assert abs(value - 1.0) < 4 * stated
-    assert max(std(design.expected), std(design.old)) < std(design.nothing)
+    assert max(std(designed.expected), std(designed.old)) < std(designed.nothing)
 
 
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     *_, data, fitted = slide
-    design = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    designed = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
     with pytest.warns(DeprecationWarning, match=r"Design\.expected"):
-        assert design.told is design.expected
+        assert designed.told is designed.expected
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
-    extremes = motions(paths, design.limits, design.t, design.u, design.start, 1, key=jax.random.key(78))
-    assert np.all(np.asarray(extremes.lowest) >= design.limits.lowest[None, None])
-    assert np.all(np.asarray(extremes.highest) <= design.limits.highest[None, None])
-    assert isinstance(design.question, Several) and isinstance(design.question.criteria[0], Friction)
-    whole, near = design.question.criteria[0].weight
+    extremes = motions(paths, designed.limits, designed.t, designed.u, designed.start, 1, key=jax.random.key(78))
+    assert np.all(np.asarray(extremes.lowest) >= designed.limits.lowest[None, None])
+    assert np.all(np.asarray(extremes.highest) <= designed.limits.highest[None, None])
+    assert isinstance(designed.question, Several) and isinstance(designed.question.criteria[0], Friction)
+    whole, near = designed.question.criteria[0].weight
     np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
-    speed = np.abs(np.asarray(design.fit.nodes))
-    assert speed[near > 0].max() <= design.slow[0] < speed[whole > 0].max()  # the slowest rows once more by themselves
-    again = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
-    np.testing.assert_array_equal(design.u, again.u)  # the same seed, the same numbers
+    speed = np.abs(np.asarray(designed.fit.nodes))
+    assert (
+        speed[near > 0].max() <= designed.slow[0] < speed[whole > 0].max()
+    )  # the slowest rows once more by themselves
+    again = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    np.testing.assert_array_equal(designed.u, again.u)  # the same seed, the same numbers
     assert not np.array_equal(
-        design.u, design_experiment(fitted, data, key=jax.random.key(3), seconds=4.0, sequences=3, effort=SMALL).u
+        designed.u, design(fitted, data, key=jax.random.key(3), seconds=4.0, sequences=3, effort=SMALL).u
     )
 
 
@@ -237,11 +239,11 @@ def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says
     _, _, data, fitted = slide
     pairs = rivals(fitted, data, [(None, Law("motor_gain", 1))])
     plan = {"seconds": 4.0, "sequences": 2, "effort": SMALL}
-    design = design_experiment(fitted, data, key=jax.random.key(2), question="apart", rivals=pairs, **plan)
-    assert design.apart is not None
-    assert np.all(design.apart.distance(design.expected) > 0)
-    std = lambda expected: np.sqrt(after(np.asarray(design.fit.cov), expected.information)[-1, -1])  # noqa: E731
-    assert std(design.expected) < 0.99 * std(design.nothing)  # of the mass
+    designed = design(fitted, data, key=jax.random.key(2), question="apart", rivals=pairs, **plan)
+    assert designed.apart is not None
+    assert np.all(designed.apart.distance(designed.expected) > 0)
+    std = lambda expected: np.sqrt(after(np.asarray(designed.fit.cov), expected.information)[-1, -1])  # noqa: E731
+    assert std(designed.expected) < 0.99 * std(designed.nothing)  # of the mass
 
 
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
@@ -263,7 +265,7 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
         limits_of(rig, system, data._replace(u=np.zeros_like(data.u)), path, used)
     tight = fitted._replace(rig=bounded(values={"x": (-1e-4, 1e-4)}))
     with pytest.raises(DesignError, match=r"stay inside the limits; widen \[limits\]"):
-        design_experiment(tight, data, key=jax.random.key(0), seconds=4.0, sequences=2, effort=SMALL)
+        design(tight, data, key=jax.random.key(0), seconds=4.0, sequences=2, effort=SMALL)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +279,7 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
 def test_a_question_that_the_fit_cannot_answer_is_told(slide, question, reason):
     _, _, data, fitted = slide
     with pytest.raises(DesignError, match=re.escape(reason)):
-        design_experiment(fitted, data, key=jax.random.key(0), question=question)
+        design(fitted, data, key=jax.random.key(0), question=question)
 
 
 def test_rivals_are_fitted_in_the_place_of_a_law(slide):
@@ -400,7 +402,7 @@ def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
 def test_the_figure_shows_all_of_every_input(slide):
     """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
     *_, data, fitted = slide
-    design = design_experiment(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
-    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], design.u.shape)
-    low, high = motion_figure(design._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
+    designed = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], designed.u.shape)
+    low, high = motion_figure(designed._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
     assert low < 0.01 and high > 3.0

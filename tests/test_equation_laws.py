@@ -11,8 +11,8 @@ import pytest
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose import equations
-from nnap_em.diagnose.equations import FOLDS, folds, search_equations
+from nnap_em.diagnosis import equations
+from nnap_em.diagnosis.equations import FOLDS, folds, search_equations
 from nnap_em.draft.equations import draft_equations
 from nnap_em.effects import Scene, catalogue
 from nnap_em.em.equations import free_term, motion, unknown_terms
@@ -159,8 +159,8 @@ def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, 
     monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 300
     data = _logs(coupling)
     before = identify(_rig(tmp_path), data, key=jax.random.key(0))
-    closed = search_equations(before, data, lambda text: None)
-    assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
+    diagnosis = search_equations(before, data, lambda text: None)
+    assert {(effect.channel, effect.reads) for effect in diagnosis.after.model.effects} == names
 
 
 def test_an_acrobot_as_equations_moves_as_the_built_in_one():

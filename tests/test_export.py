@@ -18,11 +18,11 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import AbstractEffect, catalogue
+from nnap_em.export import unroll
+from nnap_em.export.model import ExportError, parameters, predictor, stablehlo, write_model
 from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table, phi_samples
 from nnap_em.fit.predict import predict, smooth
 from nnap_em.fit.store import save
-from nnap_em.portable import unroll
-from nnap_em.portable.export import ExportError, export, parameters, predictor, stablehlo
 
 DT, ROWS, GIVEN, SAMPLES = 0.02, 90, 0.6, 20
 RIG = Rig(
@@ -105,7 +105,7 @@ def test_the_predictor_agrees_with_predict_where_there_is_no_jax(case, tmp_path)
         deviations=phi_samples(fitted, SAMPLES, key=key_draw),
         start=jax.random.normal(key_start, (SAMPLES, n)), noise=jax.random.normal(key_noise, (ROWS, SAMPLES, n)),
     )  # fmt: skip
-    export(fitted, tmp_path)
+    write_model(fitted, tmp_path)
     (tmp_path / "use.py").write_text(CODE)
     _alone(tmp_path, "use.py")
     with np.load(tmp_path / "found.npz") as stored:
@@ -123,7 +123,7 @@ def test_the_predictor_agrees_with_predict_where_there_is_no_jax(case, tmp_path)
 def test_the_predictor_is_a_program(case, tmp_path):
     """Its own random numbers: the mean within the error of as many draws."""
     fitted, data = case
-    export(fitted, tmp_path)
+    write_model(fitted, tmp_path)
     columns = {"time": data.t[0], "u": data.u[0, :, 0], "theta1": data.y[0, :, 0]}
     (tmp_path / "log.csv").write_text(csv_text(columns).replace("nan", ""))
     _alone(tmp_path, "predictor.py", "log.csv", "--given", str(GIVEN), "--out", "prediction.csv")
@@ -150,7 +150,7 @@ def test_one_step_through_stablehlo(case):
 
 def test_the_json_has_the_numbers_of_the_model(case, tmp_path):
     fitted, _ = case
-    export(fitted, tmp_path)
+    write_model(fitted, tmp_path)
     content = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
     value, std = parameter_table(fitted)["m"]
     assert content["parameters"]["m"] == {"value": value, "std": std, "unit": "kg", "estimated": True}
@@ -190,9 +190,9 @@ def test_a_slide_is_exported_in_newtons_and_metres():
 def test_a_model_that_numpy_cannot_follow_has_no_predictor_and_says_why(tmp_path):
     """A predictor of another fit does not stay beside it."""
     out = tmp_path / "out"
-    assert export(_case(()).fitted, out) == "" and (out / "predictor.py").exists()
+    assert write_model(_case(()).fitted, out) == "" and (out / "predictor.py").exists()
     gain = catalogue["motor_gain"](jnp.asarray(0.1), joint=1)
-    assert "'motor_gain' acts on the command; use model.stablehlo" in export(_case((gain,)).fitted, out)
+    assert "'motor_gain' acts on the command; use model.stablehlo" in write_model(_case((gain,)).fitted, out)
     assert sorted(path.name for path in out.iterdir()) == ["model.stablehlo", "parameters.json"]
     assert json.loads((out / "parameters.json").read_text())["effects"][0]["name"] == "motor_gain"
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import rod
 
-from nnap_em.diagnose.context import EFFORT, SearchContext, extend
-from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.losses import OneStep
+from nnap_em.diagnosis.context import EFFORT, SearchContext, extend
+from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.losses import OneStep
 from nnap_em.em.loop import Schedule
 from nnap_em.fit.identify import friction_table, identify
 

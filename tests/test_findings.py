@@ -12,10 +12,10 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.findings import advice, disputes, entry, estimates, findings, suspected, undecided, verdict
-from nnap_em.diagnose.hypothesis import Found, Hypothesis
-from nnap_em.diagnose.keys import key_of
-from nnap_em.diagnose.outcome import Closed, Disputed, Step, Suspect
+from nnap_em.diagnosis.findings import advice, disputes, entry, estimates, findings, suspected, undecided, verdict
+from nnap_em.diagnosis.hypothesis import Found, Hypothesis
+from nnap_em.diagnosis.keys import key_of
+from nnap_em.diagnosis.outcome import Diagnosis, Disputed, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 from nnap_em.fit.identify import begin
@@ -46,7 +46,7 @@ def _function(signal: str, joint: int, slope: float) -> AbstractEffect:
     return catalogue["unknown_function"](slope * axis.centres(), (axis,), joint=joint)
 
 
-def _closed(rig: Rig, *effects: AbstractEffect) -> Closed:
+def _closed(rig: Rig, *effects: AbstractEffect) -> Diagnosis:
     """A search that found these, in this order."""
     before = begin(rig, _data(rig), key=jax.random.key(0))
     hypothesis = Hypothesis(before.model, before.m_step)
@@ -57,7 +57,7 @@ def _closed(rig: Rig, *effects: AbstractEffect) -> Closed:
     size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
     state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))
     bank = before.bank.padded(model.log_q.shape[0])
-    return Closed(before, before._replace(state=state, m_step=rule, bank=bank), found, ())
+    return Diagnosis(before, before._replace(state=state, m_step=rule, bank=bank), found, ())
 
 
 def test_a_learned_rest_is_told_with_its_law_and_the_next_function_keeps_its_joint():
@@ -110,8 +110,8 @@ def test_a_law_by_many_steps_has_shares_and_one_by_one_step_has_nats():
         (nats, {"log_likelihood_gain", "held_out_gain", "p_value"}),
         (shares, {"share_of_error", "chance"}),
     ):
-        closed = _closed(ARM, _spring(2))
-        (finding,) = findings(closed._replace(found=(found,)))
+        diagnosis = _closed(ARM, _spring(2))
+        (finding,) = findings(diagnosis._replace(found=(found,)))
         numbers = {name for name, value in finding.evidence.items() if name != "parts" and np.isfinite(value)}
         assert numbers == known and finding.evidence["parts"] == list(found.parts)
 
@@ -121,7 +121,7 @@ def test_a_law_of_known_form_has_no_shape():
     assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)
 
 
-def _doubtful() -> Closed:
+def _doubtful() -> Diagnosis:
     """A search that saw a gain on which the second recording disagrees, and a spring and a dead zone that are even."""
     gain, zone, spring = (key_of(e) for e in (_law("motor_gain"), _law("dead_zone"), _spring(1)))
     last = Step(ROWS, (), (), None, 3, disputed=(Disputed(gain, 0.8, (1,), 0.61),), rivals=(zone, spring))
@@ -206,8 +206,8 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
 
 @pytest.mark.slow
 def test_the_page_draws_what_is_left_beside_a_law(tmp_path):
-    closed = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
+    diagnosis = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
     logs = Logs(("a.csv", "b.csv"), _data(SLIDE), ("time", "u", "x"))
-    write_diagnosis(tmp_path, closed, findings(closed), logs, None, seed=0, began=0.0, log=lambda text: None)
+    write_diagnosis(tmp_path, diagnosis, findings(diagnosis), logs, None, seed=0, began=0.0, log=lambda text: None)
     html = (tmp_path / "report.html").read_text()
     assert html.count("<figcaption><b>What is left of torsional spring at joint 1, a function of x.</b>") == 1

@@ -11,7 +11,7 @@ import pytest
 from helpers import slide
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnose import refit as refits
+from nnap_em.diagnosis import refit as refits
 from nnap_em.em import loop
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import ScoringMStep

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnose import columns as columns_of
-from nnap_em.diagnose.columns import candidate_columns, tracks
-from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.losses import MultiStep
-from nnap_em.diagnose.propose import proposals, surroundings
-from nnap_em.diagnose.smoothed import SmoothedFit
+from nnap_em.diagnosis import columns as columns_of
+from nnap_em.diagnosis.columns import candidate_columns, tracks
+from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.losses import MultiStep
+from nnap_em.diagnosis.propose import proposals, surroundings
+from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.simulate import paper_model

@@ -11,11 +11,11 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.losses import OneStep
-from nnap_em.diagnose.propose import proposals, surroundings
-from nnap_em.diagnose.screen import screen
-from nnap_em.diagnose.smoothed import SmoothedFit
+from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.losses import OneStep
+from nnap_em.diagnosis.propose import proposals, surroundings
+from nnap_em.diagnosis.screen import screen
+from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import Around, Scene, catalogue, free_form
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rod
 
-from nnap_em import close_the_loop, findings
+from nnap_em import diagnose, findings
 from nnap_em.effects import Around, fields
 from nnap_em.effects.base import a
 from nnap_em.effects.friction import LoadFriction
@@ -122,7 +122,7 @@ def around_rod(model):
 def test_torques_of_motor_and_load_apart_are_found_on_one_joint(tmp_path):
     """The law by the motor's torque alone is found first, then the share of the load's."""
     data = rod.logs(0, level=lambda u, c, v: np.abs(0.15 * u + 0.05 * c))
-    (finding,) = findings(close_the_loop(rod.rig(tmp_path, pendulum=True), data, key=jax.random.key(0)))
+    (finding,) = findings(diagnose(rod.rig(tmp_path, pendulum=True), data, key=jax.random.key(0)))
     assert finding.effect.name == "load_friction" and finding.effect.joint == 1
     assert set(finding.parameters) == {"mu", "mu_load"}
     for name, truth in (("mu", 0.15), ("mu_load", 0.05)):

@@ -4,8 +4,8 @@ import warnings
 
 import pytest
 
-from nnap_em.design.experiment import design_experiment
-from nnap_em.diagnose.search import close_the_loop
+from nnap_em.diagnosis.search import diagnose
+from nnap_em.experiment.experiment import design
 from nnap_em.storage.log import renamed, silent
 
 
@@ -25,13 +25,13 @@ def test_the_old_name_of_an_argument_gives_the_same_with_a_warning():
     assert lines == same == ["epoch 1"]
 
 
-@pytest.mark.parametrize("function", [close_the_loop, design_experiment])
+@pytest.mark.parametrize("function", [diagnose, design])
 def test_public_functions_refuse_both_names_of_an_argument(function):
     with pytest.raises(TypeError, match="'log' and its old name 'say'"):
         function(None, None, key=None, log=silent, say=silent)
 
 
-@pytest.mark.parametrize("function", [close_the_loop, design_experiment])
+@pytest.mark.parametrize("function", [diagnose, design])
 def test_public_functions_accept_the_old_name(function):
     """The warning comes before the arguments are read; the key is none, so that nothing is computed."""
     message = rf"{function.__name__}\(say=\) is now log="

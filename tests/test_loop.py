@@ -9,9 +9,9 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em import close_the_loop, findings, load, read_logs, read_rig, specs
+from nnap_em import diagnose, findings, load, read_logs, read_rig, specs
 from nnap_em.commands import cli
-from nnap_em.diagnose.findings import Estimate, Finding, verdict
+from nnap_em.diagnosis.findings import Estimate, Finding, verdict
 from nnap_em.effects import catalogue
 from nnap_em.effects.base import Curve
 from nnap_em.effects.function import Axis
@@ -26,8 +26,8 @@ def _closed(case, folder):
     plant.write(case, folder)
     rig = read_rig(folder / "rig.toml", specs)
     data = read_logs(folder / "train", rig).data
-    closed = close_the_loop(rig, data, key=jax.random.key(0))
-    return closed, findings(closed)
+    diagnosis = diagnose(rig, data, key=jax.random.key(0))
+    return diagnosis, findings(diagnosis)
 
 
 def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):

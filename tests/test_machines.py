@@ -17,12 +17,12 @@ from machines import arm, tree
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
 from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig, write_rig
-from nnap_em.design.criteria import Information
-from nnap_em.design.experiment import Design
-from nnap_em.design.information import Fit
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build, build_system
 from nnap_em.em.prior import ParameterPrior
+from nnap_em.experiment.criteria import Information
+from nnap_em.experiment.experiment import Design
+from nnap_em.experiment.information import Fit
 from nnap_em.identifiability.identifiability import identifiability, sentences
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import examples

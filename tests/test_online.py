@@ -14,15 +14,15 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
+from nnap_em.export import online
+from nnap_em.export.fmu import write_fmu
+from nnap_em.export.model import ExportError
+from nnap_em.export.online import numbers, table, write_observer
 from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, RESTARTED, observer
 from nnap_em.fit.store import save
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
-from nnap_em.portable import online
-from nnap_em.portable.export import ExportError
-from nnap_em.portable.fmu import write_fmu
-from nnap_em.portable.online import numbers, table, write_observer
 
 DT, JUMP = 0.02, 32
 PENDULUM = Rig(

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from nnap_em.diagnose.keys import words
+from nnap_em.diagnosis.keys import words
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
 from nnap_em.report.page import MOST, Picture, page

@@ -4,7 +4,7 @@ import jax
 import pytest
 import rod
 
-from nnap_em import close_the_loop, findings
+from nnap_em import diagnose, findings
 from nnap_em.effects import catalogue
 
 MASS, PLACE = 0.5, (0.15, -0.3)
@@ -14,8 +14,8 @@ MASS, PLACE = 0.5, (0.15, -0.3)
 def test_mass_and_centre_of_a_load_on_one_joint_are_found(tmp_path):
     """Weight and inertia of a hinge give mass and centre in the plane of its motion; along the axis nothing is seen."""
     data = rod.logs(0, mass=MASS, at=PLACE)
-    closed = close_the_loop(rod.rig(tmp_path), data, key=jax.random.key(0))
-    (finding,) = findings(closed)
+    diagnosis = diagnose(rod.rig(tmp_path), data, key=jax.random.key(0))
+    (finding,) = findings(diagnosis)
     assert finding.effect.name == "payload" and finding.effect.joint == 1
     estimates = finding.parameters
     for name, truth, within in (("mass", MASS, 0.1 * MASS), ("centre_x", PLACE[0], 0.02), ("centre_z", PLACE[1], 0.02)):

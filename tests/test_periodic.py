@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import around, slide
 
-from nnap_em.diagnose.keys import replaced
-from nnap_em.diagnose.propose import seeded
+from nnap_em.diagnosis.keys import replaced
+from nnap_em.diagnosis.propose import seeded
 from nnap_em.effects import flat
 from nnap_em.effects.periodic import OVERTONES, PeriodicForce
 from nnap_em.model.state_space import with_effects

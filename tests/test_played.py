@@ -19,14 +19,14 @@ from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.effects.function import Axis, InputAxis, UnknownFunction
 from nnap_em.effects.periodic import PeriodicForce
+from nnap_em.export.c99 import torques, write_c
+from nnap_em.export.draws import write_draws
+from nnap_em.export.mjcf import beside, write_mjcf
+from nnap_em.export.model import ExportError
+from nnap_em.export.placement import PLACES, REASONS
+from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.machines.mjcf import MachineError, read_machine
-from nnap_em.portable.c99 import torques, write_c
-from nnap_em.portable.draws import write_draws
-from nnap_em.portable.export import ExportError
-from nnap_em.portable.mjcf import beside, write_mjcf
-from nnap_em.portable.placement import PLACES, REASONS
-from nnap_em.portable.urdf import write_urdf
 from nnap_em.systems import specs
 
 a, c = jnp.asarray, catalogue

@@ -53,7 +53,7 @@ SAID = {
         "2 sequences, 4 rows ahead",
         "[rad and rad/s, or m and m/s]: 0.5, 0.5",
     ),
-    "experiment": (nnap_em.Experiment(DATA, jnp.zeros((3, ROWS, 2))), "all 2 states known; Dataset: 3 sequences"),
+    "experiment": (nnap_em.paper.Experiment(DATA, jnp.zeros((3, ROWS, 2))), "all 2 states known; Dataset: 3 sequences"),
 }
 
 

@@ -7,7 +7,7 @@ import pytest
 from nnap_em.commands import cli
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnose.rivals import instead, possible
+from nnap_em.diagnosis.rivals import instead, possible
 from nnap_em.em.loop import e_step
 from nnap_em.fit.identify import identify
 from nnap_em.systems import specs

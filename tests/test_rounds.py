@@ -10,17 +10,17 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose import rounds, trial
-from nnap_em.diagnose.context import EFFORT, SearchContext
-from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.keys import contains, elsewhere, key_of
-from nnap_em.diagnose.losses import MultiStep, OneStep
-from nnap_em.diagnose.refit import Refit
-from nnap_em.diagnose.rounds import screening_round
-from nnap_em.diagnose.screen import Screen, Screened
-from nnap_em.diagnose.smoothed import SmoothedFit
-from nnap_em.diagnose.trial import Trial
-from nnap_em.diagnose.verdict import Share
+from nnap_em.diagnosis import rounds, trial
+from nnap_em.diagnosis.context import EFFORT, SearchContext
+from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.keys import contains, elsewhere, key_of
+from nnap_em.diagnosis.losses import MultiStep, OneStep
+from nnap_em.diagnosis.refit import Refit
+from nnap_em.diagnosis.rounds import screening_round
+from nnap_em.diagnosis.screen import Screen, Screened
+from nnap_em.diagnosis.smoothed import SmoothedFit
+from nnap_em.diagnosis.trial import Trial
+from nnap_em.diagnosis.verdict import Share
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 

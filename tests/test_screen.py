@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnose.hypothesis import Hypothesis
-from nnap_em.diagnose.losses import OneStep
-from nnap_em.diagnose.propose import proposals, seeded, surroundings
-from nnap_em.diagnose.screen import overlaps, project, screen
-from nnap_em.diagnose.smoothed import SmoothedFit
+from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.losses import OneStep
+from nnap_em.diagnosis.propose import proposals, seeded, surroundings
+from nnap_em.diagnosis.screen import overlaps, project, screen
+from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import catalogue
 from nnap_em.em.local import local
 from nnap_em.fit.memory import extended

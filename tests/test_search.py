@@ -13,20 +13,20 @@ from helpers import around, declared_model, slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnose import backward, search
-from nnap_em.diagnose import context as context_of
-from nnap_em.diagnose.context import EFFORT, SearchContext, ahead
-from nnap_em.diagnose.hypothesis import Found, Hypothesis, covariances
-from nnap_em.diagnose.keys import completed, key_of, remainder_of, replaced
-from nnap_em.diagnose.losses import MultiStep, OneStep, readings
-from nnap_em.diagnose.outcome import Step
-from nnap_em.diagnose.propose import seeded
-from nnap_em.diagnose.refit import Refit
-from nnap_em.diagnose.rounds import Round
-from nnap_em.diagnose.screen import Screened
-from nnap_em.diagnose.smoothed import SmoothedFit
-from nnap_em.diagnose.trial import Null, Trial, certainty
-from nnap_em.diagnose.verdict import Share
+from nnap_em.diagnosis import backward, search
+from nnap_em.diagnosis import context as context_of
+from nnap_em.diagnosis.context import EFFORT, SearchContext, ahead
+from nnap_em.diagnosis.hypothesis import Found, Hypothesis, covariances
+from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
+from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
+from nnap_em.diagnosis.outcome import Step
+from nnap_em.diagnosis.propose import seeded
+from nnap_em.diagnosis.refit import Refit
+from nnap_em.diagnosis.rounds import Round
+from nnap_em.diagnosis.screen import Screened
+from nnap_em.diagnosis.smoothed import SmoothedFit
+from nnap_em.diagnosis.trial import Null, Trial, certainty
+from nnap_em.diagnosis.verdict import Share
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.effects.function import Axis, InputAxis
 from nnap_em.em.loop import EMState
@@ -386,7 +386,7 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
     monkeypatch.setattr(search, "_released", lambda rig: search.finished)
     monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
-    outcome = search.close_the_loop(RIG, DATA, key=jax.random.key(0))
+    outcome = search.diagnose(RIG, DATA, key=jax.random.key(0))
     assert ran == losses and len(outcome.found) == len(losses) and outcome.complete == complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says

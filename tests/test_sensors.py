@@ -29,6 +29,8 @@ from nnap_em.em.local import local, readings_at
 from nnap_em.em.mstep import _shaken
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
+from nnap_em.export.mjcf import write_mjcf
+from nnap_em.export.model import parameters, predictor
 from nnap_em.fit.identify import begin, phi_samples
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
@@ -39,8 +41,6 @@ from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.portable.export import parameters, predictor
-from nnap_em.portable.mjcf import write_mjcf
 from nnap_em.recordings.recording import Topic
 from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading

@@ -14,11 +14,12 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.data.servo import KINDS
-from nnap_em.diagnose.columns import candidate_columns, tracks
+from nnap_em.diagnosis.columns import candidate_columns, tracks
 from nnap_em.effects import Candidate
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.servos import build_servos
+from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
@@ -27,7 +28,6 @@ from nnap_em.identifiability.identifiability import identifiability, sentences
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.portable.export import ExportError, export
 from nnap_em.systems import specs
 
 BODY = '<inertial pos="0 0 -.2" mass=".5" diaginertia=".002 .002 .002"/>'
@@ -414,7 +414,7 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
     again = load(tmp_path / "model.npz")
     assert parameter_table(again) == table and again.rig == rig
     with pytest.raises(ExportError, match="its inputs are commands of servos"):
-        export(again, tmp_path / "out")
+        write_model(again, tmp_path / "out")
 
 
 def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):

@@ -8,7 +8,7 @@ import matplotlib
 import pytest
 
 import nnap_em
-from nnap_em.design.search import Effort
+from nnap_em.experiment.search import Effort
 from nnap_em.storage.journal import Journal, keeping
 
 TOUR = Path(__file__).resolve().parents[1] / "examples" / "tour.py"
@@ -33,7 +33,7 @@ def test_it_is_short_and_told():
 def test_it_runs_and_finds_the_cable(tmp_path, monkeypatch, capsys):
     """The truth is 30 N/m; the stated standard deviation holds it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(nnap_em, "design_experiment", partial(nnap_em.design_experiment, effort=SMALL))
+    monkeypatch.setattr(nnap_em, "design", partial(nnap_em.design, effort=SMALL))
     matplotlib.use("agg")
     names = {"__name__": "tour"}
     with keeping(Journal(tmp_path / "steps", {})):  # the search begins with the fit of the cell before

@@ -9,10 +9,10 @@ from helpers import around, declared_model
 from jaxtyping import Array, Float
 
 from nnap_em.effects import catalogue
+from nnap_em.export.unroll import UnrollError, unroll
 from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.state_space import Inputs, with_effects
 from nnap_em.numerics.elementary import cos, sin
-from nnap_em.portable.unroll import UnrollError, unroll
 
 MODEL = declared_model(plant.Case(steps=20, hidden=False))
 AROUND = around(MODEL)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nnap_em.diagnose.verdict import (
+from nnap_em.diagnosis.verdict import (
     AGREE,
     CHANCE,
     EQUIVALENT,

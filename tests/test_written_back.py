@@ -19,13 +19,13 @@ from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.effects.body import Payload
 from nnap_em.effects.position import Cogging, TorsionalSpring
+from nnap_em.export.friction import friction_form
+from nnap_em.export.mjcf import write_mjcf
+from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import load, save
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import declared, paper_model
-from nnap_em.portable.export import ExportError, export
-from nnap_em.portable.friction import friction_form
-from nnap_em.portable.mjcf import write_mjcf
 from nnap_em.systems import specs
 
 MACHINES = Path(machine_files.__file__).parent / "machines"
@@ -83,7 +83,7 @@ def test_a_saved_model_needs_neither_the_file_nor_mujoco(tmp_path):
 
 
 def test_a_machine_from_a_file_is_exported(tmp_path):
-    export(_begun(parameters={"pole.mass": Declared(0.2, 0.05)}), tmp_path)  # compares NumPy's numbers with JAX's
+    write_model(_begun(parameters={"pole.mass": Declared(0.2, 0.05)}), tmp_path)  # compares NumPy's numbers with JAX's
     assert sorted(p.name for p in tmp_path.iterdir()) == ["model.stablehlo", "parameters.json", "predictor.py"]
     assert '"unit": "kg"' in (tmp_path / "parameters.json").read_text()
 

@@ -21,9 +21,10 @@ from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
-from ..design.limits import DesignError
 from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
+from ..experiment.limits import DesignError
+from ..export.model import ExportError
 from ..fit.identify import Identified
 from ..fit.predict import GIVEN
 from ..fit.store import fingerprint
@@ -32,7 +33,6 @@ from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
-from ..portable.export import ExportError
 from ..recordings.mcap_writer import Channel
 from ..residual.residual import names_of
 from ..storage.cache import Cache

@@ -9,9 +9,9 @@ from pathlib import Path
 import jax
 
 from ..data.rig import read_rig
-from ..design.experiment import check_question, design_experiment
-from ..design.limits import DesignError
-from ..design.rivals import Law, open_pairs, rivals
+from ..experiment.experiment import check_question, design
+from ..experiment.limits import DesignError
+from ..experiment.rivals import Law, open_pairs, rivals
 from ..fit.identify import Identified
 from ..fit.store import Stored, fingerprint, model_file, read
 from ..report.design import write_design
@@ -31,11 +31,11 @@ def run(args: argparse.Namespace, log: Log) -> None:
     with resumable(args, bench, log):
         data = bench.train.data
         pairs = rivals(fitted, data, laws, log) if question in ("all", "apart") else []
-        design = design_experiment(
+        designed = design(
             fitted, data, key=key, question=question, rivals=pairs,
             seconds=args.seconds, sequences=args.sequences, log=log,
         )  # fmt: skip
-        write_design(args.out, design, question=question, seed=args.seed, began=began, log=log)
+        write_design(args.out, designed, question=question, seed=args.seed, began=began, log=log)
 
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:

@@ -6,8 +6,8 @@ import time
 
 import jax
 
-from ..diagnose.findings import findings
-from ..diagnose.search import close_the_loop
+from ..diagnosis.findings import findings
+from ..diagnosis.search import diagnose
 from ..fit.store import AFTER, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
@@ -36,15 +36,15 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
         spent = time.perf_counter() - began
         key = jax.random.key(args.seed)
-        closed = close_the_loop(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
-        journal.open = not closed.complete
-        accepted, mark = findings(closed), fingerprint(bench.train.data)
+        diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
+        journal.open = not diagnosis.complete
+        accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
         for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
-        for name, fitted in (("before.npz", closed.before), (AFTER, closed.after)):
+        for name, fitted in (("before.npz", diagnosis.before), (AFTER, diagnosis.after)):
             save(args.out / name, fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, closed, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
+        write_diagnosis(args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
     if journal.open:
         log(go_on(args, journal))
 

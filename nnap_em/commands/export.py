@@ -4,15 +4,15 @@ import argparse
 
 import jax
 
+from ..export.c99 import write_c
+from ..export.draws import TABLE, write_draws
+from ..export.fmu import write_fmu
+from ..export.mjcf import write_mjcf
+from ..export.model import write_model
+from ..export.online import write_observer
+from ..export.urdf import write_urdf
 from ..fit.store import load, model_file
 from ..numerics.digits import counted
-from ..portable.c99 import write_c
-from ..portable.draws import TABLE, write_draws
-from ..portable.export import export
-from ..portable.fmu import write_fmu
-from ..portable.mjcf import write_mjcf
-from ..portable.online import write_observer
-from ..portable.urdf import write_urdf
 from ..storage.log import Log
 from .common import require_joints
 
@@ -45,6 +45,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
         log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")
     elif args.out is not None:
-        reason = export(fitted, args.out)
+        reason = write_model(fitted, args.out)
         log(f"no predictor.py: {reason}" if reason else f"wrote predictor.py to {args.out}")
         log(f"wrote parameters.json and model.stablehlo to {args.out}")

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from ..data.logs import DataWarning, read_logs
-from ..diagnose.keys import listed
+from ..diagnosis.keys import listed
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
 from ..numerics.digits import counted

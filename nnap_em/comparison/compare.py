@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 
 from ..data.formats import read_table
 from ..data.machine import unpacked
-from ..diagnose.findings import estimates
-from ..diagnose.hypothesis import covariances
-from ..diagnose.keys import Key, key_of, listed, words
+from ..diagnosis.findings import estimates
+from ..diagnosis.hypothesis import covariances
+from ..diagnosis.keys import Key, key_of, listed, words
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
-from ..diagnose.findings import Estimate, estimates, filled
-from ..diagnose.hypothesis import covariances
+from ..diagnosis.findings import Estimate, estimates, filled
+from ..diagnosis.hypothesis import covariances
 from ..effects import flat
 from ..fit.identify import Identified
 from ..model.dynamic_friction import DynamicFriction, Hysteresis, hysteresis

@@ -8,9 +8,9 @@ import numpy as np
 from scipy import stats
 
 from ..data.formats import write_csv
-from ..design.criteria import Information, after
-from ..design.experiment import Design
-from ..diagnose.keys import key_of, listed, words
+from ..diagnosis.keys import key_of, listed, words
+from ..experiment.criteria import Information, after
+from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
 from ..residual.residual import names_of
 from ..storage.files import replace_text

@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..design.experiment import Design
+from ..experiment.experiment import Design
 from ..residual.residual import Names
 from .style import AFTER, BEFORE, READING, ZERO, head, limits, panels, styled, symbol
 

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..data.rig import Rig
-from ..diagnose.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
-from ..diagnose.keys import Key, key_of, place_of, words
-from ..diagnose.outcome import Closed, Step
+from ..diagnosis.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
+from ..diagnosis.keys import Key, key_of, place_of, words
+from ..diagnosis.outcome import Diagnosis, Step
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import GIVEN, Prediction
@@ -32,7 +32,7 @@ from .tables import visited_nodes, write_friction, write_json
 
 def write_diagnosis(
     out: Path,
-    closed: Closed,
+    diagnosis: Diagnosis,
     accepted: list[Finding],
     train: Logs,
     test: Logs | None,
@@ -41,9 +41,9 @@ def write_diagnosis(
     began: float,
     log: Log,
 ) -> None:
-    """Write the report of a closed loop into the folder `out`; `began` is `time.perf_counter()` at the start."""
-    names, both = names_of(closed.before), {"before": closed.before, "after": closed.after}
-    sides = both if accepted else {"before": closed.before}
+    """Write the report of a diagnosis into the folder `out`; `began` is `time.perf_counter()` at the start."""
+    names, both = names_of(diagnosis.before), {"before": diagnosis.before, "after": diagnosis.after}
+    sides = both if accepted else {"before": diagnosis.before}
     predicted = predictions(sides, test)
     error = errors(predicted, sides, test) if test else None
     if error:
@@ -53,38 +53,38 @@ def write_diagnosis(
     tested = {name: tests(each, names) for name, each in left.items()}
     velocities = _velocities(left["before"], len(names.rates))
     nodes = visited_nodes(velocities) if names.rates else np.zeros((0, 2))
-    tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if closed.before.rig.friction}
+    tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if diagnosis.before.rig.friction}
     for name, table in tables.items():
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
     figures = [
         *_error_pictures(error, predicted, tables, names, test),
         *_residual_pictures(left, partial, names),
         *_effect_pictures(accepted),
-        *_search_pictures(closed.steps, closed.before.rig.named),
+        *_search_pictures(diagnosis.steps, diagnosis.before.rig.named),
     ]
-    disputed, rivals, suspects = disputes(closed, train.files), undecided(closed), suspected(closed)
+    disputed, rivals, suspects = disputes(diagnosis, train.files), undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
-    outcome, far = verdict(accepted, error, failed, rivals, suspects, closed.complete), moved(closed.after)
-    document = shared(closed.before, train, test, seed=seed, began=began) | {
+    outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.complete), moved(diagnosis.after)
+    document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *(one.sentence for one in far)]),
         "moved": [one._asdict() for one in far],
-        "complete": closed.complete,
+        "complete": diagnosis.complete,
         "effects": [entry(f) for f in accepted],
-        "interventions": [_disturbance(force, train.files) for force in closed.interventions],
+        "interventions": [_disturbance(force, train.files) for force in diagnosis.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
-        "visited": visited(closed.before, velocities, train) if closed.before.rig.friction else None,
-        "friction_change": friction_change(closed, nodes),
+        "visited": visited(diagnosis.before, velocities, train) if diagnosis.before.rig.friction else None,
+        "friction_change": friction_change(diagnosis, nodes),
         "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
-        "looks": [_round(step, closed.before.rig.dt) for step in closed.steps],
+        "looks": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
         "disagreements": [d._asdict() for d in disputed],
         "cannot_tell": [place_of(key) for key in rivals],
         "suspects": [suspect._asdict() for suspect in suspects],
-        "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(closed.before.rig)],
+        "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
     }
-    named = closed.before.rig.named
+    named = diagnosis.before.rig.named
     write_json(out / "report.json", document, named)
     replace_text(out / "report.html", named(page(document, figures)))
     log(document["verdict"])

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.logs import Logs
-from ..diagnose.keys import listed
+from ..diagnosis.keys import listed
 from ..em.build import build_system
 from ..em.loop import REFUSED
 from ..fit.identify import FrictionTable, Identified, friction_table

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from ..diagnose.findings import growth
+from ..diagnosis.findings import growth
 from ..numerics.digits import finite, number
 from ..residual.statistics import LEVEL
 from . import wording

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..diagnose.keys import words
+from ..diagnosis.keys import words
 from ..numerics.digits import finite, number, share_of, ten, with_std
 
 

@@ -1,7 +1,7 @@
 """Finished steps of a long computation on disk, so that one that was killed goes on where it was.
 
     with keeping(Journal(folder, {"seed": 0})):
-        closed = close_the_loop(rig, data, key=key)
+        closed = diagnose(rig, data, key=key)
 
 A step is a function that gives the same for the same arguments, and a file holds the outcome of one call.  It is found
 again by a digest of all that the function was given: a resumed run computes what is not there, and a step whose

@@ -76,4 +76,4 @@ def register_equations(
     specs[name] = SystemSpec((), (), {}, 0, declare=partial(declared.declare, of=of))
 
 
-__all__ = ["AbstractPlant", "AbstractSystem", "Equations", "register", "register_equations", "root", "specs", "systems"]
+__all__ = ["AbstractPlant", "AbstractSystem", "Equations", "register", "register_equations", "root", "specs"]

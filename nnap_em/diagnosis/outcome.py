@@ -52,7 +52,7 @@ class Step(NamedTuple):
     """Candidates over their bar that were not refitted before the time was up."""
 
 
-class Closed(NamedTuple):
+class Diagnosis(NamedTuple):
     """Outcome of a search: the fits before and after, the effects found, and the rounds that led to them."""
 
     before: Identified

@@ -21,7 +21,7 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE
 from ..storage.files import replace_text
 from .c99 import WHOLE, Dialect, function
-from .export import ExportError, unrolled
+from .model import ExportError, unrolled
 from .unroll import named
 
 BRANCHES = 16

@@ -27,7 +27,7 @@ from ..prediction_error.multistep import Grid
 from ..storage.log import Log
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, words
-from .outcome import Closed, Step, Suspect
+from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
 from .verdict import AGREE, CERTAIN, EQUIVALENT
 
@@ -167,7 +167,7 @@ def around_of(fitted: Identified, data: Dataset) -> Around:
     )  # fmt: skip
 
 
-def search_equations(before: Identified, data: Dataset, log: Log, until: float = math.inf) -> Closed:
+def search_equations(before: Identified, data: Dataset, log: Log, until: float = math.inf) -> Diagnosis:
     """Laws that equations lack, added and fitted, one or two at a time, until none passes on parts left out."""
     hypothesis = Hypothesis(before.model, before.m_step, (None,) * len(before.model.effects))
     declared = len(before.model.effects)
@@ -191,10 +191,10 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
     if len(hypothesis.model.effects) == declared:
-        return Closed(before, before, (), tuple(steps), complete=complete)
+        return Diagnosis(before, before, (), tuple(steps), complete=complete)
     state = before.state._replace(best=hypothesis.model)
     after = fitted_to_horizon(before._replace(state=state, m_step=hypothesis.m_step), data)
-    return Closed(before, after, hypothesis.found, tuple(steps), complete=complete)  # type: ignore[arg-type]
+    return Diagnosis(before, after, hypothesis.found, tuple(steps), complete=complete)  # type: ignore[arg-type]
 
 
 def _with_numbers(hypothesis: Hypothesis, case: Case) -> Any:

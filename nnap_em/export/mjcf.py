@@ -19,8 +19,8 @@ from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .actuator import actuator
 from .content import Bristle, Contact, Content, Drive, JointContent, SensorContent
-from .export import ExportError
 from .friction import SHARE, FrictionForm, friction_forms
+from .model import ExportError
 from .placement import file_springs, placed
 
 STEP = 5e-4

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..data.dataset import Dataset
-from ..diagnose.keys import key_of, words
-from ..diagnose.rivals import instead, possible
+from ..diagnosis.keys import key_of, words
+from ..diagnosis.rivals import instead, possible
 from ..effects import AbstractEffect
 from ..fit.identify import Identified
 from ..storage.log import Log, silent

@@ -17,7 +17,7 @@ from ..fit.identify import friction_table
 from ..numerics.digits import finite, number, share_of, with_std
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
-from .outcome import Closed
+from .outcome import Diagnosis
 
 
 class Estimate(NamedTuple):
@@ -71,12 +71,12 @@ class Finding(NamedTuple):
     """True if the curve is the remainder beside the law."""
 
 
-def findings(closed: Closed) -> list[Finding]:
+def findings(diagnosis: Diagnosis) -> list[Finding]:
     """All effects found, each with its equivalents."""
-    fitted, model = closed.after, closed.after.model
+    fitted, model = diagnosis.after, diagnosis.after.model
     numbers = covariances(model, fitted.m_step, fitted.state.hessian)
     laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]
-    entries = list(zip(model.effects, closed.found, numbers, laws, strict=True))
+    entries = list(zip(model.effects, diagnosis.found, numbers, laws, strict=True))
     out = []
     for effect, record, cov, law in entries:
         if law is not None:
@@ -193,11 +193,13 @@ def _sized(finding: Finding) -> str:
     return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
 
 
-def friction_change(closed: Closed, velocity: Float[np.ndarray, "dof node"]) -> str | None:
+def friction_change(diagnosis: Diagnosis, velocity: Float[np.ndarray, "dof node"]) -> str | None:
     """Change of the learned friction by the added effects."""
-    if not (closed.found and closed.before.rig.friction):
+    if not (diagnosis.found and diagnosis.before.rig.friction):
         return None
-    first, second = (np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (closed.before, closed.after))
+    first, second = (
+        np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (diagnosis.before, diagnosis.after)
+    )
     size = np.sqrt(np.mean(second**2, axis=1))
     share = np.sqrt(np.mean((first - second) ** 2, axis=1)) / np.maximum(size, 1e-12)
     parts = [f"joint {j + 1} by {100 * s:.0f} %" for j, s in enumerate(share)]
@@ -220,11 +222,11 @@ class Dispute(NamedTuple):
     description: str
 
 
-def disputes(closed: Closed, files: Sequence[str], most: int = 3) -> list[Dispute]:
+def disputes(diagnosis: Diagnosis, files: Sequence[str], most: int = 3) -> list[Dispute]:
     """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
     out = []
-    for dispute in [disputed for step in closed.last for disputed in step.disputed][:most]:
-        against = list(dict.fromkeys(files[closed.pieces[i] if closed.pieces else i] for i in dispute.against))
+    for dispute in [disputed for step in diagnosis.last for disputed in step.disputed][:most]:
+        against = list(dict.fromkeys(files[diagnosis.pieces[i] if diagnosis.pieces else i] for i in dispute.against))
         share = share_of(dispute.share, "the prediction error")
         text = (
             f"{words(dispute.key)} would remove {share}, but {listed(against)} "
@@ -257,10 +259,10 @@ class SuspectReport(NamedTuple):
     """An experiment that would show it."""
 
 
-def suspected(closed: Closed) -> list[SuspectReport]:
+def suspected(diagnosis: Diagnosis) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
-    for suspect in [entry for step in closed.last for entry in step.suspects]:
+    for suspect in [entry for step in diagnosis.last for entry in step.suspects]:
         law, confirm = words(suspect.key), catalogue[suspect.key[0]].confirm
         text = (
             f"{law} would remove {share_of(suspect.share, 'the squared prediction error')}, "
@@ -273,9 +275,9 @@ def suspected(closed: Closed) -> list[SuspectReport]:
     return out
 
 
-def undecided(closed: Closed) -> tuple[Key, ...]:
+def undecided(diagnosis: Diagnosis) -> tuple[Key, ...]:
     """Laws of other causes that explain the same of what is left, so that none of them was added."""
-    return tuple(key for step in closed.last for key in step.rivals)
+    return tuple(key for step in diagnosis.last for key in step.rivals)
 
 
 def advice(

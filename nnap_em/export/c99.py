@@ -14,7 +14,7 @@ from ..effects.base import Scene
 from ..fit.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_text
-from .export import ExportError, unrolled
+from .model import ExportError, unrolled
 from .placement import of_command
 from .unroll import Source
 

@@ -1,13 +1,13 @@
 """A rig with an effect that nobody declared, end to end from a seed: find it, name it, add it, and see the error fall.
 
 The rig is simulated by `plant.py`, which shares no code with the library: an acrobot whose second joint nobody
-measures and whose cable pulls on it like a spring.  Written into `out/close_the_loop/`: the data set, report.html and
+measures and whose cable pulls on it like a spring.  Written into `out/diagnose/`: the data set, report.html and
 report.json.
 
-    python examples/close_the_loop.py                                  # some minutes
-    python examples/close_the_loop.py --effect payload --seed 3        # another name of plant.STRONG
-    python examples/close_the_loop.py --effect none                    # a rig that lacks nothing
-    python examples/close_the_loop.py --system slide                   # a slide: spring, dead zone and drag in one
+    python examples/diagnose.py                                  # some minutes
+    python examples/diagnose.py --effect payload --seed 3        # another name of plant.STRONG
+    python examples/diagnose.py --effect none                    # a rig that lacks nothing
+    python examples/diagnose.py --system slide                   # a slide: spring, dead zone and drag in one
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main() -> int:
     arguments.add_argument("--system", choices=("acrobot", "slide"), default="acrobot")
     arguments.add_argument("--effect", choices=("none", *plant.STRONG), default="torsional_spring")
     arguments.add_argument("--seed", type=int, default=1)
-    arguments.add_argument("--out", type=Path, default=Path("out/close_the_loop"))
+    arguments.add_argument("--out", type=Path, default=Path("out/diagnose"))
     args = arguments.parse_args()
     effects = SLIDE if args.system == "slide" else plant.STRONG.get(args.effect, ())
     clock = "session" if args.effect in plant.SESSION else "sequence"

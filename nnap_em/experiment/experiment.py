@@ -74,7 +74,7 @@ class Design(NamedTuple):
 
 
 @renamed(say="log")
-def design_experiment(
+def design(
     fitted: Identified,
     data: Dataset,
     *,

@@ -14,7 +14,7 @@ from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..systems.tree import Tree
 from . import acting
-from .export import literal, unrolled
+from .model import literal, unrolled
 from .placement import takes_time
 
 

@@ -1,4 +1,4 @@
-"""Close the loop: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
+"""Diagnosis: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
 
 import dataclasses
 import math
@@ -33,7 +33,7 @@ from .equations import search_equations
 from .hypothesis import Found, Hypothesis
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
-from .outcome import Closed, Step
+from .outcome import Diagnosis, Step
 from .quantised import quantised
 from .rounds import Round, screening_round
 from .trial import Trial
@@ -93,7 +93,7 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def search(context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified]) -> Closed:
+def search(context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
 
     Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
@@ -112,9 +112,9 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     if not hypothesis.found or state is None:
-        return Closed(before, before, (), tuple(steps), complete=complete)
+        return Diagnosis(before, before, (), tuple(steps), complete=complete)
     outcome = release(_outcome(before, hypothesis, state), data)
-    return Closed(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
+    return Diagnosis(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
 
 
 def _ladder(context: SearchContext) -> list[int]:
@@ -190,7 +190,7 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
 
 
 @renamed(say="log")
-def close_the_loop(
+def diagnose(
     rig: Rig,
     data: Dataset,
     *,
@@ -198,7 +198,7 @@ def close_the_loop(
     effort: Effort = EFFORT,
     log: Log = silent,
     seconds: float = math.inf,
-) -> Closed:
+) -> Diagnosis:
     """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
 
     Where readings do not carry white noise, as on real machines, external disturbances are left out before.
@@ -240,10 +240,10 @@ def close_the_loop(
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
     context, release = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), _released(rig)
-    closed = search(context, white=False, release=release)
+    diagnosis = search(context, white=False, release=release)
     before = release(before, data)
-    closed = closed._replace(before=before, after=closed.after if closed.found else before)
-    return _branching(closed._replace(interventions=disturbances, pieces=pieces))
+    diagnosis = diagnosis._replace(before=before, after=diagnosis.after if diagnosis.found else before)
+    return _branching(diagnosis._replace(interventions=disturbances, pieces=pieces))
 
 
 def _held(rig: Rig) -> Rig:
@@ -277,11 +277,13 @@ def _unbranched(bank: StartBank) -> GaussianSmoother:
     return CubatureSmoother(bank, branching=False)
 
 
-def _branching(closed: Closed) -> Closed:
+def _branching(diagnosis: Diagnosis) -> Diagnosis:
     """The outcome with the smoother of `identify`, by which states are smoothed and predicted."""
 
     def branched(fit: Identified) -> Identified:
         return fit._replace(smoother=CubatureSmoother(fit.bank))
 
-    before = branched(closed.before)
-    return closed._replace(before=before, after=before if closed.after is closed.before else branched(closed.after))
+    before = branched(diagnosis.before)
+    return diagnosis._replace(
+        before=before, after=before if diagnosis.after is diagnosis.before else branched(diagnosis.after)
+    )

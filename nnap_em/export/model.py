@@ -31,7 +31,7 @@ class ExportError(ValueError):
     """A model that has no plain NumPy form: the message names what it is about it."""
 
 
-def export(fitted: Identified, out: Path) -> str:
+def write_model(fitted: Identified, out: Path) -> str:
     """Write parameters.json, predictor.py and model.stablehlo to the folder `out`, each whole or not at all.
 
     Returns the reason why there is no predictor.py, as for a law of the command; empty where there is one.

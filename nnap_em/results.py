@@ -1,0 +1,22 @@
+"""Types of what the functions of `nnap_em` take and return, for annotations."""
+
+from .comparison.compare import Comparison
+from .data.logs import Logs
+from .diagnosis.findings import Finding
+from .experiment.experiment import Design
+from .fit.identify import FrictionTable
+from .fit.observer import Observation, Observer
+from .fit.predict import Prediction
+from .identifiability.check import CheckResult
+
+__all__ = [
+    "CheckResult",
+    "Comparison",
+    "Design",
+    "Finding",
+    "FrictionTable",
+    "Logs",
+    "Observation",
+    "Observer",
+    "Prediction",
+]

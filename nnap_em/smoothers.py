@@ -1,0 +1,17 @@
+"""Smoothers, for `identify(..., smoother=...)`: each is made from the hypotheses of the start of a fit."""
+
+from .fit.branches import Branch, branches
+from .smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from .smoother.mixture import MixtureSmoother
+from .smoother.particle import ParticleSmoother
+from .smoother.posterior import Posterior
+
+__all__ = [
+    "Branch",
+    "CubatureSmoother",
+    "ExtendedKalmanSmoother",
+    "MixtureSmoother",
+    "ParticleSmoother",
+    "Posterior",
+    "branches",
+]

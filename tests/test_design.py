@@ -203,8 +203,6 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     *_, data, fitted = slide
     designed = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
-    with pytest.warns(DeprecationWarning, match=r"Design\.expected"):
-        assert designed.told is designed.expected
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
     extremes = motions(paths, designed.limits, designed.t, designed.u, designed.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(extremes.lowest) >= designed.limits.lowest[None, None])

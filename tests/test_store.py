@@ -16,7 +16,6 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.effects import catalogue
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
@@ -96,23 +95,6 @@ def _rewrite(path: Path, change) -> None:
     np.savez(path, header=np.frombuffer(text, np.uint8), sha256=checksum, **arrays)
 
 
-def test_a_payload_of_a_file_from_before_it_had_a_centre_is_read(tmp_path):
-    path, rig = tmp_path / "model.npz", RIGS["arm"]
-    law = catalogue["payload"](jnp.asarray(0.04), joint=2)
-    save(path, begin(rig, _data(rig), key=jax.random.key(5), effects=(law,)))
-
-    def older(header, arrays):
-        for part in (header["leaves"], header["settings"]):
-            for place in [place for place in part if place.endswith(("0/moment", "0/point"))]:
-                del part[place]
-        for name in ("moment", "point"):
-            del header["effects"][0]["parts"][name]
-
-    _rewrite(path, older)
-    (effect,) = load(path).model.effects
-    assert float(effect.values()["mass"]) == 0.04 and effect.moment is None
-
-
 @pytest.mark.parametrize("name", RIGS)
 def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     fitted = _fitted(name)
@@ -134,22 +116,6 @@ SMOOTHERS = {
         CubatureSmoother(bank, iterations=2), Guided(), MetropolisBackward(7), num_particles=31, dtype=float
     ),
 }
-
-
-@pytest.mark.parametrize("name", SMOOTHERS)
-def test_a_model_from_before_smoothers_branched_is_read(tmp_path, name):
-    rig = RIGS["arm"]
-    fitted = begin(rig, _data(rig), key=jax.random.key(5), smoother=SMOOTHERS[name])
-    save(tmp_path / "model.npz", fitted)
-
-    def older(header, arrays):
-        later = [place for place in header["settings"] if place.endswith(("/angles", "/branching"))]
-        assert len(later) == 3  # of the bank, of the smoother's, and whether it branches
-        for place in later:
-            del header["settings"][place]
-
-    _rewrite(tmp_path / "model.npz", older)
-    assert jax.tree.structure(load(tmp_path / "model.npz").smoother) == jax.tree.structure(fitted.smoother)
 
 
 @pytest.mark.parametrize("make", SMOOTHERS.values(), ids=SMOOTHERS)

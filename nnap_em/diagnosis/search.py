@@ -26,7 +26,7 @@ from ..residual.undisturbed import disturbance_free
 from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
 from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
-from ..storage.log import Log, renamed, silent
+from ..storage.log import Log, silent
 from .backward import backward
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
@@ -189,7 +189,6 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
         ahead = [longest]
 
 
-@renamed(say="log")
 def diagnose(
     rig: Rig,
     data: Dataset,

@@ -73,14 +73,11 @@ class Axis(AbstractAxis):
     def value(self, scene):
         system = scene.system
         signals = dict(zip(system.coordinates + system.rates, (*scene.q, *scene.v), strict=True))
-        first = scene.drive[system.joints[0] - 1] if system.joints else 0.0
-        signals |= {"time": scene.time, "u": first}  # "u": models saved before every input was an axis of its own
+        signals["time"] = scene.time
         return jnp.sum(jnp.stack([signals[name] for name in self.names]))
 
     def unit(self, system):
         name = self.names[0]
-        if name == "u":
-            return system.force_unit(system.joints[0])
         return "s" if name == "time" else system.unit(name)
 
 

@@ -1,6 +1,5 @@
 """The next experiment: which inputs, played on the machine, determine best what a fit leaves open."""
 
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from ..em.mstep import kept
 from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, smooth
 from ..numerics.digits import counted
-from ..storage.log import Log, renamed, silent
+from ..storage.log import Log, silent
 from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
@@ -66,14 +65,7 @@ class Design(NamedTuple):
         """Information without an experiment."""
         return jax.tree.map(np.zeros_like, self.expected)
 
-    @property
-    def told(self) -> Information:
-        """The old name of `expected`, for one release."""
-        warnings.warn("Design.told is now Design.expected", DeprecationWarning, stacklevel=2)
-        return self.expected
 
-
-@renamed(say="log")
 def design(
     fitted: Identified,
     data: Dataset,

@@ -22,7 +22,6 @@ from ..data.rig import Declared, Rig
 from ..effects import catalogue, parts
 from ..model.dynamic_friction import DynamicFriction
 from ..smoother import kinds
-from ..smoother.gaussian import CubatureSmoother
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
 from ..storage.leaves import describe, name_of, plain, restore, tuples
 from ..systems import systems
@@ -177,12 +176,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:
-            # numbers that effects and models have had since
-            later = ("/servos", "/unknown/rest", "/stop", "/quiet", "/horizon_note")
-            since = "/effects/" in place or place.endswith(later)
-            return (
-                value if since and (value is None or isinstance(value, str)) else differs(place, "missing in the file")
-            )
+            return differs(place, "missing in the file")
         seen.add(place)
         kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
         if kind == "code":
@@ -196,21 +190,15 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
 
     def setting(place: str, value: Any) -> Any:
         seen.add(place)
-        later = place not in settings and (
-            "/effects/" in place or place.endswith(("/angles", "/branching", "/scales", "/pace", "/jointless"))
-        )  # its default
-        if plain(value) != (place in settings) and not later:
+        if plain(value) != (place in settings):
             differs(place, "a setting that only one of the two has")
         return tuples(settings[place]) if place in settings else value
 
     known = {kind.__name__: kind for kind in (*catalogue.values(), *parts, DynamicFriction)}
-    effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header.get("effects", []))
+    effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header["effects"])
     tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
-    del tree["smoother"]
-    if "smoother" in header:
-        tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
+    tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
     tree = _rebuild(tree, "", leaf, setting)
-    tree.setdefault("smoother", CubatureSmoother(tree["bank"]))  # of files from before smoothers were kept
     for place in (*leaves, *settings):
         if place not in seen:
             differs(place, "unknown here")
@@ -252,11 +240,9 @@ def _rig(entries: Mapping[str, Any]) -> Rig:
         name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
     }
     values["parameters"], values["start"] = declared(entries["parameters"]), declared(entries["start"])
-    pairs = {
-        part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries.get("limits", {}).items()
-    }
+    pairs = {part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries["limits"].items()}
     values["limits"] = Bounds(**pairs)
-    values["ranges"] = {name: tuple(ends) for name, ends in entries.get("ranges", {}).items()}
+    values["ranges"] = {name: tuple(ends) for name, ends in entries["ranges"].items()}
     return Rig(**values)
 
 

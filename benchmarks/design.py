@@ -47,7 +47,7 @@ PLAYS = 17
 def logs(case: plant.Case, folder: Path):
     """The rig, and its training logs."""
     plant.write(case, folder)
-    rig = nnap_em.read_rig(folder / "rig.toml", nnap_em.specs)
+    rig = nnap_em.read_rig(folder / "rig.toml")
     return rig, nnap_em.read_logs(folder / "train", rig).data
 
 

@@ -23,7 +23,7 @@ from identify import nrmse, paper_rig, visited
 
 from nnap_em.em.loop import e_step
 from nnap_em.fit.identify import friction_table, identify
-from nnap_em.fit.predict import smooth
+from nnap_em.fit.predict import posterior_of
 from nnap_em.model.simulate import paper_experiment, paper_model, simulate
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.start import StartBank
@@ -72,7 +72,7 @@ def late(seed: int) -> list[dict[str, object]]:
         data = train.data._replace(y=train.data.y.at[:, :rows].set(jnp.nan))
         fitted = identify(paper_rig(0.5), data, key=jax.random.key(seed))
         error = nrmse(friction_table(fitted, velocity).torque - torque, torque, count)
-        state = smooth(fitted, data).state.mean
+        state = posterior_of(fitted, data).state.mean
         theta2 = np.sqrt(np.mean(np.asarray(state - train.x)[..., 1] ** 2, axis=1))
         out.append({
             "seed": seed, "late by [s]": rows * truth.dt,

@@ -20,7 +20,7 @@ import numpy as np
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.fit.identify import identify, parameter_table
-from nnap_em.fit.predict import predict, smooth
+from nnap_em.fit.predict import posterior_of, predict
 from nnap_em.systems import specs
 
 RIGS = ("dfki_c1_joint1", "dfki_c0_joint1", "dfki_a0_joint1", "dfki_c1", "dfki_c0")
@@ -62,7 +62,7 @@ def study(folder: Path, seed: int) -> dict:
     seconds = time.perf_counter() - began
     data = jax.tree.map(jax.numpy.asarray, test.data)
     angles = encoder(folder, test.files)
-    error = wrap(np.asarray(smooth(fitted, data).state.mean)[..., :2] - angles)
+    error = wrap(np.asarray(posterior_of(fitted, data).state.mean)[..., :2] - angles)
     smoothing = np.sqrt(np.nanmean(error[..., 1] ** 2, axis=1))
     squares = {0.2: [], 0.5: []}
     for given in STARTS:

@@ -26,7 +26,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.fit.identify import Identified, friction_table, identify
-from nnap_em.fit.predict import horizon_errors, predict, smooth
+from nnap_em.fit.predict import horizon_errors, posterior_of, predict
 from nnap_em.model import hooks
 from nnap_em.systems import specs
 
@@ -190,7 +190,7 @@ def declared(hidden: bool, memory: bool) -> Rig:
 
 def friction(fitted: Identified, data: Dataset):
     """Friction torque of both joints along smoothed states [N m]."""
-    model, path = fitted.model, smooth(fitted, data).state.mean
+    model, path = fitted.model, posterior_of(fitted, data).state.mean
 
     def one(x, u):
         scene = model.scene(x, u)
@@ -225,7 +225,7 @@ def ahead(fitted: Identified, laws: Sequence[Any], run: Run, given: float) -> tu
     last = round(given / DT)
     rows = np.arange(last, last + round(1 / DT) + 1)
     known = run.data._replace(valid=np.arange(ROWS)[None] <= last + np.zeros((len(run.x), 1)))
-    x0 = np.asarray(smooth(fitted, known).state.mean)[:, last]
+    x0 = np.asarray(posterior_of(fitted, known).state.mean)[:, last]
     model = fitted.model
 
     def one(x, seq):

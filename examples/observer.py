@@ -97,7 +97,7 @@ def main() -> int:
     jax.config.update("jax_enable_x64", True)
     case = plant.Case(sequences=args.sequences, tests=1, steps=300, seed=args.seed, start="anywhere")
     plant.write(case, args.out / "rig")
-    rig = nnap_em.read_rig(args.out / "rig" / "rig.toml", nnap_em.specs)
+    rig = nnap_em.read_rig(args.out / "rig" / "rig.toml")
     fitted = nnap_em.identify(rig, nnap_em.read_logs(args.out / "rig" / "train", rig).data, key=jax.random.key(0))
     nnap_em.save(args.out / "fit" / "model.npz", fitted)
     nnap_em.export.write_observer(fitted, args.out / "arm.c")

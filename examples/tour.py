@@ -54,7 +54,7 @@ print((folder / "rig.toml").read_text())
 # there is no word of the cable.
 
 # %%
-rig = nnap_em.read_rig(folder / "rig.toml", nnap_em.specs)
+rig = nnap_em.read_rig(folder / "rig.toml")
 train, test = (nnap_em.read_logs(folder / part, rig) for part in ("train", "test"))
 print(f"{len(train.files)} sequences to fit, {len(test.files)} to test, {train.data.t.shape[1]} rows each")
 

@@ -1,8 +1,7 @@
 """Identify what a physics model of a machine does not know, from logs, and find what it lacks.
 
-The main jobs are functions of the package; the rest is in `smoothers`, `export`, `systems`, `results`, `errors`,
-`paper` and `parallel`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing and sets nothing
-up.
+The main jobs are functions of the package; the rest is in `smoothers`, `plots`, `export`, `systems`, `results`,
+`errors`, `paper` and `parallel`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing.
 """
 
 import importlib
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from . import errors, export, paper, parallel, results, smoothers, systems
+    from . import errors, export, paper, parallel, plots, results, smoothers, systems
     from .comparison.compare import compare
     from .data.dataset import Dataset, pad
     from .data.logs import read_logs
-    from .data.rig import Rig, read_rig, write_rig
+    from .data.rig import Rig, write_rig
     from .diagnosis.findings import findings
     from .diagnosis.outcome import Diagnosis
     from .diagnosis.search import diagnose
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from .fit.store import load, save
     from .identifiability.check import check
     from .model.simulate import simulate
-    from .systems import register, register_equations, specs
+    from .systems import read_rig, register, register_equations
 
 __all__ = [
     "Dataset",
@@ -50,6 +49,7 @@ __all__ = [
     "paper",
     "parallel",
     "parameter_table",
+    "plots",
     "predict",
     "read_logs",
     "read_rig",
@@ -60,7 +60,6 @@ __all__ = [
     "simulate",
     "smooth",
     "smoothers",
-    "specs",
     "systems",
     "write_rig",
 ]
@@ -68,7 +67,7 @@ _homes = {
     "comparison.compare": ("compare",),
     "data.dataset": ("Dataset", "pad"),
     "data.logs": ("read_logs",),
-    "data.rig": ("Rig", "read_rig", "write_rig"),
+    "data.rig": ("Rig", "write_rig"),
     "diagnosis.findings": ("findings",),
     "diagnosis.outcome": ("Diagnosis",),
     "diagnosis.search": ("diagnose",),
@@ -79,10 +78,10 @@ _homes = {
     "fit.store": ("load", "save"),
     "identifiability.check": ("check",),
     "model.simulate": ("simulate",),
-    "systems": ("register", "register_equations", "specs"),
+    "systems": ("read_rig", "register", "register_equations"),
 }
 _home = {name: home for home, names in _homes.items() for name in names}
-_namespaces = ("errors", "export", "paper", "parallel", "results", "smoothers", "systems")
+_namespaces = ("errors", "export", "paper", "parallel", "plots", "results", "smoothers", "systems")
 
 
 def __getattr__(name: str) -> Any:

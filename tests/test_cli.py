@@ -591,19 +591,19 @@ def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
     def bug(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(smooth_command, "smoothed_states", bug)
+    monkeypatch.setattr(smooth_command, "smooth", bug)
     with pytest.raises(ZeroDivisionError):
         _run("smooth", fit, bench / "test", "--out", tmp_path / "out")
 
 
 def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypatch, capsys):
-    whole = smooth_command.smoothed_states
+    whole = smooth_command.smooth
 
     def lost(fitted, data):
         state = whole(fitted, data)
         return state._replace(mean=state.mean.at[2, 10:, 1].set(np.inf))
 
-    monkeypatch.setattr(smooth_command, "smoothed_states", lost)
+    monkeypatch.setattr(smooth_command, "smooth", lost)
     assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
     assert f"nnap-em: warning: 002.csv: {STEPS + 1 - 10} values run away" in capsys.readouterr().err
     assert np.isnan(_read(tmp_path / "002.csv")["dx"]).sum() == STEPS + 1 - 10

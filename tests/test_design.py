@@ -176,7 +176,7 @@ def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
     """The fit linearises over the whole posterior, a design along one motion: they agree to a few percent."""
     *_, data, fitted = slide
     expected, data = known(fitted), Dataset(*map(jnp.asarray, data))
-    path = nnap_em.smooth(fitted, data).state.mean
+    path = nnap_em.smooth(fitted, data).mean
     total = information(expected, data, path[:, None]).sum(axis=0)
     weights = fitted.m_step.weights(fitted.model)
     hessian = jnp.asarray(total) + weights.prior_precision(fitted.model.unknown)

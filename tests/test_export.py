@@ -21,7 +21,7 @@ from nnap_em.effects import AbstractEffect, catalogue
 from nnap_em.export import unroll
 from nnap_em.export.model import ExportError, parameters, predictor, stablehlo, write_model
 from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table, phi_samples
-from nnap_em.fit.predict import predict, smooth
+from nnap_em.fit.predict import posterior_of, predict
 from nnap_em.fit.store import save
 
 DT, ROWS, GIVEN, SAMPLES = 0.02, 90, 0.6, 20
@@ -115,7 +115,7 @@ def test_the_predictor_agrees_with_predict_where_there_is_no_jax(case, tmp_path)
     np.testing.assert_allclose(arrays["std"], wanted.std[0], rtol=1e-6, atol=1e-6)
     assert np.ptp(arrays["mean"][ROWS // 2 :, 0]) > 0.3  # it moves
     if not fitted.model.effects:
-        state = smooth(fitted, data).state  # of the model as it is: `nnap-em smooth` widens it by the model's own
+        state = posterior_of(fitted, data).state  # of the model as it is: `nnap-em smooth` widens it by the model's own
         np.testing.assert_allclose(arrays["smoothed"], state.mean[0], rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(arrays["cov"], state.cov[0], rtol=1e-6, atol=1e-9)
 

@@ -9,7 +9,7 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em import diagnose, findings, load, read_logs, read_rig, specs
+from nnap_em import diagnose, findings, load, read_logs, read_rig
 from nnap_em.commands import cli
 from nnap_em.diagnosis.findings import Estimate, Finding, verdict
 from nnap_em.effects import catalogue
@@ -24,7 +24,7 @@ DRAG = {"name": "air_drag", "joint": 1, "c": 0.8}
 
 def _closed(case, folder):
     plant.write(case, folder)
-    rig = read_rig(folder / "rig.toml", specs)
+    rig = read_rig(folder / "rig.toml")
     data = read_logs(folder / "train", rig).data
     diagnosis = diagnose(rig, data, key=jax.random.key(0))
     return diagnosis, findings(diagnosis)

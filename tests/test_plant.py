@@ -7,7 +7,7 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em import read_logs, read_rig, specs
+from nnap_em import read_logs, read_rig
 
 SMALL = plant.Case(sequences=3, tests=2, steps=60, seed=5)
 FREE = {"Fc": 0.0, "Fs": 0.0, "vs": 0.3, "b": 0.0, "eps": 0.1}
@@ -301,7 +301,7 @@ def test_the_play_of_a_backlash_is_free():
 def test_the_library_reads_the_folder(case, tmp_path):
     """Without a warning: pytest turns them into errors."""
     plant.write(case, tmp_path)
-    rig = read_rig(tmp_path / "rig.toml", specs)
+    rig = read_rig(tmp_path / "rig.toml")
     assert rig.system == case.system and rig.clock == case.clock
     assert bool(rig.noise_std) == case.declare_noise
     assert ("theta2" in rig.start) == (case.system == "acrobot" and case.hidden)

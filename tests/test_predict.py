@@ -11,7 +11,7 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
-from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, predict, smooth, smoothed_states
+from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics import parallel
@@ -136,9 +136,9 @@ def test_std_grows_as_the_kicks_add_up():
 def test_the_smoother_of_the_fit_is_the_one_that_smooths():
     """A particle smoother gives the states of the Kalman smoother within their error, and says how it was sampled."""
     case = _case(q=1e-2, information=1.0)
-    kalman = smooth(case.fitted, case.data)
+    kalman = posterior_of(case.fitted, case.data)
     drawn = case.fitted._replace(smoother=ParticleSmoother(CubatureSmoother(case.fitted.bank), num_paths=400))
-    posterior = smooth(drawn, case.data)
+    posterior = posterior_of(drawn, case.data)
     assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(posterior.ess) > 100)
     std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
     # means of 400 paths through 300 particles: a standard error of .08, 480 of them
@@ -156,8 +156,8 @@ def test_uncertain_friction_widens_the_prediction():
 def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():
     sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
     blind = sure.data._replace(y=sure.data.y.at[:, 20:].set(jnp.nan))
-    certain = smooth(sure.fitted, blind).state.cov
-    known, wide = (smoothed_states(case.fitted, blind).cov for case in (sure, unsure))
+    certain = posterior_of(sure.fitted, blind).state.cov
+    known, wide = (smooth(case.fitted, blind).cov for case in (sure, unsure))
     np.testing.assert_allclose(known, certain, rtol=1e-6)
     last, first = (np.asarray(wide / certain)[:, row, 0, 0] for row in (-1, 5))
     assert np.all(last > 100 * first)

@@ -57,6 +57,13 @@ SAID = {
 }
 
 
+def test_a_fit_says_why_it_ended():
+    state = FITTED.state._replace(stop="at rest", top=np.asarray([10.0, np.nan, 14.0]))
+    fit = FITTED._replace(state=state)
+    assert fit.converged and "(at rest), 12 nat a sequence" in str(fit)
+    assert not FITTED.converged and "nat" not in str(FITTED)
+
+
 def test_a_slide_has_no_torque():
     assert "N m" not in str(BED_TABLE) and "rad" not in str(BED_TABLE)
 

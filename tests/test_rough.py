@@ -10,7 +10,7 @@ from helpers import swing, swing_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em import horizon_errors, identify, predict, read_logs, read_rig, specs
+from nnap_em import horizon_errors, identify, predict, read_logs, read_rig
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, Logs
@@ -162,7 +162,7 @@ RIGS = {
 @pytest.mark.parametrize("case", RIGS.values(), ids=RIGS)
 def test_what_machines_do_is_left_alone(case, tmp_path):
     plant.write(case._replace(steps=200), tmp_path)
-    logs = read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs))  # a warning would be an error
+    logs = read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml"))  # a warning would be an error
     assert (logs.masked, logs.as_read) == ((), logs.data)
 
 
@@ -177,7 +177,7 @@ WIGGLES = {
 @pytest.mark.parametrize("case", WIGGLES.values(), ids=WIGGLES)
 def test_wiggles_without_noise_to_hide_them_are_left_alone(case, tmp_path):
     plant.write(case._replace(hidden=False, sequences=4, tests=1, noise=(1e-4, 1e-3)), tmp_path)
-    assert read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml", specs)).masked == ()
+    assert read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml")).masked == ()
 
 
 @pytest.mark.parametrize("name", NOISE)
@@ -419,7 +419,7 @@ SLIDE = plant.Case(system="slide", hidden=False, sequences=6, tests=2, steps=200
 
 def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
     plant.write(SLIDE, tmp_path)
-    rig = read_rig(tmp_path / "rig.toml", specs)
+    rig = read_rig(tmp_path / "rig.toml")
     train, test = (read_logs(tmp_path / part, rig) for part in ("train", "test"))
     rng = np.random.default_rng(0)
     for path in sorted((tmp_path / "train").glob("*.csv")):

@@ -8,7 +8,7 @@ import numpy as np
 from ..data.logs import Logs, read_logs
 from ..fit.branches import Branch, branches
 from ..fit.identify import Identified
-from ..fit.predict import smoothed_states
+from ..fit.predict import smooth
 from ..fit.store import load, model_file
 from ..numerics.digits import counted
 from ..recordings.mcap_writer import Channel, require_mcap, write_mcap
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings)
-    state = smoothed_states(fitted, logs.data)
+    state = smooth(fitted, logs.data)
     mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")

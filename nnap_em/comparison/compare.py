@@ -167,13 +167,26 @@ class Comparison(NamedTuple):
 
 
 def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Comparison:
-    """Compare two or more fits of one machine: folders or files of `identify` and `diagnose`, or fitted models.
+    """Compare two or more fits of one machine.
 
     Every parameter and every friction curve is tested for a change by `pooling.joint_test` with the covariance that
     its fits state; p-values are corrected for the number of quantities [Holm 1979, Scand. J. Stat. 6, 65]. The prior
     draws all fits to one value, which only makes alarms rarer.
-    Raises CompareError where the fits are fewer than two, the same, or of different machines; StoreError where a file
-    is no fit.
+
+    Args:
+        *fits: folders or files of `identify` and `diagnose`, or fitted models.
+        names: a name for each, for the reader; without them those of the files.
+
+    Returns:
+        Curves, parameters and effects with their changes and p-values; `print` shows a table.
+
+    Raises:
+        CompareError: the fits are fewer than two, the same, or of different machines.
+        StoreError: a file is no fit.
+
+    Example:
+        >>> [fit.name for fit in nnap_em.compare(fit, other, names=("January", "June")).fits]
+        ['January', 'June']
     """
     opened = [_opened(fit) for fit in fits]
     labels = tuple(names) or _labels(fits, opened)

@@ -35,9 +35,22 @@ class Dataset(NamedTuple):
 
 
 def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
-    """Sequences (t [s], u [N m], y [rad, rad/s]) of any length as one Dataset.
+    """Sequences of any length as one Dataset, for data that are not in a folder of logs.
 
-    Raises DataError if the shapes of a sequence do not fit each other or the first sequence.
+    Args:
+        sequences: (t, u, y) of each: time (row,) [s], inputs (row, input) [N m, or N], readings (row, column)
+            [rad, rad/s, or m, m/s]; NaN where there is no reading.
+
+    Returns:
+        Arrays (sequence, row, ...), as long as the longest; `valid` marks the rows that are there.
+
+    Raises:
+        DataError: shapes of a sequence do not fit each other or the first sequence.
+
+    Example:
+        >>> t = np.arange(5) * 0.01
+        >>> nnap_em.pad([(t, np.zeros((5, 1)), np.zeros((5, 1)))]).y.shape
+        (1, 5, 1)
     """
     if not sequences:
         raise DataError("pad: no sequence; give at least one (t, u, y)")

@@ -76,12 +76,30 @@ class Logs:
 
 
 def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
-    """All logs of `folder` by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
+    """All logs of a folder by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes, what a stuck, late or saturated sensor reads, and all rows but the first in which a reading stands while the
-    machine moves, become missing samples, unless you `trust` the readings.
-    Those later than `until` [s after the first row] are neither masked nor used: a prediction has no access to them.
-    Raises DataError at the first mistake; warns DataWarning of what is masked, and of what is seldom meant.
+    machine moves, become missing samples.
+
+    Args:
+        folder: the CSV files, one a sequence.
+        rig: what their columns mean.
+        trust: mask nothing.
+        until: readings later than that [s after the first row] are neither masked nor used: a prediction has no access
+            to them.
+
+    Returns:
+        Names of the files, the Dataset (`.data`), and what was masked.
+
+    Raises:
+        DataError: at the first mistake, with file, row, column and what to do.
+
+    Warns:
+        DataWarning: of what is masked, and of what is seldom meant.
+
+    Example:
+        >>> nnap_em.read_logs(f"{folder}/train", rig).data.y.shape
+        (2, 61, 1)
     """
     files = log_files(Path(folder))
     tables = [_within(_read_table(path, rig), rig) for path in files]

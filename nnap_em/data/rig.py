@@ -189,7 +189,7 @@ class Rig:
 
 
 def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
-    """The rig that `rig.toml` declares, in SI units; `systems` are the registered ones.
+    """`nnap_em.read_rig` for some registered machines, by name.
 
     Raises RigError at the first mistake.
     """
@@ -230,8 +230,18 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     )
 
 
-def write_rig(rig: Rig, path: Path) -> None:
-    """Write `rig` as rig.toml, units as comments; `read_rig` gives the same Rig back."""
+def write_rig(rig: Rig, path: Path | str) -> None:
+    """Write a rig as rig.toml, units as comments; `read_rig` gives the same Rig back.
+
+    Args:
+        rig: what is declared.
+        path: the file.
+
+    Example:
+        >>> nnap_em.write_rig(rig, f"{folder}/copy.toml")
+        >>> nnap_em.read_rig(f"{folder}/copy.toml") == rig
+        True
+    """
     scales = {name: f", {AT} = {{ {_columns(scale)} }}" for name, scale in rig.input_scales.items()}
     parameters = {
         name: repr(x.mean) if x.std == 0 and name not in scales else _pair(x, scales.get(name, ""))
@@ -258,7 +268,7 @@ def write_rig(rig: Rig, path: Path) -> None:
     lines += ["", "[start]    # prior of the first row"]
     lines += [f"{name} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
     lines += _limits(rig.limits)
-    replace_text(path, "\n".join(lines) + "\n")
+    replace_text(Path(path), "\n".join(lines) + "\n")
 
 
 def _joints(rig: Rig, parameters: Mapping[str, str], bodies: Sequence[str]) -> list[str]:

@@ -72,7 +72,18 @@ class Finding(NamedTuple):
 
 
 def findings(diagnosis: Diagnosis) -> list[Finding]:
-    """All effects found, each with its equivalents."""
+    """The effects that a diagnosis added, each with its numbers, sentence and equivalents.
+
+    Args:
+        diagnosis: of `diagnose`.
+
+    Returns:
+        One a law, in the order of their acceptance; empty where nothing is missing or the logs cannot decide.
+
+    Example:
+        >>> [finding.sentence for finding in nnap_em.findings(diagnosis)]
+        []
+    """
     fitted, model = diagnosis.after, diagnosis.after.model
     numbers = covariances(model, fitted.m_step, fitted.state.hessian)
     laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]

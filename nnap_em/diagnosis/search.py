@@ -198,12 +198,29 @@ def diagnose(
     log: Log = silent,
     seconds: float = math.inf,
 ) -> Diagnosis:
-    """Fit the declared unknowns of `rig`, find what it lacks, add that, and fit again.
+    """Fit the declared unknowns of a rig, find what it lacks, add that, and fit again.
 
     Where readings do not carry white noise, as on real machines, external disturbances are left out before.
-    After `seconds` [s] no new round or refit begins, and the outcome is what was accepted until then, not `complete`;
-    the first fit, and that of an accepted law over the whole length, are always done.
-    Raises FitError when no sequence can be followed.
+
+    Args:
+        rig: what is declared.
+        data: sequences; two at least, better five.
+        key: random key of the start.
+        effort: limits of the search.
+        log: receives a line of progress at a time.
+        seconds: time after which no new round or refit begins [s]; the outcome is then what was accepted until that,
+            not `complete`. The first fit, and that of an accepted law over the whole length, are always done.
+
+    Returns:
+        The models before and after, the evidence, and the course of the search; `findings` has it in sentences.
+
+    Raises:
+        FitError: no sequence can be followed.
+
+    Example:
+        >>> diagnosis = nnap_em.diagnose(rig, train, key=key, seconds=1.0)
+        >>> diagnosis.after.rig == rig
+        True
     """
     end = time.monotonic() + seconds
     if rig.memory:  # the search has a law with memory of its own

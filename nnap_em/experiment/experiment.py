@@ -11,7 +11,7 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..em.mstep import kept
 from ..fit.identify import Identified
-from ..fit.predict import drawn_paths, smooth
+from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
 from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
@@ -78,16 +78,32 @@ def design(
     effort: Effort = EFFORT,
     log: Log = silent,
 ) -> Design:
-    """The `sequences` inputs of `seconds` [s] together that serve a criterion best, found by a seeded search.
+    """Inputs to play next, so that their logs determine best what a fit leaves open: found by a seeded search.
 
-    `question` is "friction", "parameters", the name of one, "apart" (discriminate each of `rivals`) or "all" of what
-    there is. `data` are the logs that `fitted` was fitted to.  Every sequence stays inside the limits of its rig
-    (`limits_of`) for 500 models drawn from the posterior, process noise included. Raises DesignError where the rig has
-    no input, a start is out of the limits, or nothing is open.
+    Every sequence stays inside the limits of its rig (`limits_of`) for 500 models drawn from the posterior, process
+    noise included.
+
+    Args:
+        fitted: the model.
+        data: the logs that it was fitted to.
+        key: random key of the search.
+        question: "friction", "parameters", the name of one, "apart" (discriminate each of `rivals`) or "all" of what
+            there is.
+        rivals: pairs of laws to be discriminated.
+        seconds: length of all sequences together [s].
+        sequences: their number.
+        effort: size of the search.
+        log: receives a line of progress at a time.
+
+    Returns:
+        Inputs (sequence, row, input) [N m, or N], the starts they assume, and the standard deviations to expect.
+
+    Raises:
+        DesignError: the rig has no input, a start is out of the limits, or nothing is open.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
     data = jax.device_put(data)
-    posterior = smooth(fitted, data)
+    posterior = posterior_of(fitted, data)
     path, used = np.asarray(posterior.state.mean), np.asarray(kept(posterior, data))
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]

@@ -72,12 +72,22 @@ def torques(fitted: Identified) -> Torques:
     return Torques(friction, feedforward, without)
 
 
-def write_c(fitted: Identified, out: Path) -> list[str]:
-    """Write friction and feed-forward torque per joint to a C99 file, and return the laws that are not in it.
+def write_c(fitted: Identified, out: Path | str) -> list[str]:
+    """Write friction and feed-forward torque per joint to a C99 file.
 
     Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`.
-    Raises ExportError, before anything is written, where a law has no plain C form.
+
+    Args:
+        fitted: the model.
+        out: the file.
+
+    Returns:
+        Laws that are not in it.
+
+    Raises:
+        ExportError: a law has no plain C form; nothing is written.
     """
+    out = Path(out)
     system, functions = fitted.model.system, torques(fitted)
     name = re.sub(r"\W", "_", out.stem)
     name = f"model_{name}" if name[:1].isdigit() else name

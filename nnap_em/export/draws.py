@@ -12,17 +12,24 @@ from ..fit.identify import Identified, friction_table
 from ..fit.predict import drawn_paths
 from ..systems.tree import Tree
 from .friction import FrictionForm, declared_friction, even_nodes, friction_form
-from .mjcf import write_model
+from .mjcf import write_variant
 
 TABLE = "draws.csv"
 
 
-def write_draws(fitted: Identified, out: Path, count: int, *, key: PRNGKeyArray) -> None:
-    """Write `count` draws of the posterior to the folder `out`: draws.csv, and draw_00.xml, ... for one of a file.
+def write_draws(fitted: Identified, out: Path | str, count: int, *, key: PRNGKeyArray) -> None:
+    """Write draws of the posterior: draws.csv, and draw_00.xml, ... for a machine from a file.
 
     A row of draws.csv has friction per joint (`JOINT.coulomb`, `.breakaway`, `.stribeck`, `.viscous`, `.offset`), the
     estimated parameters of the machine, and those of every effect (`EFFECT.JOINT.NAME`), in SI units.
+
+    Args:
+        fitted: the model.
+        out: the folder.
+        count: number of draws.
+        key: random key of the draws.
     """
+    out = Path(out)
     paths = drawn_paths(fitted, count, key=key)
     columns: dict[str, list[float]] = {}
     width = len(str(count - 1))
@@ -41,7 +48,7 @@ def write_draws(fitted: Identified, out: Path, count: int, *, key: PRNGKeyArray)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
         if isinstance(drawn.system, Tree):
-            write_model(fitted, drawn, forms, out / f"draw_{i:0{width}d}.xml")
+            write_variant(fitted, drawn, forms, out / f"draw_{i:0{width}d}.xml")
     write_csv(out / TABLE, {name: np.asarray(values, float) for name, values in columns.items()})
 
 

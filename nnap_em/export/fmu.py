@@ -20,14 +20,25 @@ from ..storage.files import replace_bytes
 from .online import numbers, observer_c
 
 
-def write_fmu(fitted: Identified, out: Path, *, single: bool = False) -> bool:
-    """Write the observer as a co-simulation FMU (FMI 3.0); False where no C compiler `cc` made a binary.
+def write_fmu(fitted: Identified, out: Path | str, *, single: bool = False) -> bool:
+    """Write the observer as a co-simulation FMU (FMI 3.0).
 
     Inputs: those of the rig, and `reading.NAME` (NaN: none). Outputs: states, `std.NAME`, `innovation.NAME`, misfit,
     weight and flags. Parameters: estimated numbers and noise. A step is a multiple of the rows of the logs: readings of
     its beginning count, and states are predicted for its end.
-    Raises ExportError, before anything is written, where a law has no plain C form.
+
+    Args:
+        fitted: the model.
+        out: the file, an fmu.
+        single: numbers of 32 bits.
+
+    Returns:
+        False where no C compiler `cc` made a binary: the sources alone are inside.
+
+    Raises:
+        ExportError: a law has no plain C form; nothing is written.
     """
+    out = Path(out)
     name = re.sub(r"\W", "_", out.stem)
     name = f"model_{name}" if name[:1].isdigit() else name
     source, header = observer_c(fitted, name, single=single)

@@ -48,19 +48,29 @@ class Motor(NamedTuple):
     """Command of the fit for a unit of the control."""
 
 
-def write_mjcf(fitted: Identified, out: Path, *, alone: bool = False) -> list[str]:
-    """Write the identified machine to the file `out`, and return what MuJoCo has no place for, a sentence each.
+def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> list[str]:
+    """Write the identified machine to an MJCF file.
 
     Laws without a place go to a Python module beside it, `OUT_actuator.py`.
 
-    Raises ExportError where the machine did not come from a file; with `alone`, before anything is written, where a law
-    has no place in MuJoCo.
+    Args:
+        fitted: the model, of a machine from a file.
+        out: the file.
+        alone: write no module.
+
+    Returns:
+        What MuJoCo has no place for, a sentence each.
+
+    Raises:
+        ExportError: the machine did not come from a file; with `alone`, a law has no place in MuJoCo. Nothing is
+            written.
     """
+    out = Path(out)
     as_it_is(fitted, fitted.model)
-    return write_model(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
+    return write_variant(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
 
 
-def write_model(
+def write_variant(
     fitted: Identified, model: StateSpaceModel, forms: Sequence[FrictionForm], out: Path, *, alone: bool = False
 ) -> list[str]:
     """`write_mjcf` for a model and friction near those of a fit."""

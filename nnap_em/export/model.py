@@ -31,12 +31,24 @@ class ExportError(ValueError):
     """A model that has no plain NumPy form: the message names what it is about it."""
 
 
-def write_model(fitted: Identified, out: Path) -> str:
-    """Write parameters.json, predictor.py and model.stablehlo to the folder `out`, each whole or not at all.
+def write_model(fitted: Identified, out: Path | str) -> str:
+    """Write parameters.json, predictor.py and model.stablehlo to a folder, each whole or not at all.
 
-    Returns the reason why there is no predictor.py, as for a law of the command; empty where there is one.
-    Raises ExportError, before anything is written, where the inputs are commands of servos.
+    Args:
+        fitted: the model.
+        out: the folder.
+
+    Returns:
+        The reason why there is no predictor.py, as for a law of the command; empty where there is one.
+
+    Raises:
+        ExportError: its inputs are commands of servos; nothing is written.
+
+    Example:
+        >>> nnap_em.export.write_model(fit, f"{folder}/plain")
+        ''
     """
+    out = Path(out)
     if fitted.model.servos:
         raise ExportError(
             "its inputs are commands of servos, which have no exported form yet; use nnap-em predict, --urdf or --c"

@@ -101,12 +101,20 @@ def table(curve: Any, name: str, speed: float, knee: float, share: float) -> Tab
     return None
 
 
-def write_observer(fitted: Identified, out: Path, *, single: bool = False) -> None:
+def write_observer(fitted: Identified, out: Path | str, *, single: bool = False) -> None:
     """Write the observer of a fit as a C99 file, and its declarations beside it: `arm.c` and `arm.h`.
 
-    `single`: numbers of 32 bits.  Functions have the name of the file: `arm_start`, `arm_step`, `arm_covariance`.
-    Raises ExportError, before anything is written, where a law has no plain C form.
+    Functions have the name of the file: `arm_start`, `arm_step`, `arm_covariance`.
+
+    Args:
+        fitted: the model.
+        out: the file, which ends in .c.
+        single: numbers of 32 bits.
+
+    Raises:
+        ExportError: a law has no plain C form; nothing is written.
     """
+    out = Path(out)
     if out.suffix != ".c":
         raise ExportError(f"{out}: name a file that ends in .c; its declarations go beside it")
     source, header = observer_c(fitted, out.stem, single=single)

@@ -23,11 +23,20 @@ FAR = 1e9
 """Limit of a slide without stops, of an effort or a rate without limit: URDF requires one."""
 
 
-def write_urdf(fitted: Identified, out: Path) -> list[str]:
-    """Write the identified machine to a URDF file, and return what URDF has no place for, a sentence each.
+def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
+    """Write the identified machine to a URDF file.
 
-    Raises ExportError where the machine did not come from a file.
+    Args:
+        fitted: the model, of a machine from a file.
+        out: the file.
+
+    Returns:
+        What URDF has no place for, a sentence each.
+
+    Raises:
+        ExportError: the machine did not come from a file.
     """
+    out = Path(out)
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
     content, _ = placed(content_of(fitted, fitted.model, system, forms), fitted.model.effects)

@@ -42,6 +42,19 @@ def branches(
     """Paths that the readings leave possible beside those of `e_step`, the likelier first in each sequence.
 
     A weight is no better than the model: where not all forces of a machine are modelled, it is overconfident.
+
+    Args:
+        model: such as `fit.model`.
+        data: sequences.
+        smoother: such as `fit.smoother`.
+        key: random key of a smoother that draws.
+
+    Returns:
+        One for each other path, with its weight.
+
+    Example:
+        >>> nnap_em.smoothers.branches(fit.model, test, fit.smoother, key=key)
+        ()
     """
     first, second = e_step(model, data, smoother, key=key), smoother.second()
     if second is None:

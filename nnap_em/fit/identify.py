@@ -14,7 +14,19 @@ from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
-from ..em.loop import AFTERWARDS, EPOCHS, SCHEDULE, EMState, Schedule, e_step, fit, later_state, start_state, unsettled
+from ..em.loop import (
+    AFTERWARDS,
+    EPOCHS,
+    RESTED,
+    SCHEDULE,
+    EMState,
+    Schedule,
+    e_step,
+    fit,
+    later_state,
+    start_state,
+    unsettled,
+)
 from ..em.mstep import ScoringMStep, kept
 from ..em.prior import ParameterPrior
 from ..em.scale import holding, not_identifiable
@@ -58,10 +70,17 @@ class Identified(NamedTuple):
         """The likeliest model."""
         return cast(StateSpaceModel, self.state.best)
 
+    @property
+    def converged(self) -> bool:
+        """True where EM came to rest; `state.stop` is the reason for its end."""
+        return self.state.stop == RESTED
+
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
-        line = f"\n  estimated: {quantities(estimated, self.rig.unit)}" if estimated else ""
-        return f"Identified {self.rig.name!r} after {counted(self.state.epoch, 'epoch')}{line}\n  {self.model}"
+        stop = f" ({self.state.stop}), {np.nanmean(self.state.top):.6g} nat a sequence" if self.state.stop else ""
+        lines = [f"Identified {self.rig.name!r} after {counted(self.state.epoch, 'epoch')}{stop}"]
+        lines += [f"estimated: {quantities(estimated, self.rig.unit)}"] if estimated else []
+        return "\n  ".join([*lines, *self.memory.splitlines(), str(self.model)])
 
 
 class FrictionTable(NamedTuple):
@@ -117,10 +136,31 @@ def identify(
     start: Identified | None = None,
     watch: Watch = lambda state, seen, used: None,
 ) -> Identified:
-    """Fit the declared unknowns of `rig` (friction, uncertain parameters, noise) to `data`; go on from `start`.
+    """Fit the declared unknowns of a rig to logs by Expectation-Maximisation: friction, uncertain parameters, noise.
 
-    Without a `smoother` it is that of `start`, or the cubature smoother.
-    Raises FitError when no sequence can be followed.
+    [Vantilborgh, Lefebvre & Crevecoeur, the paper that this library implements, algorithm 1]
+
+    Args:
+        rig: what is declared.
+        data: sequences to fit.
+        key: random key of the start.
+        smoother: makes the smoother, such as `nnap_em.smoothers.ParticleSmoother`; without it that of `start`, or the
+            cubature smoother.
+        epochs: of EM, at most.
+        schedule: the growing horizon.
+        start: a fit to go on from.
+        watch: called after every epoch with its state, the rows seen and the sequences used.
+
+    Returns:
+        The fitted model with what is needed to use it, to judge it and to go on; `print` shows a table.
+
+    Raises:
+        FitError: no sequence can be followed.
+
+    Example:
+        >>> fit = nnap_em.identify(rig, train, key=key, epochs=3)
+        >>> fit.model.log_r.shape  # one measured column
+        (1,)
     """
     if start is None:
         rig = holding(rig, not_identifiable(rig, build_system(rig), data))
@@ -237,9 +277,20 @@ def nodes_between(
 
 
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
-    """Friction in steady sliding at `velocity` [rad/s], and its covariance (Laplace).
+    """Friction in steady sliding, and its covariance (Laplace).
 
     It is the learned map, and below the knee of a contact with memory, where the map is a straight line, the contact's.
+
+    Args:
+        fitted: the model.
+        velocity: rates of each joint (joint, node) [rad/s, or m/s].
+
+    Returns:
+        Torque (joint, node) [N m, or N] and its covariance over the nodes of a joint; `.std` is its square root.
+
+    Example:
+        >>> nnap_em.friction_table(fit, jnp.linspace(-0.2, 0.2, 5)[None]).std.shape
+        (1, 5)
     """
     weights = fitted.m_step.weights(fitted.model)
     w, model = weights.read(fitted.model), fitted.model
@@ -276,7 +327,18 @@ def _friction(weights: Weights, unknown, w, precision, velocity, contacts: State
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
-    """Estimated physical parameters: value and standard deviation in the unit of `rig.toml`."""
+    """Estimated physical parameters with their standard deviations.
+
+    Args:
+        fitted: the model.
+
+    Returns:
+        (value, standard deviation) by name, in the unit of `rig.toml`; empty where all are trusted.
+
+    Example:
+        >>> nnap_em.parameter_table(fit)
+        {}
+    """
     prior = fitted.m_step.prior
     if not prior.names:
         return {}

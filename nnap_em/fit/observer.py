@@ -116,9 +116,24 @@ class _Row(NamedTuple):
 def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cubature = CUBATURE) -> Observer:
     """The model of a fit as an online estimator, a row every `rig.dt` seconds.
 
-    `branches`: Gaussians at most, where an angle is not read; one where all are.  A reading that depends on the input
-    of its own row, an acceleration, counts one row later.
-    Raises ValueError where a law of the command has no form for one row, and for a rig that is written as equations.
+    A reading that depends on the input of its own row, an acceleration, counts one row later.
+
+    Args:
+        fitted: the model.
+        branches: Gaussians at most, where an angle is not read; one where all are.
+        linearise: tangent or cubature.
+
+    Returns:
+        Pure functions `start` and `step(state, u, y)`; a reading that is NaN is none.
+
+    Raises:
+        ValueError: a law of the command has no form for one row, or the rig is written as equations.
+
+    Example:
+        >>> online = nnap_em.observer(fit)
+        >>> state = online.step(online.start(), jnp.asarray(test.u[0, 0]), jnp.asarray(test.y[0, 0]))
+        >>> state.mean.shape
+        (2,)
     """
     rig, model = fitted.rig, fitted.model
     if rig.equations:

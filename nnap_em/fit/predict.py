@@ -59,7 +59,7 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
     return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
 
 
-def smooth(fitted: Identified, data: Dataset) -> Posterior:
+def posterior_of(fitted: Identified, data: Dataset) -> Posterior:
     """p(x_k | all y) of every sequence by the smoother of the fit; one that draws gives the same each time."""
     return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
 
@@ -150,28 +150,53 @@ DRAWN = 32
 """Number of models drawn for the dependence of a smoothed state on the model."""
 
 
-def smoothed_states(fitted: Identified, data: Dataset) -> Gaussian:
-    """Smoothed states in the coordinates of `Prediction`, with the uncertainty of the model in their covariance.
+def smooth(fitted: Identified, data: Dataset) -> Gaussian:
+    """Smooth every state of each sequence from all its readings, the uncertainty of the model in the covariance.
 
     A hidden joint hangs on the model alone: on two real double pendulums the smoother's own standard deviation held the
     angle within two in 55 and 65 % of the rows, this one in 83 and 87 %.
+
+    Args:
+        fitted: the model.
+        data: sequences.
+
+    Returns:
+        Mean (sequence, row, state) and covariance, in the coordinates of `Prediction` [rad, rad/s, or m, m/s].
+
+    Example:
+        >>> nnap_em.smooth(fit, test).mean.shape == (*test.t.shape, 2)
+        True
     """
     data = jax.device_put(data)
     key_model, key_force = jax.random.split(jax.random.key(1))
-    path, phi = smooth(fitted, data).state, phi_samples(fitted, DRAWN, key=key_model)
+    path, phi = posterior_of(fitted, data).state, phi_samples(fitted, DRAWN, key=key_model)
     model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key_force)
     return each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
 
 
 def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArray, samples: int = 100) -> Prediction:
-    """Distribution of every state from the readings up to `given` [s] after the first row and all inputs.
+    """Predict every state from the first readings of each sequence and all its inputs.
 
     Uncertainty of the present state, of friction and parameters, and process noise are in it; measurement noise is
     not. The mean is that of sample paths, of equations the path of the model itself: over many time constants paths
     with wide parameters and noise are no more what equations are used for.
+
+    Args:
+        fitted: the model.
+        data: sequences; readings later than `given` are not used.
+        given: time from the first row on whose readings are used [s].
+        key: random key of the sample paths.
+        samples: number of sample paths.
+
+    Returns:
+        Mean and standard deviation of every state and sensor, (sequence, row, state) [rad, rad/s, or m, m/s].
+
+    Example:
+        >>> nnap_em.predict(fit, test, 0.5, key=key, samples=20).mean.shape == (*test.t.shape, 2)
+        True
     """
     known = given_samples(data, given)
-    posterior = smooth(fitted, data._replace(valid=known))
+    posterior = posterior_of(fitted, data._replace(valid=known))
     key_draw, key_roll = jax.random.split(key)
     common = drawn_paths(fitted, samples, key=key_draw)
     sequences, rows = data.t.shape
@@ -185,7 +210,23 @@ def predict(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyArra
 def horizon_errors(
     prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = HORIZONS
 ) -> dict[str, list[float]]:
-    """RMS of prediction minus reading over (given, given + horizon], per measured column; NaN where no data."""
+    """Root mean square of prediction minus reading over some horizons.
+
+    Args:
+        prediction: of `predict`.
+        fitted: its model.
+        data: its sequences, with all readings.
+        given: its `given` [s].
+        horizons: errors are those over (given, given + horizon] [s].
+
+    Returns:
+        Errors by measured column, one a horizon, in its unit; NaN where there are no readings.
+
+    Example:
+        >>> prediction = nnap_em.predict(fit, test, 0.5, key=key, samples=20)
+        >>> list(nnap_em.horizon_errors(prediction, fit, test, 0.5, horizons=(0.1, 0.25)))
+        ['x']
+    """
     y, observed = (np.asarray(a) for a in fill_missing(jnp.asarray(data.y)))
     since = np.asarray(data.t) - np.asarray(data.t)[:, :1] - given
     system = fitted.model.system

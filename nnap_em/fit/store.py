@@ -73,9 +73,19 @@ def fingerprint(data: Dataset) -> str:
 def save(
     path: Path | str, fitted: Identified, *, fingerprint: str = "", notes: Mapping[str, Any] | None = None
 ) -> None:
-    """Write `fitted` to one file, whole or not at all.
+    """Write a fit to one file, whole or not at all; it loads with the same numbers to the last bit.
 
-    Raises StoreError if it could not be loaded again: if it is of another structure than `identify` makes.
+    Args:
+        path: the file, an npz.
+        fitted: the fit.
+        fingerprint: digest of its training data, for `--resume`.
+        notes: whatever else should be kept, as JSON.
+
+    Raises:
+        StoreError: it could not be loaded again, since it is of another structure than `identify` makes.
+
+    Example:
+        >>> nnap_em.save(f"{folder}/model.npz", fit)
     """
     path = Path(path)
     arrays: dict[str, np.ndarray] = {}
@@ -111,9 +121,21 @@ def save(
 
 
 def load(path: Path | str) -> Identified:
-    """The fitted model in `path`, with the numbers that were saved.
+    """The fit that a file holds, with the numbers that were saved.
 
-    Raises StoreError if the file is damaged, foreign, or of another version.
+    Args:
+        path: of `save`, or model.npz or after.npz of the commands.
+
+    Returns:
+        The fit.
+
+    Raises:
+        StoreError: the file is damaged, foreign, or of another version.
+
+    Example:
+        >>> nnap_em.save(f"{folder}/model.npz", fit)
+        >>> nnap_em.load(f"{folder}/model.npz").rig == rig
+        True
     """
     return read(Path(path)).fitted
 

@@ -67,7 +67,22 @@ class Along(NamedTuple):
 
 
 def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[CheckResult]:
-    """Results of all checks of a data set, or what is missing where there is too little of it; nothing is fitted."""
+    """Check whether logs can identify what a rig declares; nothing is fitted.
+
+    Args:
+        rig: what is declared.
+        train: logs to be fitted.
+        test: logs to be predicted, or None.
+        key: random key of the start of the problem.
+
+    Returns:
+        Results of all checks, each with its mark (ok, warning, error) and reason; where there is too little data, what
+        is missing.
+
+    Example:
+        >>> [result.text for result in nnap_em.check(rig, logs, None, key=key) if result.mark == "error"]
+        []
+    """
     data = Dataset(*(np.asarray(part) for part in train.data))
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_held(train, rig), *_rough(train)]
     if amount[0].mark == ERROR:

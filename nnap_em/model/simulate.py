@@ -40,7 +40,22 @@ def simulate(
     key: PRNGKeyArray,
     substeps: int = 10,
 ) -> Experiment:
-    """Logs of `model` as the truth, integrated with `substeps` Runge-Kutta steps per sample and both noises added."""
+    """Logs of a model as the truth, both noises added.
+
+    Args:
+        model: the truth, such as `fit.model`.
+        x0: first states (sequence, state) [rad, rad/s, or m, m/s].
+        u: inputs (sequence, row, input) [N m, or N].
+        key: random key of both noises.
+        substeps: Runge-Kutta steps a sample.
+
+    Returns:
+        The Dataset and the states behind it.
+
+    Example:
+        >>> nnap_em.simulate(fit.model, jnp.zeros((3, 2)), jnp.ones((3, 10, 1)), key=key).data.y.shape
+        (3, 10, 1)
+    """
     truth = dataclasses.replace(model, substeps=substeps)
     key_process, key_reading = jax.random.split(key)
     w = jax.random.normal(key_process, (*u.shape[:2], x0.shape[1]), x0.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
@@ -75,8 +90,18 @@ def paper_friction(dtype=float) -> StribeckLaw:
 def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.5, dtype=float) -> StateSpaceModel:
     """The true acrobot of the paper: Table I, friction in both joints, only joint 1 read at 100 Hz.
 
-    `q_std` is the process noise of angles [rad] and rates [rad/s] per step, `r_std` that of the readings,
-    `start_std` that of theta2 in the first row [rad].
+    Args:
+        q_std: process noise of angles [rad] and rates [rad/s] per step.
+        r_std: noise of the readings of theta1 [rad] and its rate [rad/s].
+        start_std: standard deviation of theta2 in the first row [rad].
+        dtype: of all numbers.
+
+    Returns:
+        The model.
+
+    Example:
+        >>> nnap_em.paper.paper_model().system.coordinates
+        ('theta1', 'theta2')
     """
     a = lambda *values: jnp.asarray(values, dtype)  # noqa: E731
     system = Acrobot(**{k: a(v)[0] for k, v in {**Acrobot.optional, **table_i}.items()}, joints=drives)
@@ -107,7 +132,23 @@ paper_sweep = Sweep((0.05, 0.3), (0.5, 3.0), (math.pi / 2, 3 * math.pi / 2))
 
 
 def paper_experiment(model: StateSpaceModel, sequences: int = 20, steps: int = 500, *, key: PRNGKeyArray) -> Experiment:
-    """Sinusoidal torques of another amplitude and period in each sequence, starts in the upper half plane."""
+    """The paper's experiment: sinusoidal torques of another amplitude and period in each sequence.
+
+    Starts are in the upper half plane.
+
+    Args:
+        model: the truth, such as `paper_model()`.
+        sequences: their number.
+        steps: samples of each after the first row.
+        key: random key of starts, inputs and noise.
+
+    Returns:
+        The Dataset and the states behind it.
+
+    Example:
+        >>> nnap_em.paper.paper_experiment(nnap_em.paper.paper_model(), 2, 5, key=key).data.u.shape
+        (2, 6, 1)
+    """
     return sweep_experiment(model, paper_sweep, sequences, steps, key=key)
 
 

@@ -16,7 +16,7 @@ from ..em.build import build_system
 from ..em.loop import REFUSED
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import misfits, moved
-from ..fit.predict import smooth
+from ..fit.predict import posterior_of
 from ..identifiability.check import dynamics
 from ..numerics.digits import counted
 from ..residual.residual import names_of
@@ -144,7 +144,7 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
 
 def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:
     """Smoothed velocities of the training sequences that took part."""
-    mean = np.asarray(smooth(fitted, train.data).state.mean)
+    mean = np.asarray(posterior_of(fitted, train.data).state.mean)
     valid = np.array(train.data.valid)
     valid[epochs[-1]["left_out"]] = False
     inside = valid & np.isfinite(mean).all(axis=-1)

@@ -16,7 +16,7 @@ from ..data.dataset import Dataset
 from ..data.units import force_unit, joint_called, state_unit
 from ..em.mstep import kept
 from ..fit.identify import Identified
-from ..fit.predict import smooth
+from ..fit.predict import posterior_of
 from ..model import hooks
 from ..model.base import prepare
 from ..model.state_space import with_effects
@@ -152,7 +152,7 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     linearised about the smoothed distribution by cubature, whichever smoother gave that.
     """
     data = jax.device_put(data)
-    posterior = smooth(fitted, data)
+    posterior = posterior_of(fitted, data)
     outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
     innovation, force, std, partial_force, partial_force_std, state, predicted, u = outcome
     t, valid = np.asarray(data.t), np.asarray(data.valid)

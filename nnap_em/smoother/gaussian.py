@@ -127,10 +127,32 @@ def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) 
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:
-    """The extended Kalman (tangent) filter with RTS smoother."""
+    """The extended Kalman (tangent) filter with RTS smoother.
+
+    Args:
+        bank: hypotheses of the start, `fit.bank`.
+        **options: of `GaussianSmoother`.
+
+    Returns:
+        The smoother.
+
+    Example:
+        >>> fit = nnap_em.identify(rig, train, key=key, epochs=2, smoother=nnap_em.smoothers.ExtendedKalmanSmoother)
+    """
     return GaussianSmoother(bank, Tangent(), **options)
 
 
 def CubatureSmoother(bank: StartBank, **options) -> GaussianSmoother:
-    """The cubature (sigma-point) filter with RTS smoother."""
+    """The cubature (sigma-point) filter with RTS smoother.
+
+    Args:
+        bank: hypotheses of the start, `fit.bank`.
+        **options: of `GaussianSmoother`.
+
+    Returns:
+        The smoother.
+
+    Example:
+        >>> smoother = nnap_em.smoothers.CubatureSmoother(fit.bank)
+    """
     return GaussianSmoother(bank, Cubature(), **options)

@@ -3,9 +3,11 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from ..data.rig import SystemSpec
+from ..data import rig as rigs
+from ..data.rig import Rig, SystemSpec
 from ..machines.from_file import declare
 from . import acrobot, declared, equations, pendubot, pendulum, slide, tree
 from .base import AbstractSystem
@@ -41,10 +43,36 @@ systems["equations"] = equations.Equations
 specs["equations"] = SystemSpec((), (), {}, 0, declare=declared.declare)
 
 
-def register(name: str, system: type[AbstractSystem]) -> None:
-    """Make a machine of yours known as `type = name` in `rig.toml`, in this process; a name that is taken is refused.
+def read_rig(path: Path | str) -> Rig:
+    """The rig that a rig.toml declares, in SI units, of a machine that ships or that was registered.
 
-    Call it before `read_rig` and before `load` of a model of this machine.
+    Args:
+        path: the file.
+
+    Returns:
+        What is declared.
+
+    Raises:
+        RigError: at the first mistake, with file, key and what to do.
+
+    Example:
+        >>> nnap_em.read_rig(f"{folder}/rig.toml").measured
+        ('x',)
+    """
+    return rigs.read_rig(path, specs)
+
+
+def register(name: str, system: type[AbstractSystem]) -> None:
+    """Make a machine known as `type = name` in `rig.toml`, in this process.
+
+    Call it before `read_rig`, and before `load` of a model of this machine.
+
+    Args:
+        name: for rig.toml.
+        system: its class.
+
+    Raises:
+        ValueError: the name is taken.
     """
     if systems.get(name, system) is not system:
         raise ValueError(f"{name!r} is the name of {systems[name].__name__}; give the machine another one")
@@ -61,10 +89,19 @@ def register_equations(
     parameters: Sequence[str],
     units: Mapping[str, str] | None = None,
 ) -> None:
-    """Make equations known as `type = name` in `rig.toml`, in this process, by a function `rate(x, u, p)`.
+    """Make equations known as `type = name` in `rig.toml`, in this process, by a Python function.
 
-    It gets states, inputs and parameters as attributes (`x.h1`) and returns the derivatives of all states by their
-    names [per second]; `states` and `inputs` have their units, those of parameters are in `units`.
+    Args:
+        name: for rig.toml.
+        rate: `rate(x, u, p)` gets states, inputs and parameters as attributes (`x.h1`) and returns the derivatives
+            of all states by their names [per second].
+        states: unit of every state.
+        inputs: unit of every input.
+        parameters: names of the parameters.
+        units: those of parameters that have one.
+
+    Raises:
+        ValueError: the name is taken.
     """
     if (
         equations.functions.get(name, rate) is not rate

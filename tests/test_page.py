@@ -9,7 +9,7 @@ import pytest
 from nnap_em.diagnosis.keys import words
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
-from nnap_em.report.page import MOST, Picture, page
+from nnap_em.report.page import MOST, Picture, page, write_page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, reached
 from nnap_em.residual.statistics import LEVEL
@@ -116,7 +116,7 @@ def test_page_is_whole_whatever_is_missing(missing):
         assert "None" not in "".join(parsed.text) and "nan" not in "".join(parsed.text)
         assert "script" not in parsed.tags
         assert not re.search(r"https?://|url\(|@import", html)
-        assert all(a.startswith("data:image/") for a in parsed.addresses)
+        assert all(a.startswith("data:image/") or a == "figures.html" for a in parsed.addresses)
 
 
 def test_pictures_of_one_title_are_chosen_from_and_every_picture_is_enlarged_without_a_script():
@@ -322,3 +322,14 @@ def test_what_the_test_sequences_do_not_bear_out_is_doubted():
     assert "Doubtful" not in page(WHOLE | {"error": error})  # what one column loses, another one more than gains
     assert "Doubtful" not in page(WHOLE)
     assert "Beyond doubt" in page(WHOLE)
+
+
+def test_figures_to_zoom_into_are_one_file_that_fetches_nothing(tmp_path):
+    """The same figures as on the page, in its order; the script asks for nothing."""
+    write_page(tmp_path, {"rig": "bench"}, FIGURES, lambda text: text.replace("Learned", "Found"))
+    html = (tmp_path / "figures.html").read_text()
+    parsed = _parsed(html)
+    assert parsed.addresses == [picture.source for picture in FIGURES]
+    assert "Found" in html and "Learned" not in html and "<title>bench</title>" in html
+    assert not re.search(r"https?://|fetch|XMLHttp|import", html)
+    assert (tmp_path / "report.html").read_text().count("figures.html") == 1

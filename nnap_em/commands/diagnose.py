@@ -39,7 +39,11 @@ def run(args: argparse.Namespace, log: Log) -> None:
         diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
         journal.open = not diagnosis.complete
         accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
-        for name in ("report.json", "report.html"):  # older ones are not of the models that are written now
+        for name in (
+            "report.json",
+            "report.html",
+            "figures.html",
+        ):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before.npz", diagnosis.before), (AFTER, diagnosis.after)):

@@ -36,7 +36,11 @@ def run(args: argparse.Namespace, log: Log) -> int:
         most = args.epochs * (1 + bench.rig.memory)
         watch, key = _watch(bench.rig, most, epochs, log), jax.random.key(args.seed)
         fitted = identify(bench.rig, data, key=key, smoother=smoother(args), epochs=args.epochs, watch=watch)
-        for name in ("report.json", "report.html"):  # older ones are not of the model that is written now
+        for name in (
+            "report.json",
+            "report.html",
+            "figures.html",
+        ):  # older ones are not of the model that is written now
             (args.out / name).unlink(missing_ok=True)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}

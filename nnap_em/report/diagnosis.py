@@ -19,13 +19,12 @@ from ..fit.predict import GIVEN, Prediction
 from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
-from ..storage.files import replace_text
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
-from .page import MOST, ROOM, Picture, page, picture
+from .page import MOST, ROOM, Picture, picture, write_page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
 
@@ -86,7 +85,7 @@ def write_diagnosis(
     }
     named = diagnosis.before.rig.named
     write_json(out / "report.json", document, named)
-    replace_text(out / "report.html", named(page(document, figures)))
+    write_page(out, document, figures, named)
     log(document["verdict"])
     log(f"wrote {out / 'report.html'} and report.json")
 

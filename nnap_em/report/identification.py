@@ -20,13 +20,13 @@ from ..fit.predict import posterior_of
 from ..identifiability.check import dynamics
 from ..numerics.digits import counted
 from ..residual.residual import names_of
-from ..storage.files import replace_bytes, replace_text
+from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, visited
 from .error_plots import error_figure
 from .friction_plots import friction_figure
-from .page import Picture, page, picture
+from .page import Picture, picture, write_page
 from .tables import visited_nodes, write_friction, write_json
 from .wording import reached, sentence
 
@@ -93,7 +93,7 @@ def write_identification(
     }
     _log_summary(document, log)
     write_json(out / "report.json", document, fitted.rig.named)
-    replace_text(out / "report.html", fitted.rig.named(page(document, figures)))
+    write_page(out, document, figures, fitted.rig.named)
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
     return not misfit
 

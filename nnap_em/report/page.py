@@ -8,7 +8,8 @@ import io
 import itertools
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 from ..diagnosis.findings import growth
 from ..numerics.digits import finite, number
 from ..residual.statistics import LEVEL
+from ..storage.files import replace_text
 from . import wording
 from .vocabulary import MEANINGS, WORDS
 from .wording import ratio, reached
@@ -103,6 +105,15 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         doubted=_doubted(document),
         parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
     )
+
+
+def write_page(
+    out: Path, document: Mapping[str, Any], pictures: Sequence[Picture], named: Callable[[str], str] = str
+) -> None:
+    """Write report.html, and figures.html with the same figures to zoom into, in the names of the user's file."""
+    title = document.get("rig") or "Figures"
+    replace_text(out / "figures.html", named(rendered("figures.html.j2", title=title, pictures=pictures)))
+    replace_text(out / "report.html", named(page(document, pictures)))
 
 
 def rendered(template: str, **content: Any) -> str:

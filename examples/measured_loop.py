@@ -169,7 +169,7 @@ def summary(done: Diagnosis) -> str:
     report = done.report
     suspects = "".join(f"; a suspect: {s['law']}" for s in report.get("suspects", [])[:1])
     laws = "; ".join(f"{e['description'].partition(':')[0]}{share_removed(e['evidence'])}" for e in report["effects"])
-    return laws or ("it cannot tell what" if report.get("cannot_tell") else f"nothing{suspects}")
+    return laws or ("it cannot tell what" if report.get("undecided") else f"nothing{suspects}")
 
 
 def share_removed(evidence: dict[str, float | None]) -> str:

@@ -295,7 +295,7 @@ def test_rivals_are_fitted_in_the_place_of_a_law(slide):
 
 def test_what_a_report_leaves_open_becomes_pairs():
     lag = {"name": "actuator_lag", "joint": 2, "channel": None}
-    report = {"effects": [{"name": "input_delay", "joint": 2, "equivalent": [lag]}], "cannot_tell": [lag]}
+    report = {"effects": [{"name": "input_delay", "joint": 2, "equivalent": [lag]}], "undecided": [lag]}
     pairs = [(None, Law("actuator_lag", 2)), (Law("input_delay", 2), Law("actuator_lag", 2))]
     assert open_pairs(report) == pairs
     assert open_pairs({}) == []

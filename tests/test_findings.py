@@ -195,7 +195,7 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
     assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
     assert all(row["velocity"][0] < row["velocity"][1] for row in joints)
     assert report["effects"] == [] and report["disagreements"][0]["files"] == ["b.csv"]
-    assert [(rival["name"], rival["joint"]) for rival in report["cannot_tell"]] == [
+    assert [(rival["name"], rival["joint"]) for rival in report["undecided"]] == [
         ("dead_zone", 2),
         ("torsional_spring", 1),
     ]

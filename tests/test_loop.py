@@ -53,7 +53,7 @@ def test_two_effects_of_a_slide_through_the_command(tmp_path):
     report = json.loads((out / "report.json").read_text())
     _named_and_sized(report)
     _exact_to_the_interface(report, (out / "report.html").read_text())
-    _ends_over_the_whole_length(report["looks"])
+    _ends_over_the_whole_length(report["rounds"])
     for side in ("before", "after"):
         _errors_of_predict(tmp_path, report, side)
 

@@ -53,7 +53,7 @@ WHOLE = {
         "after": {"m1": {"value": 1.1, "std": 0.1}},
     },
     "noise": {"before": {"theta1": {"value": 0.005, "unit": "rad"}}, "after": {"theta1": 0.005}},
-    "looks": [
+    "rounds": [
         {
             "horizon_s": 1.0,
             "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}],

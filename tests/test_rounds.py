@@ -193,7 +193,7 @@ def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):
         (0.46, {"dead_zone": 0.51}, {"dead_zone": 160.0}, "motor_gain"),
     ],
 )
-def test_refits_decide_between_laws_that_the_screen_cannot_tell_apart(monkeypatch, share, errors, gains, accepted):
+def test_refits_decide_between_laws_that_the_screen_undecided_apart(monkeypatch, share, errors, gains, accepted):
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), share)]
     outcome, tried = _run(monkeypatch, entries, errors, gains)
     assert outcome.accepted.effect.name == accepted

@@ -48,7 +48,7 @@ class Rivals(NamedTuple):
 def open_pairs(report: Mapping[str, Any]) -> list[tuple[Law | None, Law]]:
     """Pairs that a diagnosis left open: a law of its model, or None where nothing was added, and a rival."""
     law = lambda entry: Law(entry["name"], entry.get("joint"), entry.get("channel"))  # noqa: E731
-    out: list[tuple[Law | None, Law]] = [(None, law(entry)) for entry in report.get("cannot_tell", [])]
+    out: list[tuple[Law | None, Law]] = [(None, law(entry)) for entry in report.get("undecided", [])]
     for effect in report.get("effects", []):
         out += [(law(effect), law(other)) for other in effect.get("equivalent", [])]
     return out

@@ -161,7 +161,7 @@ def pair_entries(design: Design) -> list[dict[str, Any]]:
     for i, pair in enumerate(design.rivals):
         both = {side: float(np.min(d[2 * i : 2 * i + 2])) for side, d in far.items() if side != "now"}
         wrong = {side: float(stats.norm.cdf(-0.5 * d)) for side, d in both.items()}
-        out.append({"laws": list(pair.names), "distance": both, "told_wrong": wrong})
+        out.append({"laws": list(pair.names), "distance": both, "misleading": wrong})
     return out
 
 
@@ -185,7 +185,7 @@ def _verdict(document: dict[str, Any]) -> str:
     told_most = sorted((name for name, times in surer.items() if times > NOTED), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
     for pair in document["apart"]:
-        wrong, old = pair["told_wrong"]["expected"], pair["told_wrong"]["same_time_of_old_inputs"]
+        wrong, old = pair["misleading"]["expected"], pair["misleading"]["same_time_of_old_inputs"]
         gains.append(
             f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
         )

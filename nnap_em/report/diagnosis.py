@@ -77,9 +77,9 @@ def write_diagnosis(
         "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
-        "looks": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
+        "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
         "disagreements": [d._asdict() for d in disputed],
-        "cannot_tell": [place_of(key) for key in rivals],
+        "undecided": [place_of(key) for key in rivals],
         "suspects": [suspect._asdict() for suspect in suspects],
         "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
     }

@@ -32,7 +32,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "units": {name: system.unit(name) for name in system.readable},
         "error_note": None if test else NO_TEST,
         "masked": masked(train, test),
-        "untold": []
+        "undetermined": []
         if fitted.rig.equations
         else sentences(identifiability(fitted.rig, system, fitted.model.servos or ())),
         "seed": seed,

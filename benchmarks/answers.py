@@ -24,7 +24,7 @@ from nnap_em.storage.files import cores, replace_text
 
 CASES = ("clean:middle:hidden:101", "strong:torsional_spring:hidden:11", "outside:bump:hidden:11")
 NNAP_EM = str(Path(sys.executable).with_name("nnap-em"))
-ROWS = 14
+ROWS = 5
 """Programs in the table of one."""
 
 
@@ -64,9 +64,10 @@ def main() -> None:
     args = arguments.parse_args()
     lines = [
         "# Time to an answer\n",
+        "The first run finds no cached program, and most of its time is compiling; the later run finds those of the "
+        "first. Times are of whole processes.\n",
         f"{date.today()}, {platform.machine()}, {cores()} cores, Python {platform.python_version()}; "
-        "written by `benchmarks/answers.py`. The first run finds no program compiled; the second finds those of the "
-        "first. Whole processes, with the start of Python, reading, figures and page.\n",
+        "written by `benchmarks/answers.py`.\n",
         "| command | data set | first run [s] | of it compiling [s] | programs | later run [s] | answer |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]

@@ -7,6 +7,7 @@ run on one core, except where a number of cores is given; rows of a table are ti
 """
 
 import argparse
+import csv
 import importlib.metadata
 import json
 import os
@@ -200,7 +201,8 @@ preface = """\
 # Throughput
 
 One pass of the library is faster than that of its fastest peer, with the same errors; as the library sets them (13
-starts, one relinearisation more) its Gaussian smoothers are slower than dynamax's one pass. [Summary](../throughput.md).
+starts, one relinearisation more) its Gaussian smoothers are slower than dynamax's one pass
+([summary](../throughput.md)).
 
 ![Rows smoothed per second](../figures/gallery/throughput.png)
 
@@ -217,8 +219,8 @@ against the simulated states: smoothed in the tables of smoothers, filtered in t
 Peers have the transition as their user would write it in jax.numpy (closed form of the 2 x 2 mass matrix, one matrix
 product per layer), or ours in the rows marked so. dynamax takes the points of the cubature rule. All resample
 systematically below half the sample size; cuthbert's backward sampler evaluates the transition again for every pair.
-particles is NumPy in 64 bits; it and the exact backward samplers run on the first 2 sequences. Our particle rows include
-the extended smoother about whose path particles are stored. Other models, devices and languages were not measured.
+particles is NumPy in 64 bits; it and the exact backward samplers run on the first 2 sequences. Our particle rows
+include the extended smoother about whose path particles are stored. Other models, devices and languages were not measured.
 """
 
 
@@ -286,6 +288,7 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
             rows += [
                 [smoother, f"{r['point']} {axes[axis]}", f"{r['time']:.3g}", f"{r['memory'] / 1e6:.0f}"] for r in runs
             ]
+    head = ["smoother", "work", "time [s]", "peak memory [MB]"]
     lines = ["", "## How time and memory grow", ""]
     lines.append(f"`e_step` as the library sets it, {base[0]} sequences x {base[1]} steps, {base[2]} particles and")
     lines += ["25 trajectories where nothing else is said; one core.", ""]
@@ -293,7 +296,11 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
         picture = out.parents[1] / "figures" / "throughput.png"
         growth_figure(curves, base).savefig(picture)
         lines += [f"![Time and memory of the E-step](../figures/{picture.name})", ""]
-    return [*lines, *table(["smoother", "work", "time [s]", "peak memory [MB]"], rows)]
+        numbers = out.with_suffix(".csv")
+        with numbers.open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([head, *rows])
+        return [*lines, f"[The numbers]({numbers.name})."]
+    return [*lines, *table(head, rows)]
 
 
 def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:

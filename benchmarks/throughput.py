@@ -220,7 +220,8 @@ Peers have the transition as their user would write it in jax.numpy (closed form
 product per layer), or ours in the rows marked so. dynamax takes the points of the cubature rule. All resample
 systematically below half the sample size; cuthbert's backward sampler evaluates the transition again for every pair.
 particles is NumPy in 64 bits; it and the exact backward samplers run on the first 2 sequences. Our particle rows
-include the extended smoother about whose path particles are stored. Other models, devices and languages were not measured.
+include the extended smoother about whose path particles are stored. Other models, devices and languages were not
+measured.
 """
 
 

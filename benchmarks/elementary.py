@@ -1,4 +1,4 @@
-"""Gain of each function that is written by hand for speed over the usual one: the table of docs/results/elementary.md.
+"""Gain of each function that is written by hand for speed over the usual one: the table of docs/results/elementary.csv.
 
     JAX_NUM_CPU_DEVICES=1 taskset -c 0 python benchmarks/elementary.py [--rounds 30]
 

@@ -177,14 +177,12 @@ def judged(record: dict[str, Any]) -> dict[str, Any]:
 
 
 preface = """\
-# Diagnosis, the table
-
-Written by `benchmarks/diagnose.py`. Rigs are simulated by `examples/plant.py`, a NumPy program that shares no code with
-the library: 20 training and 5 test sequences of 5 s, noise .005 rad and .05 rad/s, joint 2 hidden or shown.  "six" has
-six sequences, "untold" declares no noise, "missing" has a tenth of its readings empty.  "True" is a
-cubature filter and an open-loop prediction by the simulator itself.  Effects that a learned friction map holds
-(`torque_offset`, `motor_back_emf`) are right when nothing is named.  Seconds are of one busy core.
-[Every case](diagnose_table.csv) but clean ones without an alarm.
+Rigs are simulated by `examples/plant.py`, a NumPy program that shares no code with the library: 20 training and 5 test
+sequences of 5 s, noise 0.005 rad and 0.05 rad/s, joint 2 hidden or shown. "six" has six sequences, "untold" declares no
+noise, "missing" has a tenth of its readings empty. "True" is a cubature filter and an open-loop prediction by the
+simulator itself. Effects that a learned friction map holds (`torque_offset`, `motor_back_emf`) are right when nothing is
+named. Seconds are of one busy core. [Every case](diagnose_table.csv) but clean ones without an alarm; written by
+`benchmarks/diagnose.py`.
 """
 
 
@@ -232,7 +230,10 @@ def table(out: Path) -> tuple[str, str]:
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
     head = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}."
-    return "\n".join([preface, head, "", *summary, ""]), lines.getvalue()
+    every = [score for scores in groups.values() for score in scores]
+    right, bad = sum(s["right"] for s in every), sum(s["false"] or s["extras"] > 0 for s in every)
+    result = f"Of {len(every)} runs {right} are named right; {bad} have a false or an extra effect.\n"
+    return "\n".join(["# Diagnosis, the table\n", result, preface, head, "", *summary, ""]), lines.getvalue()
 
 
 def _name(entry: dict[str, Any]) -> str:

@@ -170,7 +170,7 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
         "theta2 prediction 1 s / true model": scores[1.0][1] / truth_scores[1.0][1],
         "theta2 prediction 2 s [rad]": scores[2.0][1],
         "theta2 prediction 2 s / true model": scores[2.0][1] / truth_scores[2.0][1],
-        "sequences lost at the end (left out or theta2 off by > .3 rad)": float(
+        "sequences lost at the end (left out or theta2 off by > 0.3 rad)": float(
             max(lost[-1], (smooth_error > 0.3).sum())
         ),
         "coverage of the 90 % friction band [%]": 100 * float(np.sum(count * inside) / np.sum(count)),
@@ -178,10 +178,10 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
         "epochs": float(fitted.state.epoch),
         "seconds for these epochs": fit_s,
         "seconds to compile": compile_s,
-        "process noise sd of rates [rad/s], joint 1 (truth .01)": q[2],
-        "process noise sd of rates [rad/s], joint 2 (truth .01)": q[3],
-        "reading noise sd theta1 [rad] (truth .01)": r[0],
-        "reading noise sd dtheta1 [rad/s] (truth .05)": r[1],
+        "process noise sd of rates [rad/s], joint 1 (truth 0.01)": q[2],
+        "process noise sd of rates [rad/s], joint 2 (truth 0.01)": q[3],
+        "reading noise sd theta1 [rad] (truth 0.01)": r[0],
+        "reading noise sd dtheta1 [rad/s] (truth 0.05)": r[1],
     }
 
 

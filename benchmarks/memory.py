@@ -306,7 +306,7 @@ def main() -> None:
         f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
     )
     if args.measured:
-        print("| reading | static, .25 and .5 s | with memory over static | seconds |\n| --- | --- | --- | --- |")
+        print("| reading | static, 0.25 and 0.5 s | with memory over static | seconds |\n| --- | --- | --- | --- |")
         for name in args.rigs:
             measured(args.measured / name)
         return

@@ -49,8 +49,8 @@ GROUP_COLUMNS = (
     "named right",
     "and nothing else",
     "with a false extra",
-    "test error at .5 s not above before",
-    "median log ratio at .5 s of those named right (number)",
+    "test error at 0.5 s not above before",
+    "median log ratio at 0.5 s of those named right (number)",
     "parameters within 15 %",
     "truth inside 2 std",
     "no report",
@@ -63,7 +63,7 @@ CASE_COLUMNS = (
     "truth (share of the typical torque)",
     "found",
     "right",
-    "error at .25, .5, 1 s: before / after / unplanted [rad]",
+    "error at 0.25, 0.5, 1 s: before / after / unplanted [rad]",
     "log ratio",
     "s of a processor",
 )
@@ -304,7 +304,7 @@ def table(records: Sequence[Entry]) -> str:
         reported = sum(s.extras > 0 for s in as_recorded)
         raised = sum(s.raised and s.extras > 0 for s in as_recorded)
         lines.append(
-            f"\nAs recorded: {len(as_recorded)} rigs, something reported on {reported}, the .5 s test error raised"
+            f"\nAs recorded: {len(as_recorded)} rigs, something reported on {reported}, the 0.5 s test error raised"
         )
         lines.append(f"by more than 2 % on {raised}.")
     true, hits = (sum(s.touches[i] for s in scores.values()) for i in range(2))

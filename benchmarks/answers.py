@@ -24,7 +24,7 @@ from nnap_em.storage.files import cores, replace_text
 
 CASES = ("clean:middle:hidden:101", "strong:torsional_spring:hidden:11", "outside:bump:hidden:11")
 NNAP_EM = str(Path(sys.executable).with_name("nnap-em"))
-ROWS = 5
+ROWS = 14
 """Programs in the table of one."""
 
 
@@ -65,13 +65,12 @@ def main() -> None:
     lines = [
         "# Time to an answer\n",
         "The first run finds no cached program, and most of its time is compiling; the later run finds those of the "
-        "first. Times are of whole processes.\n",
+        "first. Times are of whole processes. `--profile` prints the programs that compile.\n",
         f"{date.today()}, {platform.machine()}, {cores()} cores, Python {platform.python_version()}; "
         "written by `benchmarks/answers.py`.\n",
         "| command | data set | first run [s] | of it compiling [s] | programs | later run [s] | answer |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    profiles = []
     with tempfile.TemporaryDirectory() as place:
         work = Path(place)
         jobs = [("identify", "the paper's data set", work / "paper")]
@@ -86,8 +85,8 @@ def main() -> None:
             first, later = (run(command, folder, work / f"{number}_{i}", work / f"cache_{number}") for i in range(2))
             row = f"{first.seconds:.0f} | {first.compiling:.0f} | {first.programs} | {later.seconds:.0f}"
             lines.append(f"| {command} | {name} | {row} | {later.answer} |")
-            profiles += [f"\n## What the first `{command}` of {name} compiles\n", "```text", *first.profile, "```"]
-    replace_text(args.table, "\n".join([*lines, *profiles]) + "\n")
+            print(f"what the first {command} of {name} compiles", *first.profile, sep="\n", flush=True)
+    replace_text(args.table, "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

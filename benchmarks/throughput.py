@@ -201,15 +201,14 @@ preface = """\
 # Throughput
 
 One pass of the library is faster than that of its fastest peer, with the same errors; as the library sets them (13
-starts, one relinearisation more) its Gaussian smoothers are slower than dynamax's one pass
-([summary](../throughput.md)).
+starts, one relinearisation more) its Gaussian smoothers are slower than dynamax's one pass.
 
 ![Rows smoothed per second](../figures/gallery/throughput.png)
 
 The acrobot with a 1-16-16-1 tanh network of friction in each joint, one Runge-Kutta step per 10 ms, 20 sequences of
 500 steps, 32 bits; angle and rate of joint 1 read with noise of 0.01 rad and 0.05 rad/s, process noise 2e-4 rad and
 0.01 rad/s per step. All rows have the model that made the logs and the same prior of the start, 0.05 rad and 0.05 rad/s
-about the arm held out level: from a wide one a bootstrap filter of this size loses most sequences in any library.
+about the arm held out level.
 
 The rows of a table take turns in one process on one core. Time is the median of 3 to 7 runs after compilation (which
 includes tracing), memory the peak of one run beyond the loaded program and the logs, θ and ω the root mean square error
@@ -218,10 +217,8 @@ against the simulated states: smoothed in the tables of smoothers, filtered in t
 
 Peers have the transition as their user would write it in jax.numpy (closed form of the 2 x 2 mass matrix, one matrix
 product per layer), or ours in the rows marked so. dynamax takes the points of the cubature rule. All resample
-systematically below half the sample size; cuthbert's backward sampler evaluates the transition again for every pair.
-particles is NumPy in 64 bits; it and the exact backward samplers run on the first 2 sequences. Our particle rows
-include the extended smoother about whose path particles are stored. Other models, devices and languages were not
-measured.
+systematically below half the sample size. particles is NumPy in 64 bits; it and the exact backward samplers run on the
+first 2 sequences. Our particle rows include the extended smoother about whose path particles are stored.
 """
 
 

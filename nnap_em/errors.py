@@ -20,3 +20,7 @@ __all__ = [
     "RigWarning",
     "StoreError",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

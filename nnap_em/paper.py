@@ -15,3 +15,7 @@ __all__ = [
     "paper_experiment",
     "paper_model",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -76,3 +76,7 @@ def residual(fitted: Identified, data: Dataset) -> Figure:
         True
     """
     return residual_figure(residual_of(fitted, data), names_of(fitted))
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -15,3 +15,7 @@ __all__ = [
     "Posterior",
     "branches",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

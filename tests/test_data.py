@@ -1,7 +1,9 @@
 """Logs: what is written is read back, padding is marked, and every mistake is refused by line and column."""
 
 import cProfile
+import dataclasses
 import pstats
+import re
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 
 from nnap_em.data.dataset import DataError, Dataset, fill_missing, horizon, pad
 from nnap_em.data.formats import read_csv, write_csv
-from nnap_em.data.logs import DataWarning, check_split, read_logs
+from nnap_em.data.logs import DataWarning, check_split, logs_of_arrays, read_logs, sequences_of
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.systems import specs
 
@@ -117,7 +119,7 @@ def test_sequences_that_do_not_fit_are_refused_by_number():
         pad([])
     with pytest.raises(DataError, match=r"pad: sequence 1: shapes of t, u, y are \(\(3,\), \(3, 2\), \(3, 2\)\)"):
         pad([(t, u, y), (t, y, y)])
-    with pytest.raises(DataError, match=r"pad: sequence 0: .* they must be"):
+    with pytest.raises(DataError, match=r"pad: sequence 0: .* one column is u"):
         pad([(t, u[:2], y)])
 
 
@@ -207,3 +209,27 @@ def test_calls_of_reading_grow_with_the_rows_and_no_faster(tmp_path):
         counts.append(calls(tmp_path / str(rows), swing_rig()))
     assert counts[2] - counts[1] < 2.5 * (counts[1] - counts[0])
     assert counts[2] - counts[1] < 10 * 1000
+
+
+@pytest.mark.parametrize(
+    "change, problem",
+    [
+        (lambda d: d._replace(u=np.repeat(d.u, 2, axis=-1)), "u has 2 columns; give those of the rig in its order: u"),
+        (lambda d: d._replace(y=d.y[..., :0]), "y has 0 columns; give those of the rig in its order: theta1, dtheta1"),
+        (lambda d: d._replace(t=2 * d.t), "sequence 0, row 1: t goes from 0 to 0.02 s, the rig has dt = 0.01 s"),
+        (lambda d: d._replace(t=1e3 * d.t), "sequence 0, row 1: t goes from 0 to 10 s"),
+        (lambda d: d._replace(t=d.t + 0.004 * (np.arange(5) == 3)), "sequence 0, row 3: t goes from 0.02 to 0.034 s"),
+        (
+            lambda d: d._replace(u=np.where(np.arange(5)[:, None] == 2, np.nan, d.u)),
+            "sequence 0, row 2: u is no number",
+        ),
+    ],
+)
+def test_arrays_that_are_not_of_the_rig_are_refused(change, problem):
+    """What is in the padding does not count; a lost row and a missing reading may be."""
+    rig, t = dataclasses.replace(swing_rig(), dt=0.01), 0.01 * np.arange(5)
+    good = pad([(t, np.zeros((5, 1)), np.full((5, 2), np.nan)), (t[[0, 1, 3]], np.zeros((3, 1)), np.zeros((3, 2)))])
+    assert sequences_of(good, rig) is good
+    assert logs_of_arrays(good, rig).files == ("sequence 0", "sequence 1")
+    with pytest.raises(DataError, match=re.escape(problem)):
+        sequences_of(change(good), rig)

@@ -38,8 +38,9 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     """Sequences of any length as one Dataset, for data that are not in a folder of logs.
 
     Args:
-        sequences: (t, u, y) of each: time (row,) [s], inputs (row, input) [N m, or N], readings (row, column)
-            [rad, rad/s, or m, m/s]; NaN where there is no reading.
+        sequences: (t, u, y) of each: time (row,) [s], uniform; inputs (row, input) [N m, or N] in the order of
+            `rig.logged_inputs`; readings (row, column) [rad, rad/s, or m, m/s] in that of `rig.measured`, NaN where
+            there is none. One column is `u[:, None]`.
 
     Returns:
         Arrays (sequence, row, ...), as long as the longest; `valid` marks the rows that are there.
@@ -58,7 +59,8 @@ def pad(sequences: Sequence[tuple[Array, Array, Array]]) -> Dataset:
     for i, (t, u, y) in enumerate(sequences):
         expected = (len(t),), (len(t), inputs), (len(t), obs)
         if (shapes := (np.shape(t), np.shape(u), np.shape(y))) != expected or not len(t):
-            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}; they must be {expected}, time above 0")
+            hint = "give (row,), (row, input), (row, column), with a row at least; one column is u[:, None]"
+            raise DataError(f"pad: sequence {i}: shapes of t, u, y are {shapes}, not {expected}: {hint}")
     lengths = [len(t) for t, _, _ in sequences]
     time = max(lengths)
     return Dataset(

@@ -78,8 +78,8 @@ class Logs:
 def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
     """All logs of a folder by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
-    Spikes, what a stuck, late or saturated sensor reads, and all rows but the first in which a reading stands while the
-    machine moves, become missing samples.
+    Spikes and readings of stuck, late or saturated sensors, values that repeat while the machine moves among them,
+    become NaN.
 
     Args:
         folder: the CSV files, one a sequence.
@@ -114,6 +114,40 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
     unmasked = pad([s.as_read for s in sequences]) if masked else None
     return Logs(tuple(path.name for path in files), data, (*rig.logged_inputs, *rig.measured), masked, unmasked)
+
+
+def sequences_of(data: Dataset | Logs, rig: Rig) -> Dataset:
+    """The sequences of logs, or of arrays, which must be those of `rig`.
+
+    Raises DataError where they have other columns, another interval, or a row without an input.
+    """
+    data = data.data if isinstance(data, Logs) else data
+    for name, array, columns in (("u", data.u, rig.logged_inputs), ("y", data.y, rig.measured)):
+        if np.shape(array)[-1] != len(columns):
+            given, wanted = counted(np.shape(array)[-1], "column"), ", ".join(columns) or "none"
+            raise DataError(f"{name} has {given}; give those of the rig in its order: {wanted}")
+    valid, t, u = (np.asarray(a) for a in (data.valid, data.t, data.u))
+    steps = np.where(valid[:, 1:] & valid[:, :-1], np.diff(t, axis=1) / rig.dt, 1.0)
+    uneven = np.abs(steps - np.maximum(np.round(steps), 1)) > TOLERANCE
+    if uneven.any() or np.median(steps) > 1 + TOLERANCE:
+        i, k = np.argwhere(uneven if uneven.any() else steps > 1 + TOLERANCE)[0]
+        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} s"
+        raise DataError(f"{problem}, the rig has dt = {rig.dt:g} s; resample to uniform rows, or correct dt")
+    if (dark := valid & ~np.isfinite(u).all(axis=-1)).any():
+        i, k = np.argwhere(dark)[0]
+        raise DataError(f"sequence {i}, row {k}: u is no number; give it in every row (NaN in y is a missing reading)")
+    return data
+
+
+def logs_of_arrays(data: Dataset | Logs, rig: Rig) -> Logs:
+    """Arrays as logs, whose files are called by their place.
+
+    Raises DataError where they are not of `rig`.
+    """
+    if isinstance(data, Logs):
+        return data
+    data = sequences_of(data, rig)
+    return Logs(tuple(f"sequence {i}" for i in range(len(data.t))), data, (*rig.logged_inputs, *rig.measured))
 
 
 def check_split(train: Logs, test: Logs | None = None) -> None:

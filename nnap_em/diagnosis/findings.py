@@ -78,7 +78,8 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
         diagnosis: of `diagnose`.
 
     Returns:
-        One a law, in the order of their acceptance; empty where nothing is missing or the logs cannot decide.
+        One an effect, in the order of their acceptance; empty where nothing was found: `print(diagnosis)` shows
+        whether the logs were undecided.
 
     Example:
         >>> [finding.sentence for finding in nnap_em.findings(diagnosis)]

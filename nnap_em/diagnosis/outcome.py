@@ -5,7 +5,7 @@ from typing import NamedTuple
 from ..fit.identify import Identified
 from ..residual.interventions import Intervention
 from .hypothesis import Found
-from .keys import Key
+from .keys import Key, key_of, listed, words
 
 
 class Disputed(NamedTuple):
@@ -65,6 +65,13 @@ class Diagnosis(NamedTuple):
     """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
     complete: bool = True
     """False where the time was up before the search had ended: more may be missing."""
+
+    def __str__(self) -> str:
+        found = [words(key_of(effect)) for effect in self.after.model.effects[len(self.before.model.effects) :]]
+        open_ = [words(key) for step in self.last for key in step.rivals]
+        text = f"Diagnosis of {self.before.rig.name!r}: {listed(found) or 'nothing was found'}"
+        text += f"; the logs do not discriminate {listed(open_)}" if open_ else ""
+        return text + ("" if self.complete else "; the search is not complete")
 
     @property
     def last(self) -> tuple[Step, ...]:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
 
 from ..data.dataset import Dataset
+from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EMState, FitError, e_step
 from ..fit.identify import Identified, begin, finished, identify
@@ -191,7 +192,7 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
 
 def diagnose(
     rig: Rig,
-    data: Dataset,
+    data: Dataset | Logs,
     *,
     key: PRNGKeyArray,
     effort: Effort = EFFORT,
@@ -215,6 +216,7 @@ def diagnose(
         The models before and after, the evidence, and the course of the search; `findings` has it in sentences.
 
     Raises:
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
         FitError: no sequence can be followed.
 
     Example:
@@ -226,7 +228,7 @@ def diagnose(
     if rig.memory:  # the search has a law with memory of its own
         log("friction is learned as a static map; the search tries memory as the law presliding_friction")
         rig = dataclasses.replace(rig, memory=False)
-    data = jax.device_put(data)
+    data = Dataset(*map(jax.device_put, sequences_of(data, rig)))
     stages: Stages = {}
 
     white = white_readings(data, begin(rig, data, key=key).model)

@@ -59,7 +59,7 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
         alone: write no module.
 
     Returns:
-        What MuJoCo has no place for, a sentence each.
+        Effects that MuJoCo cannot express, a sentence each.
 
     Raises:
         ExportError: the machine did not come from a file; with `alone`, a law has no place in MuJoCo. Nothing is

@@ -31,7 +31,7 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
         out: the file.
 
     Returns:
-        What URDF has no place for, a sentence each.
+        Effects that URDF cannot express, a sentence each.
 
     Raises:
         ExportError: the machine did not come from a file.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
+from ..data.logs import Logs, sequences_of
 from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
@@ -127,7 +128,7 @@ def begin(
 
 def identify(
     rig: Rig,
-    data: Dataset,
+    data: Dataset | Logs,
     *,
     key: PRNGKeyArray,
     smoother: MakeSmoother | None = None,
@@ -155,6 +156,7 @@ def identify(
         The fitted model with what is needed to use it, to judge it and to go on; `print` shows a table.
 
     Raises:
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
         FitError: no sequence can be followed.
 
     Example:
@@ -162,6 +164,7 @@ def identify(
         >>> fit.model.log_r.shape  # one measured column
         (1,)
     """
+    data = sequences_of(data, rig)
     if start is None:
         rig = holding(rig, not_identifiable(rig, build_system(rig), data))
     fitted = begin(rig, data, key=key) if start is None else start
@@ -279,11 +282,11 @@ def nodes_between(
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
     """Friction in steady sliding, and its covariance (Laplace).
 
-    It is the learned map, and below the knee of a contact with memory, where the map is a straight line, the contact's.
+    It is the learned map; with `friction = "dynamic"` at the lowest velocities that of the contact with memory.
 
     Args:
         fitted: the model.
-        velocity: rates of each joint (joint, node) [rad/s, or m/s].
+        velocity: rates of each joint (joint, node) [rad/s, or m/s]; of one joint `v[None]`.
 
     Returns:
         Torque (joint, node) [N m, or N] and its covariance over the nodes of a joint; `.std` is its square root.

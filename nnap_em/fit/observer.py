@@ -124,10 +124,10 @@ def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cub
         linearise: tangent or cubature.
 
     Returns:
-        Pure functions `start` and `step(state, u, y)`; a reading that is NaN is none.
+        Pure functions `start` and `step(state, u, y)`; NaN means no reading.
 
     Raises:
-        ValueError: a law of the command has no form for one row, or the rig is written as equations.
+        ValueError: an effect on the command cannot be computed row by row, or the rig is written as equations.
 
     Example:
         >>> online = nnap_em.observer(fit)

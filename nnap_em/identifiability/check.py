@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset
-from ..data.logs import HELD, Logs
+from ..data.logs import HELD, Logs, logs_of_arrays
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
@@ -66,12 +66,14 @@ class Along(NamedTuple):
     """Jacobian of the time derivative of the state [1/s]."""
 
 
-def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> list[CheckResult]:
+def check(
+    rig: Rig, train: Logs | Dataset, test: Logs | Dataset | None = None, *, key: PRNGKeyArray
+) -> list[CheckResult]:
     """Check whether logs can identify what a rig declares; nothing is fitted.
 
     Args:
         rig: what is declared.
-        train: logs to be fitted.
+        train: logs to be fitted, of `read_logs` or of `pad`.
         test: logs to be predicted, or None.
         key: random key of the start of the problem.
 
@@ -79,10 +81,14 @@ def check(rig: Rig, train: Logs, test: Logs | None, *, key: PRNGKeyArray) -> lis
         Results of all checks, each with its mark (ok, warning, error) and reason; where there is too little data, what
         is missing.
 
+    Raises:
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
+
     Example:
         >>> [result.text for result in nnap_em.check(rig, logs, None, key=key) if result.mark == "error"]
         []
     """
+    train, test = logs_of_arrays(train, rig), None if test is None else logs_of_arrays(test, rig)
     data = Dataset(*(np.asarray(part) for part in train.data))
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_held(train, rig), *_rough(train)]
     if amount[0].mark == ERROR:

@@ -1,4 +1,7 @@
-"""Smoothers, for `identify(..., smoother=...)`: each is made from the hypotheses of the start of a fit."""
+"""Smoothers, for `identify(..., smoother=...)`: each is made from the hypotheses of the start of a fit.
+
+With options it is a function, `lambda bank: ParticleSmoother(CubatureSmoother(bank), num_particles=1000)`.
+"""
 
 from .fit.branches import Branch, branches
 from .smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother

@@ -39,7 +39,7 @@ from nnap_em.storage.journal import HERE, step
 
 MODEL, RULE = slide()
 BARE = Hypothesis(MODEL, RULE)
-DATA = Dataset(*(np.zeros((6, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((6, 9), bool))
+DATA = Dataset(np.tile(0.05 * np.arange(9), (6, 1)), *(np.zeros((6, 9, n)) for n in (1, 2)), np.ones((6, 9), bool))
 RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.05, "sequence", ("x", "dx"), {}, {})
 ACROBOT = declared_model(plant.Case(steps=20, hidden=False))
 AROUND = around(ACROBOT)

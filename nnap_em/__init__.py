@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .diagnosis.search import diagnose
     from .experiment.experiment import design
     from .fit.identify import Identified, friction_table, identify, parameter_table
+    from .fit.known import identify_from
     from .fit.observer import observer
     from .fit.predict import horizon_errors, predict, smooth
     from .fit.store import load, save
@@ -43,6 +44,7 @@ __all__ = [
     "friction_table",
     "horizon_errors",
     "identify",
+    "identify_from",
     "load",
     "observer",
     "pad",
@@ -73,6 +75,7 @@ _homes = {
     "diagnosis.search": ("diagnose",),
     "experiment.experiment": ("design",),
     "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
+    "fit.known": ("identify_from",),
     "fit.observer": ("observer",),
     "fit.predict": ("horizon_errors", "predict", "smooth"),
     "fit.store": ("load", "save"),

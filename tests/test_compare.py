@@ -16,7 +16,7 @@ import scipy.stats
 
 from nnap_em import compare
 from nnap_em.commands import cli
-from nnap_em.comparison.compare import CHANGED, LEAST_SHARED, Comparison, corrected_tests, number, shared
+from nnap_em.comparison.compare import CHANGED, LEAST_SHARED, Cause, Comparison, corrected_tests, number, shared
 from nnap_em.comparison.pooling import LEAST_VARIANCE, joint_test, pool
 from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.hypothesis import Hypothesis
@@ -27,6 +27,7 @@ from nnap_em.fit.identify import Identified, identify
 from nnap_em.fit.store import save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.report.comparison import describe, rows, table
+from nnap_em.report.wording import p_value
 
 SEQUENCES, STEPS, EPOCHS = 8, 150, 9
 GROWN = 0.15
@@ -97,6 +98,34 @@ def test_a_curve_is_compared_on_the_velocities_that_all_visited(changed):
     curve, visited = changed.curves[0], np.stack([fit.velocity[0] for fit in changed.fits])
     np.testing.assert_allclose(curve.velocity[[0, -1]], [visited[:, 0].max(), visited[:, 1].min()], rtol=1e-9)
     assert curve.torque.shape == curve.std.shape == (2, len(curve.velocity))
+
+
+def test_friction_is_not_blamed_where_it_cannot_be(changed):
+    """Several curves at once, a constant, a viscous number that goes to 0; and a law that the recordings show."""
+    (curve,) = changed.curves
+    assert not changed.other and "something other" not in changed.verdict
+    both = changed._replace(curves=(curve, curve._replace(joint=2)))
+    reason = "several at once: something other than friction changed, such as a load or a sensor"
+    assert both.verdict == f"The friction curves of joint 1 and joint 2 differ between first and grown, {reason}."
+    certain = curve.test._replace(p_value=1e-9)
+    for place, value, reason in ((5, [0.0, 3.0], "joint 1 by a constant"), (3, [5.5, 1.5], "joint 1 to a viscous")):
+        law = list(curve.law)
+        law[place] = law[place]._replace(value=np.asarray(value), std=np.ones(2), test=certain)
+        assert changed._replace(curves=(curve._replace(law=tuple(law)),)).other.startswith(reason)
+        law[place] = law[place]._replace(value=np.asarray([5.5, 2.5]), test=certain._replace(p_value=2 * CHANGED))
+        assert not changed._replace(curves=(curve._replace(law=tuple(law)),)).other
+    loaded = both._replace(cause=Cause("Changed since first: a payload.", False, ()))
+    assert loaded.verdict.startswith(
+        "Changed since first: a payload. The friction curves of joint 1 and joint 2 differ"
+    )
+    assert loaded.verdict.endswith("which is this change seen through friction.")
+    worn = changed._replace(cause=Cause("Changed since first: the Coulomb friction.", True, ()))
+    assert "The friction of joint 1 (Coulomb" in worn.verdict
+
+
+@pytest.mark.parametrize("p, text", [(1.01e-6, "1.0 × 10⁻⁶"), (0.99e-6, "< 10⁻⁶"), (0.0, "< 10⁻⁶")])
+def test_a_p_value_has_no_digits_that_mean_nothing(p, text):
+    assert p_value(p) == text
 
 
 # --- statistics against closed forms

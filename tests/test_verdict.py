@@ -147,7 +147,7 @@ def test_a_refit_vetoes_what_is_impossible_uncertain_or_small(numbers, code):
 
 
 def test_every_reason_has_a_sentence():
-    assert {"impossible", "uncertain", "undetermined", "small"} == set(REASONS)
+    assert {"impossible", "uncertain", "undetermined", "small", "before"} == set(REASONS)
 
 
 def test_what_is_lost_without_an_effect_is_most_of_the_floor():

@@ -29,6 +29,7 @@ examples:
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em design found --out next                   the inputs to play next, so that what is open is answered
   nnap-em compare monday friday --out changed       what changed between fits of one machine, and what did not
+  nnap-em monitor fit logs --out trend              an alarm where a machine changes, recording by recording
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
   nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
@@ -77,6 +78,7 @@ _IDENTIFY = """\
 examples:
   nnap-em identify bench --out fit
   nnap-em identify bench --out fit --smoother particle --particles 1000 --epochs 30
+  nnap-em identify february --from fit --out fit2   what the fit knows is the prior of these logs
   nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
 
 OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
@@ -86,6 +88,7 @@ the motion: the first sentence of the report says why.
 _DIAGNOSE = """\
 examples:
   nnap-em diagnose bench --out found
+  nnap-em diagnose february --from fit --out changed  what changed since a fit: a law, a number, or nothing
   nnap-em diagnose bench --out found --minutes 5    answer after about that time; --resume goes on
   nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
 
@@ -115,6 +118,18 @@ Each FIT is the output of identify or diagnose for the same machine: other logs,
 every estimated number of all fits with its standard deviation, a pooled value, and a p-value: the chance of such a
 difference where nothing changed.  Friction curves are compared on the velocities that all fits visited.  OUT gets
 compare.html (read this one) and compare.json.
+"""
+_MONITOR = """\
+examples:
+  nnap-em monitor fit logs --out trend
+  nnap-em monitor fit logs --out trend --resume     judge the recordings that came since
+  nnap-em monitor fit logs --out trend --rate 0.01  an alarm in a hundred recordings by chance, not in a thousand
+
+FOLDER holds recordings of one machine, by name in order of time.  Each is judged beside the recordings of the fit:
+multi-step errors, and the change of friction and of estimated numbers that it shows alone.  After an alarm the
+recordings since the change (of many the last, as many as the fit had) are searched for what changed, as by nnap-em
+diagnose --from.  A recording with a broken sensor, another unit or another clock is not judged, and listed.  OUT gets
+monitor.html (read this one) and monitor.json.  Exit status 4 where the machine changed.
 """
 _PREDICT = """\
 examples:
@@ -231,6 +246,7 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument(
             "--more", action="append", default=[], metavar="NEW", type=Path, help="a folder of further logs to train on"
         )
+        fits.add_argument("--from", dest="start", metavar="FIT", type=Path, help="a fit of the machine to begin from")
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=40, metavar="N", help="at most so many in all (40)")
@@ -244,6 +260,9 @@ def parser() -> argparse.ArgumentParser:
     design.add_argument("--rival", action="append", default=[], metavar="LAW", help="NAME[:JOINT]: one law more")
     design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
     design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
+    diagnose.add_argument(
+        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of that fit, where they were moved"
+    )
     design.add_argument(
         "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
     )
@@ -257,6 +276,16 @@ def parser() -> argparse.ArgumentParser:
     compare.add_argument("fits", metavar="FIT", nargs="+", type=Path, help="model.npz, or the folder that holds it")
     compare.add_argument("--out", metavar="OUT", type=Path, help="folder for the page and the numbers")
 
+    monitor = command("monitor", "watch a machine, recording by recording", _MONITOR)
+    monitor.add_argument("model", metavar="FIT", type=Path, help="model.npz, or the folder that holds it")
+    monitor.add_argument("folder", metavar="FOLDER", type=Path, help="the recordings")
+    monitor.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the page and the numbers")
+    monitor.add_argument("--rate", type=_rate, default=1e-3, metavar="P", help="false alarms a recording (.001)")
+    monitor.add_argument("--resume", action="store_true", help="keep what OUT/monitor.json says of recordings")
+    monitor.add_argument(
+        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
+    )
+
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)
     for use in (predict, smooth):
@@ -267,7 +296,7 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 
-    for reads in (check, identify, diagnose, design, predict, smooth):
+    for reads in (check, identify, diagnose, design, monitor, predict, smooth):
         reads.add_argument(
             "--trust-readings", action="store_true", help="use spikes and what a stuck, late or saturated sensor reads"
         )
@@ -289,7 +318,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command: 0 is done, 1 a check with an error, 2 refused with one line on stderr, 3 a fit that does not
-    describe the motion, 130 Ctrl-C.
+    describe the motion, 4 a machine that changed, 130 Ctrl-C.
     """
     arguments = parser()
     args = arguments.parse_args(argv)
@@ -411,6 +440,11 @@ def _time(text: str) -> float:
 
 def _minutes(text: str) -> float:
     return _number(text, float, math.ulp(0.0), "minutes, more than 0")
+
+
+def _rate(text: str) -> float:
+    value = _number(text, float, 1e-12, "false alarms a recording, above 0 and below .2")
+    return value if value < 0.2 else _number("", float, 0.0, "false alarms a recording, above 0 and below .2")
 
 
 def _part(text: str) -> float:

@@ -26,8 +26,9 @@ from ..em.loop import FitError
 from ..experiment.limits import DesignError
 from ..export.model import ExportError
 from ..fit.identify import Identified
+from ..fit.known import differences
 from ..fit.predict import GIVEN
-from ..fit.store import fingerprint
+from ..fit.store import Stored, fingerprint, model_file, read
 from ..identifiability.check import ERROR, torques
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
@@ -54,7 +55,7 @@ TRACED = "traced"
 """Folder of the programs before they were compiled, in that of the compiled ones."""
 MOST = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
-OPTIONS = ("smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
+OPTIONS = ("start", "smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
 
 
@@ -140,6 +141,41 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     return together(parts)
 
 
+def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) -> tuple[Rig, Logs]:
+    """Rig and training logs of the fit in `file`: of these folders, or of those that it names.
+
+    Raises DataError where they are not there, or are others.
+    """
+    folders = folders or list(map(Path, stored.notes.get("logs", [])))
+    gone = next((folder for folder in folders if not folder.is_dir()), None)
+    if not folders or gone:
+        problem = f"its logs are not at {gone}" if gone else "it does not say where its logs are"
+        raise DataError(f"{file}: {problem}; give their folder with --logs FOLDER")
+    rig = read_rig(folders[0] / "rig.toml", specs)
+    train = read_training(rig, folders, trust)
+    if stored.fingerprint and fingerprint(train.data) != stored.fingerprint:
+        wrong = "; give those with --logs FOLDER, or identify again with these"
+        raise DataError(f"{folders[0]}: not the logs, or not read as those, of the fit in {file}{wrong}")
+    return rig, train
+
+
+def origin(args: argparse.Namespace, bench: Bench, log: Log) -> tuple[Identified | None, Logs | None]:
+    """The fit of --from, and its own logs where they are at hand; logs what differs between the rigs."""
+    if args.start is None:
+        return None, None
+    file = model_file(args.start)
+    stored = read(file)
+    for line in differences(stored.fitted.rig, bench.rig):
+        log(f"{line}; that of the fit is used")
+    if stored.fingerprint and stored.fingerprint == fingerprint(bench.train.data):
+        raise DataError(f"{args.folder}: the logs of the fit in {file}; give others")
+    try:
+        return stored.fitted, logs_of(file, stored, args.logs, args.trust_readings)[1]
+    except (DataError, RigError) as error:
+        log(f"{error}: what these show as well is not left out")
+        return stored.fitted, None
+
+
 def warn_of_torques(folder: Path, bench: Bench) -> None:
     """Warn where the inputs cannot be those of the declared bodies."""
     rig, data = bench.rig, bench.train.data
@@ -198,6 +234,7 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
     Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
     """
     same = _options(args, *OPTIONS, none=True)
+    same = {name: str(value) if isinstance(value, Path) else value for name, value in same.items()}
     of = {"rig.toml": dataclasses.asdict(bench.rig), "training data": fingerprint(bench.train.data), **same}
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
@@ -219,7 +256,8 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
 
 def _options(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
     """Those of these options that the command has; `none`: also where they were left out."""
-    options = {f"--{name}": getattr(args, name) for name in names if hasattr(args, name)}
+    flag = {"start": "from"}
+    options = {f"--{flag.get(name, name)}": getattr(args, name) for name in names if hasattr(args, name)}
     return {name: value for name, value in options.items() if none or value is not None}
 
 

@@ -4,20 +4,16 @@ import argparse
 import dataclasses
 import json
 import time
-from pathlib import Path
 
 import jax
 
-from ..data.rig import read_rig
 from ..experiment.experiment import check_question, design
-from ..experiment.limits import DesignError
 from ..experiment.rivals import Law, open_pairs, rivals
 from ..fit.identify import Identified
-from ..fit.store import Stored, fingerprint, model_file, read
+from ..fit.store import Stored, model_file, read
 from ..report.design import write_design
 from ..storage.log import Log
-from ..systems import specs
-from .common import Bench, read_training, require_joints, resumable
+from .common import Bench, logs_of, require_joints, resumable
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
@@ -40,16 +36,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
     """The logs of the fit, and the fit with the limits that their rig.toml declares now."""
-    file, folders = model_file(args.folder), args.logs or list(map(Path, stored.notes.get("logs", [])))
-    gone = next((folder for folder in folders if not folder.is_dir()), None)
-    if not folders or gone:
-        problem = f"its logs are not at {gone}" if gone else "it does not say where its logs are"
-        raise DesignError(f"{file}: {problem}; give their folder with --logs FOLDER")
-    rig = read_rig(folders[0] / "rig.toml", specs)
-    train = read_training(rig, folders, args.trust_readings)
-    if stored.fingerprint and fingerprint(train.data) != stored.fingerprint:
-        wrong = "; give those with --logs FOLDER, or identify again with these"
-        raise DesignError(f"{folders[0]}: not the logs, or not read as those, of the fit in {file}{wrong}")
+    rig, train = logs_of(model_file(args.folder), stored, args.logs, args.trust_readings)
     limited = dataclasses.replace(stored.fitted.rig, limits=rig.limits)
     return stored.fitted._replace(rig=limited), Bench(limited, train, None)
 

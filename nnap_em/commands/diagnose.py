@@ -11,7 +11,7 @@ from ..diagnosis.search import diagnose
 from ..fit.store import AFTER, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import go_on, read_bench, resumable, warn_of_torques
+from .common import go_on, origin, read_bench, resumable, warn_of_torques
 
 SHARE = 0.8
 """Share of the minutes given after which the search begins no new step.
@@ -26,6 +26,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     seconds = SHARE * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
+    start, own = origin(args, bench, log)
     if (args.out / AFTER).exists():
         log(f"the diagnosis in {args.out} will be replaced")
     with resumable(args, bench, log) as journal:
@@ -36,7 +37,9 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
         spent = time.perf_counter() - began
         key = jax.random.key(args.seed)
-        diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds - spent)
+        began_from = {"start": start, "own": None if own is None else own.data}
+        seconds -= spent
+        diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds, **began_from)
         journal.open = not diagnosis.complete
         accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
         for name in (

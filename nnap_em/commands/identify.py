@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float
 from ..data.rig import Rig
 from ..em.loop import EMState
 from ..fit.identify import MakeSmoother, Watch, identify
+from ..fit.known import identify_from
 from ..fit.store import MODEL, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import read_bench, resumable, warn_of_torques
+from .common import origin, read_bench, resumable, warn_of_torques
 
 MISFIT = 3
 """Exit status of a fit that does not describe the motion."""
@@ -32,10 +33,12 @@ def run(args: argparse.Namespace, log: Log) -> int:
     if (args.out / MODEL).exists():
         log(f"the fit in {args.out} will be replaced")
     data, epochs = bench.train.data, []
+    fit, _ = origin(args, bench, log)
     with resumable(args, bench, log):
         most = args.epochs * (1 + bench.rig.memory)
         watch, key = _watch(bench.rig, most, epochs, log), jax.random.key(args.seed)
-        fitted = identify(bench.rig, data, key=key, smoother=smoother(args), epochs=args.epochs, watch=watch)
+        options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
+        fitted = identify(bench.rig, data, **options) if fit is None else identify_from(fit, bench.rig, data, **options)
         for name in (
             "report.json",
             "report.html",

@@ -34,6 +34,11 @@ LEAST_SHARED = 0.5
 Friction depends on velocity and on load: where most of a range was visited by one fit only, the curves can differ
 there by what the other had to guess."""
 MEANINGLESS = "a change of its friction may be one of the motion, not of the machine"
+SEVERAL = 2
+"""Friction curves from which on a change of all at once has another cause: joints wear one by one; a load, a sensor or
+the supply bends every curve."""
+SEEN, GONE = 5.0, 2.0
+"""Standard deviations from 0 of a viscous number in one fit, and in the other, from which on it cannot have gone so."""
 NODES = 41
 """Velocities of a friction curve: as many as the M-step has."""
 PERIODIC = ("phase",)
@@ -111,9 +116,29 @@ class Curve(NamedTuple):
         return self.test.p_value < CHANGED
 
     @property
+    def impossible(self) -> str:
+        """Change of a Stribeck number that friction cannot have, in words; empty where there is none."""
+        numbers = dict(zip(CALLED, self.law, strict=False))
+        if self.changed and numbers["constant"].changed:
+            return f"joint {self.joint} by a constant"
+        far = numbers["viscous"].value / np.where(numbers["viscous"].std > 0, numbers["viscous"].std, np.inf)
+        gone = self.changed and np.nanmax(far) > SEEN and np.nanmin(far) < GONE
+        return f"joint {self.joint} to a viscous friction of 0" if gone and numbers["viscous"].changed else ""
+
+    @property
     def parts(self) -> tuple[Number, ...]:
         """The Stribeck numbers that changed, of a curve that did."""
         return tuple(number for number in self.law if self.changed and number.changed)
+
+
+class Cause(NamedTuple):
+    """A change from one fit to the other, by their recordings (`cause.explained`)."""
+
+    text: str
+    friction: bool
+    """True where all of it is friction."""
+    judged: tuple[str, ...]
+    """Sentences on the errors of each fit on the recordings of the other."""
 
 
 class Comparison(NamedTuple):
@@ -126,6 +151,8 @@ class Comparison(NamedTuple):
     differences: tuple[str, ...]
     """Effects and parameters that some fits have and others lack."""
     warnings: tuple[str, ...]
+    cause: Cause | None = None
+    """None where the recordings are not at hand, or nothing changed."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +167,20 @@ class Comparison(NamedTuple):
     @property
     def verdict(self) -> str:
         """The outcome: the quantities that changed, then the effects and parameters that some fits lack."""
-        return " ".join([self._tested, *(f"{text[0].upper()}{text[1:]}." for text in self.differences)])
+        cause = [] if self.cause is None else [self.cause.text]
+        return " ".join([*cause, self._tested, *(f"{text[0].upper()}{text[1:]}." for text in self.differences)])
+
+    @property
+    def other(self) -> str:
+        """Reason for which something other than friction changed; empty where there is none, or recordings decide."""
+        bent = [curve for curve in self.curves if curve.changed]
+        if self.cause is not None:
+            return "" if self.cause.friction or not bent else "which is this change seen through friction"
+        reasons = ["several at once"] if len(bent) >= SEVERAL else []
+        reasons += [curve.impossible for curve in bent if curve.impossible]
+        return (
+            f"{listed(reasons)}: something other than friction changed, such as a load or a sensor" if reasons else ""
+        )
 
     @property
     def _tested(self) -> str:
@@ -152,6 +192,11 @@ class Comparison(NamedTuple):
             tested = counted(tests, "quantity", "quantities")
             return f"{nothing} changed {between} beyond the stated errors: {tested} tested at {CHANGED:.0%}."
         changed = []
+        bent = [f"joint {curve.joint}" for curve in self.curves if curve.changed]
+        if self.other:
+            moved = [number.name for number in self.numbers if number.changed]
+            also = f" {listed(moved)} changed." if moved else ""
+            return f"The friction curves of {listed(bent)} differ {between}, {self.other}.{also}"
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
             changed += [f"the {curve.name}{parts}"] * curve.changed

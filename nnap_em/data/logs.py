@@ -76,7 +76,7 @@ class Logs:
 
 
 def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float = math.inf) -> Logs:
-    """All logs of a folder by name, in the units and columns that `rig` declares (s, N m, rad, rad/s).
+    """All logs of a folder by name, or one, in the units and columns that `rig` declares (s, N m, rad, rad/s).
 
     Spikes and readings of stuck, late or saturated sensors, values that repeat while the machine moves among them,
     become NaN.
@@ -101,7 +101,7 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
         >>> nnap_em.read_logs(f"{folder}/train", rig).data.y.shape
         (2, 61, 1)
     """
-    files = log_files(Path(folder))
+    files = [Path(folder)] if Path(folder).is_file() else log_files(Path(folder))
     tables = [_within(_read_table(path, rig), rig) for path in files]
     early = [table.readings(rig, until) for table in tables]
     if held := {} if trust else _held(early):

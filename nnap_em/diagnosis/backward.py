@@ -54,8 +54,12 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
 def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) -> _Reduced:
     """The fit without the effect at `place`, and the share of its squared error that the effect removes at best."""
     hypothesis, effects = fit.hypothesis, fit.model.effects
-    if effects[place].read_off or any(remainder_of(other, fit.model) == place for other in effects):
-        return _Reduced(math.inf)  # seen in the numbers themselves, or a law whose remainder goes first
+    if (
+        hypothesis.found[place] is None
+        or effects[place].read_off
+        or any(remainder_of(other, fit.model) == place for other in effects)
+    ):
+        return _Reduced(math.inf)  # of an earlier fit, seen in the numbers themselves, or its remainder goes first
     if not effects[place].possible():
         return _Reduced(-math.inf)
     smoothed, _ = smooth(context, hypothesis.without(place), context.longest)
@@ -94,7 +98,7 @@ def _in_place(context: SearchContext, law: Key, evidence: Found, fit: SmoothedFi
     """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: a law alone
     was compared with that when it was found.  Of each the best candidate.
     """
-    around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows)
+    around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
     keyed = [(key_of(candidate.start), candidate) for candidate in proposals(around, fit.model.effects)]
     moved = bool(fit.model.effects)
     some = [c for key, c in keyed if key in evidence.equivalent or (moved and elsewhere(key, law))]

@@ -65,6 +65,10 @@ class SearchContext(NamedTuple):
     """Recording that every sequence is a piece of; empty: each is a recording."""
     until: float = math.inf
     """Moment of `time.monotonic()` after which no new round or refit begins."""
+    origin: SmoothedFit | None = None
+    """The fit from which the search began along its own recordings, where the question is what changed since."""
+    change: bool = False
+    """True where that is the question: the declared model is a fit, and its laws stay."""
 
     @property
     def longest(self) -> int:
@@ -156,12 +160,15 @@ def _looser(hypothesis: Hypothesis, fits: Sequence[EMState]) -> StateSpaceModel:
 
 
 def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMState] | None:
-    """Fit with friction and noise from their start, and the same laws; None where `hypothesis` is likelier at first.
+    """Fit with friction and noise from their start, and the same laws; None where `hypothesis` is likelier at first,
+    and where friction and noise are those of a fit.
 
     Friction that was fitted without a law may stand in its place, too steep for the step of the integration, and no
     step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within .07 rad/s.
     """
     before = context.before
+    if context.change:
+        return None
     start = begin(before.rig, context.data, key=before.state.key)
     rule = eqx.tree_at(lambda rule: rule.centre, start.m_step, hypothesis.m_step.centre)  # that of the first fit
     weights = rule.weights(start.model)

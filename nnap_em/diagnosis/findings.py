@@ -91,8 +91,8 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     entries = list(zip(model.effects, diagnosis.found, numbers, laws, strict=True))
     out = []
     for effect, record, cov, law in entries:
-        if law is not None:
-            continue  # reported with the law that it completes
+        if law is not None or record is None:
+            continue  # reported with the law that it completes, or of the fit from which the search began
         drawn = effect.curve(cov, model.system)
         parameters = estimates(effect, cov, model.system)
         sizes = ", ".join(f"{n} = {with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items())
@@ -124,10 +124,11 @@ def verdict(
     rivals: Sequence[Key] = (),
     suspects: Sequence["SuspectReport"] = (),
     complete: bool = True,
+    opening: str = "The model lacks",
 ) -> str:
     """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
     `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one where the search is
-    not `complete`.
+    not `complete`. `opening` begins the sentence that names laws.
 
     It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
     """
@@ -156,7 +157,7 @@ def verdict(
         return "Nothing is missing that these data could show: the declared model explains them."
     names = listed([_sized(finding) for finding in accepted])
     it = "it" if len(accepted) == 1 else "them"
-    text = f"The model lacks {names}"
+    text = f"{opening} {names}"
     if not error:
         return text + "."
     grows = growth(error)

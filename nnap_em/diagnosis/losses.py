@@ -23,6 +23,7 @@ from ..effects import Candidate, flat
 from ..em.local import locals_along
 from ..em.quadratic import whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
+from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each, turns
 from ..prediction_error.multistep import (
     HORIZONS,
@@ -40,7 +41,8 @@ from ..prediction_error.multistep import (
 )
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import blocks, candidate_columns, tracks
-from .refit import Refit
+from .hypothesis import Hypothesis
+from .refit import Refit, refit
 from .smoothed import SmoothedFit
 from .verdict import EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, ONE_STEP, PRICE, Bars
 
@@ -81,6 +83,10 @@ class AbstractLoss(eqx.Module):
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """A `trial` after what its fit by likelihood leaves to do."""
         return trial
+
+    @abstractmethod
+    def along(self, fit: SmoothedFit, hypothesis: Hypothesis, path: Gaussian) -> Refit:
+        """`hypothesis` as it is, along a path of the sequences of `fit`."""
 
     @abstractmethod
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
@@ -143,6 +149,12 @@ class MultiStep(AbstractLoss):
         along = finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
         return trial._replace(model=along.model, along=along)
 
+    def along(self, fit: SmoothedFit, hypothesis: Hypothesis, path: Gaussian) -> Refit:
+        """Its multi-step errors."""
+        model, rule = hypothesis.model, hypothesis.m_step
+        errors_from = followed(model, rule.prior, path, fit.data)
+        return Refit(model, rule, path, np.zeros(0), jnp.zeros((0, 0)), errors_from)
+
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """Ratio of robust squares, each fit along its own smoothed paths."""
         before, after = (errors(cast(Followed, t.along), self.judged[band]) for t in (null, full))
@@ -179,6 +191,10 @@ class OneStep(AbstractLoss):
             float
         )
         return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
+
+    def along(self, fit: SmoothedFit, hypothesis: Hypothesis, path: Gaussian) -> Refit:
+        """Its log-likelihood: that of the one pass of a refit."""
+        return refit(hypothesis.model, hypothesis.m_step, path, fit.data, fit.used, passes=1)
 
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int) -> float:
         """One minus twice the gain in log-likelihood over the readings, both of sequences that both fits follow."""

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ..fit.identify import Identified
+from ..prediction_error.recorded import Risen
 from ..residual.interventions import Intervention
 from .hypothesis import Found
 from .keys import Key, key_of, listed, words
@@ -65,6 +66,10 @@ class Diagnosis(NamedTuple):
     """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
     complete: bool = True
     """False where the time was up before the search had ended: more may be missing."""
+    change: bool = False
+    """True where the question was what changed since a fit, whose laws are in both models."""
+    risen: Risen | None = None
+    """Test of whether errors have risen since that fit; None where its recordings are not at hand."""
 
     def __str__(self) -> str:
         found = [words(key_of(effect)) for effect in self.after.model.effects[len(self.before.model.effects) :]]

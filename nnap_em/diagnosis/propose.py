@@ -17,8 +17,15 @@ from ..numerics.gaussian import Gaussian
 from .keys import key_of
 
 
-def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int) -> Around:
-    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`."""
+def surroundings(
+    rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int, *, change: bool = False
+) -> Around:
+    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`.
+
+    `change`: candidates are what may have changed since the fit of `model`, too.
+    """
+    free = {name: float(d.mean) for name, d in rig.bodies.items() if d.std > 0}
+    moved = tuple((name, rig.unit(name), abs(value) or 1.0) for name, value in free.items())
     scales = measure_scales(rig, model.system, data)
     dof = len(model.system.coordinates)
     valid = np.asarray(data.valid)
@@ -50,6 +57,7 @@ def surroundings(rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian
         rig.clock == "session",
         rig.friction,
         rig.input_columns,
+        moved=moved if change else None,
     )
 
 

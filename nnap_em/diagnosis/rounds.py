@@ -16,7 +16,7 @@ from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
-from .trial import Null, Trial, null_of, with_candidate
+from .trial import Null, Trial, explained, null_of, with_candidate
 from .verdict import EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
@@ -38,9 +38,9 @@ class Round(NamedTuple):
 def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     """Screen everything that the machine may have, and refit the best until one is accepted."""
     rig, model = context.before.rig, fit.model
-    around = surroundings(rig, model, fit.data, fit.path, fit.rows)
+    around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
     seen = screen(context.loss, fit, proposals(around, model.effects))
-    fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, model)]
+    fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
     ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).possible())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
@@ -55,7 +55,8 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             group = _group(admitted, model)[: context.effort.shortlist - len(tried)]
             cases = []
             for s in group:
-                cases.append(with_candidate(s, cast(Null, null), *fitting))
+                case = with_candidate(s, cast(Null, null), *fitting)
+                cases.append(case if case.rejection else case._replace(before=explained(case, context)))
                 _log(cases[-1], context)
             tried += cases
             admissible = [case for case in cases if case.rejection is None]
@@ -155,10 +156,15 @@ def _listed(screened: Screened) -> float:
     return screened.share.least if screened.admissible else 0.0
 
 
-def _fresh(law: AbstractEffect, model: StateSpaceModel) -> bool:
-    """True for a law that the model does not hold, or that takes the place of one."""
-    present = {key_of(effect) for effect in model.effects}
-    return (key_of(law) not in present or replaced(law, model) is not None) and not completed(law, model)
+def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
+    """True for a law that the model does not hold, or that takes the place of one; for a change of one of the fit from
+    which the search began, too, in the form that it has there.
+    """
+    model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.found, strict=True))
+    present = {key_of(effect) for effect, evidence in pairs if evidence is not None}
+    place = replaced(law, model)
+    new = place is None and key_of(law) not in present
+    return (new or (place is not None and pairs[place][1] is not None)) and not completed(law, model)
 
 
 def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -17,11 +18,14 @@ from ..data.dataset import Dataset
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EMState, FitError, e_step
+from ..em.mstep import kept
 from ..fit.identify import Identified, begin, finished, identify
+from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.programs import release_programs
 from ..prediction_error.noise import white_readings
+from ..prediction_error.recorded import errors_of, left_out, level, levels, risen
 from ..residual.innovations import white_innovations
 from ..residual.undisturbed import disturbance_free
 from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
@@ -37,6 +41,7 @@ from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step
 from .quantised import quantised
 from .rounds import Round, screening_round
+from .smoothed import SmoothedFit, along
 from .trial import Trial
 from .verdict import FOLLOWED, HELD, even
 
@@ -47,7 +52,8 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     fit, followed = smooth(context, hypothesis, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
     context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
-    added = sum(not effect.read_off for effect in hypothesis.model.effects)
+    effects = zip(hypothesis.model.effects, hypothesis.found, strict=True)
+    added = sum(not effect.read_off and evidence is not None for effect, evidence in effects)
     if not fit.used.any() or added >= context.effort.most:
         return hypothesis
     outcome = screening_round(fit, context)
@@ -76,9 +82,9 @@ def _with(hypothesis: Hypothesis, case: Trial, evidence: Found, context: SearchC
     return following.without(cast(int, remainder))
 
 
-def _names(hypothesis: Hypothesis) -> frozenset[tuple[Key, Any]]:
-    """The laws and their forms."""
-    return frozenset((key_of(effect), jax.tree.structure(effect)) for effect in hypothesis.model.effects)
+def _names(hypothesis: Hypothesis) -> frozenset[tuple[tuple[Key, Any], int]]:
+    """The laws and their forms, and how often each is there."""
+    return frozenset(Counter((key_of(e), jax.tree.structure(e)) for e in hypothesis.model.effects).items())
 
 
 def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
@@ -102,7 +108,7 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     """
     before, data = context.before, context.data
     try:  # steps of readings as noise: they spoil the noise that all else leans on
-        begun = quantised(context, context.declared)
+        begun = (context.declared, None) if context.change else quantised(context, context.declared)
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
@@ -198,6 +204,8 @@ def diagnose(
     effort: Effort = EFFORT,
     log: Log = silent,
     seconds: float = math.inf,
+    start: Identified | None = None,
+    own: Dataset | None = None,
 ) -> Diagnosis:
     """Fit the declared unknowns of a rig, find what it lacks, add that, and fit again.
 
@@ -211,6 +219,9 @@ def diagnose(
         log: receives a line of progress at a time.
         seconds: time after which no new round or refit begins [s]; the outcome is then what was accepted until that,
             not `complete`. The first fit, and that of an accepted law over the whole length, are always done.
+        start: an earlier fit of the machine; the question is then what changed since. Its posterior is the prior of
+            `data`, and nothing is fitted before the search.
+        own: recordings of that fit; a law that they show as well is no change.
 
     Returns:
         The models before and after, the evidence, and the course of the search; `findings` has it in sentences.
@@ -218,6 +229,7 @@ def diagnose(
     Raises:
         DataError: arrays are not of the rig: other columns, another interval, a row without an input.
         FitError: no sequence can be followed.
+        DataError: `start` is of another machine.
 
     Example:
         >>> diagnosis = nnap_em.diagnose(rig, train, key=key, seconds=1.0)
@@ -225,17 +237,22 @@ def diagnose(
         True
     """
     end = time.monotonic() + seconds
-    if rig.memory:  # the search has a law with memory of its own
+    if start is None and rig.memory:  # the search has a law with memory of its own
         log("friction is learned as a static map; the search tries memory as the law presliding_friction")
         rig = dataclasses.replace(rig, memory=False)
     data = Dataset(*map(jax.device_put, sequences_of(data, rig)))
     stages: Stages = {}
 
     white = white_readings(data, begin(rig, data, key=key).model)
-    held = rig if white or rig.equations else _held(rig)
+    held, hold = (rig, 1.0) if white or rig.equations else (_held(rig), HELD)
 
     def identified(part: Dataset) -> Identified:
         seen: Stages = {}
+        if start is not None:
+            outcome, used = _put(start, rig, part, hold, key)
+            stages.clear()
+            stages[int(np.max(np.sum(np.asarray(part.valid), axis=1)))] = outcome.state, used
+            return outcome
 
         def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
             seen[rows] = (state, used)
@@ -251,17 +268,68 @@ def diagnose(
     before = identified(data)
     if rig.equations:
         return search_equations(before, data, log, end)
+    change, origin = (
+        start is not None,
+        None if start is None or own is None else along(start, own, _unbranched(start.bank)),
+    )
+    ended = _ended(hold) if change else finished if white else _released(rig)
     if white:
-        context = SearchContext(before, stages, data, MultiStep(), effort, log, until=end)
-        return _branching(search(context, white=True, release=finished))
+        context = SearchContext(before, stages, data, MultiStep(), effort, log, (), end, origin, change)
+        diagnosis = search(context, white=True, release=ended)
+        return _compared(diagnosis, origin, data, ended) if change else _branching(diagnosis)
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
-    context, release = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end), _released(rig)
-    diagnosis = search(context, white=False, release=release)
-    before = release(before, data)
-    diagnosis = diagnosis._replace(before=before, after=diagnosis.after if diagnosis.found else before)
-    return _branching(diagnosis._replace(interventions=disturbances, pieces=pieces))
+    context = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end, origin, change)
+    diagnosis = search(context, white=False, release=ended)._replace(interventions=disturbances, pieces=pieces)
+    if change:
+        return _compared(diagnosis, origin, data, ended)
+    before = ended(before, data)
+    return _branching(diagnosis._replace(before=before, after=diagnosis.after if diagnosis.found else before))
+
+
+def _put(
+    start: Identified, rig: Rig, data: Dataset, hold: float, key: PRNGKeyArray
+) -> tuple[Identified, Bool[np.ndarray, " seq"]]:
+    """A fit on other recordings, its posterior their prior, and the sequences that it follows.
+
+    Raises FitError where it follows none.
+    """
+    before = known(start, rig, data, key=key, smoother=_unbranched, hold=hold)
+    posterior = e_step(before.model, data, before.smoother, key=before.state.key)
+    used = np.asarray(kept(posterior, data))
+    if not used.any():
+        raise FitError("the fit follows none of the recordings; look at units and columns with nnap-em check")
+    top = np.where(used, np.asarray(posterior.loglik), np.nan)
+    return before._replace(state=before.state._replace(top=top)), used
+
+
+def _ended(hold: float) -> Callable[[Identified, Dataset], Identified]:
+    """End of fits that began from another one: its posterior, held more tightly in the search, counts once."""
+
+    def release(fitted: Identified, data: Dataset) -> Identified:
+        rule = unheld(fitted.m_step, fitted.model, hold)
+        posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+        _, info = rule(fitted.model, posterior, data)
+        state = fitted.state._replace(hessian=info.hessian)
+        return forgotten(finished(fitted._replace(m_step=rule, state=state), data))
+
+    return release
+
+
+def _compared(
+    diagnosis: Diagnosis, origin: SmoothedFit | None, data: Dataset, ended: Callable[[Identified, Dataset], Identified]
+) -> Diagnosis:
+    """The outcome of a search for changes, with the test of whether errors have risen."""
+    if origin is not None:
+        before = diagnosis.before
+        out = levels(left_out(origin.model, origin.m_step, origin.path, origin.data, origin.used))
+        path = e_step(before.model, data, before.smoother, key=before.state.key).state
+        now = level(errors_of(before.model, before.m_step, path, data), out.scale)
+        diagnosis = diagnosis._replace(risen=risen(out.level, now))
+    before = ended(diagnosis.before, data)
+    after = diagnosis.after if any(evidence is not None for evidence in diagnosis.found) else before
+    return _branching(diagnosis._replace(before=before, after=after, change=True))
 
 
 def _held(rig: Rig) -> Rig:

@@ -6,9 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from ..data.dataset import Dataset
-from ..em.mstep import ScoringMStep
+from ..em.loop import e_step
+from ..em.mstep import ScoringMStep, kept
+from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
+from ..smoother.posterior import AbstractSmoother
 from .hypothesis import Hypothesis
 
 
@@ -42,3 +45,12 @@ class SmoothedFit(NamedTuple):
     def recording(self) -> Int[np.ndarray, " seq"]:
         """Number of the recording of every sequence."""
         return np.asarray(self.pieces) if self.pieces else np.arange(len(self.data.t))
+
+
+def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> SmoothedFit:
+    """A fit as it is along some recordings."""
+    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
+    posterior = e_step(fitted.model, data, smoother, key=fitted.state.key)
+    return SmoothedFit(
+        hypothesis, hypothesis, posterior.state, data, np.asarray(kept(posterior, data)), data.t.shape[1]
+    )

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ..effects import AbstractEffect, Candidate, flat
 from ..fit.memory import extended
 from ..numerics.gaussian import Gaussian
+from .context import SearchContext
 from .findings import estimates
 from .hypothesis import Hypothesis, covariances
 from .keys import complexity, replaced
@@ -38,6 +39,8 @@ class Trial(NamedTuple):
     """Share that the step of the screen removes, before any pass; NaN where likelihood decides."""
     refit: Refit | None = None
     """Its fit; None where the step of the screen removed too little for one."""
+    before: float = -np.inf
+    """Share of the squared error that it removes from the recordings of the fit from which the search began."""
 
     @property
     def candidate(self) -> Candidate:
@@ -53,6 +56,7 @@ class Trial(NamedTuple):
     def rejection(self) -> Rejection | None:
         """Reason against it; None where there is none."""
         numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
+        numbers["before"] = self.before
         return veto(
             possible=self.effect.possible(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
         )
@@ -110,6 +114,20 @@ def with_candidate(screened: Screened, null: Null, fit: SmoothedFit, loss: Abstr
         foreseen,
         end,
     )
+
+
+def explained(case: Trial, context: SearchContext) -> float:
+    """Share of the squared error that a law as it is fitted removes from the recordings of the fit before the search,
+    with the friction and the numbers of that fit; -inf where there is none, or its recordings are not at hand.
+    """
+    if (fit := context.origin) is None:
+        return -np.inf
+    full = fit.hypothesis.plus(case.effect, case.candidate)
+    null, other = (
+        context.loss.along(fit, one, path)
+        for one, path in ((fit.hypothesis, fit.path), (full, extended(full.model, fit.path, fit.data)))
+    )
+    return 1 - context.loss.ratio(null, other, fit, case.screened.band)
 
 
 def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:

@@ -59,6 +59,11 @@ FOLLOWED = 0.5
 REPEATS = 0.2
 """Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
 differ by up to .13, others by .25 and more."""
+MISSING = 0.0
+"""Share of the squared error of an earlier fit's recordings above which a law was missing there: one that came since
+adds to it what it removes now, one that was always there removes the same, and 0 lies in the middle."""
+RISEN = 0.01
+"""Chance of errors as large as those of new recordings, by their ranks, below which something changed since a fit."""
 COARSE = 0.1
 """Variance of rounding to the steps of a reading, over that of its noise, from which on steps are an effect."""
 FINEST = 0.25
@@ -148,7 +153,8 @@ class Rejection(NamedTuple):
     @property
     def sentence(self) -> str:
         """The reason as a clause whose subject is the effect."""
-        value = share_of(self.value, "the squared error", 1) if self.code == "small" else self.value
+        shares = ("small", "before")
+        value = share_of(self.value, "the squared error", 1) if self.code in shares else self.value
         return REASONS[self.code].format(value)
 
 
@@ -157,17 +163,25 @@ REASONS = {
     "uncertain": "is {:.1f} standard deviations from none after its refit",
     "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
     "small": "removes {} after its refit",
+    "before": "explains the recordings of the fit as well, of which it removes {}: it is missing there, and no change",
 }
 
 
 def veto(
-    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, complexity: int
+    *,
+    possible: bool,
+    certainty: float,
+    amplitude: float,
+    removed: float,
+    floor: float,
+    complexity: int,
+    before: float = -math.inf,
 ) -> Rejection | None:
     """Reason against an effect after its refit, None where there is none.
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
     one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
-    `complexity` that of the law.
+    `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit.
     """
     if not possible:
         return Rejection("impossible")
@@ -175,7 +189,9 @@ def veto(
         return Rejection("uncertain", certainty)
     if not amplitude > DETERMINED:
         return Rejection("undetermined", amplitude)
-    return None if needed(removed, required(floor, complexity)) else Rejection("small", removed)
+    if not needed(removed, required(floor, complexity)):
+        return Rejection("small", removed)
+    return Rejection("before", before) if before > MISSING else None
 
 
 def needed(share: float, floor: float) -> bool:

@@ -70,6 +70,8 @@ class Around(NamedTuple):
     """Ranges of states and inputs, of equations."""
     ends: tuple[tuple[float, float], ...] = ()
     """Ranges of the readings, of equations."""
+    moved: tuple[tuple[str, str, float], ...] | None = None
+    """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
 
     @property
     def open_ports(self) -> tuple[str, ...]:

@@ -123,7 +123,9 @@ class UnknownFunction(JointEffect):
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
         near = {j: _signals_near(system, j) for j in around.joints}
         places = [(j, grid) for j in around.joints for grid in grids]
-        return [
+        rates = [] if around.moved is None else [(j, system.rates[j - 1]) for j in around.joints]
+        friction = [_function(j, (axes[rate,](20),), around) for j, rate in rates if (rate,) in axes]
+        return friction + [
             _function(j, grid, around)
             for j, grid in places
             if all(axis.acts(system) in (None, j) and axis.of_states(system) <= near[j] for axis in grid)

@@ -29,7 +29,7 @@ from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
 from .prior import ParameterPrior
 from .quadratic import Local, Quadratic, quadratic
-from .weights import Weights, bounds
+from .weights import Known, Weights, bounds
 
 
 class MStepInfo(NamedTuple):
@@ -207,11 +207,14 @@ class ScoringMStep(AbstractMStep):
     """Smallest log variances of the readings, by the logs alone; None: any. Process noise of a hidden state may stand
     for that of its reading.
     """
+    known: Known | None = None
+    """`Weights.known`."""
 
     def weights(self, model) -> Weights:
         """Estimated vector: weights of the network and parameters."""
         nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
-        return Weights(self.prior, nodes, self.ridge, self.centre, offset, self.rough, self.departure, self.least)
+        own = self.rough, self.departure, self.least, self.known
+        return Weights(self.prior, nodes, self.ridge, self.centre, offset, *own)
 
     def early(self) -> "ScoringMStep":
         """The rule with the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the

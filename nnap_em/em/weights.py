@@ -1,6 +1,7 @@
 """Network weights and parameters as one vector, fitted to a log-likelihood that is quadratic in torques at nodes."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,6 +9,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .prior import ParameterPrior
+
+
+class Known(NamedTuple):
+    """Posterior of an earlier fit, as the prior of torques at the nodes and of its parameters."""
+
+    mean: Float[Array, " known"]
+    precision: Float[Array, "known known"]
+    """Precision beside that of `ParameterPrior`."""
+
+    def terms(self, size: int) -> tuple[Float[Array, "phi phi"], Float[Array, " phi"]]:
+        """Precision, and its product with the mean, of `size` numbers, the last of which the fit did not have."""
+        free = size - self.mean.shape[0]
+        return jnp.pad(self.precision, (0, free)), jnp.pad(self.precision @ self.mean, (0, free))
 
 
 class Weights(eqx.Module):
@@ -28,6 +42,8 @@ class Weights(eqx.Module):
     offset."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
     """Smallest possible values of the first parameters, in units of their prior."""
+    known: Known | None = None
+    """Prior of phi from an earlier fit, in the place of those of friction maps."""
 
     def read(self, model) -> Float[Array, " weight"]:
         """Those of a model, as one vector."""
@@ -63,6 +79,8 @@ class Weights(eqx.Module):
         friction of each direction is zero at rest, and rises over the velocities of the machine. Where the prior is
         coarse, what departs from viscous, Coulomb and constant friction is small.
         """
+        if self.known is not None:
+            return self.known.terms(self.nodes.size + self.prior.size)[0]
         dof, count = self.nodes.shape
         even = 0.5 * (jnp.eye(count) + jnp.eye(count)[::-1])
         torque = self.phi(unknown, w)[: self.nodes.size].reshape(dof, count)
@@ -83,6 +101,9 @@ class Weights(eqx.Module):
         no small change of its weights gives. [Khan, Immer, Abedi & Korzepa 2019, NeurIPS, "Approximate inference turns
         deep networks into Gaussian processes", for the idea]
         """
+        if self.known is not None:
+            own = jnp.concatenate([jnp.zeros(self.nodes.size), jnp.ones(self.prior.size)])
+            return self.known.terms(own.size)[0] + jnp.diag(own)
         size, count, dtype = self.centre.shape[0], self.nodes.shape[1], self.centre.dtype
         moved = jax.random.normal(jax.random.key(0), (DRAWS, size), dtype) / jnp.sqrt(jnp.asarray(self.ridge, dtype))
         torque = jax.vmap(lambda w: jax.vmap(unknown.with_weights(w))(self.nodes.T).T)(self.centre[None] + moved)
@@ -121,6 +142,8 @@ class Weights(eqx.Module):
         middle = self.middle()
         symmetry = self.symmetry(unknown, w0)
         score = score - symmetry @ phi0
+        if self.known is not None:
+            score = score + self.known.terms(score.shape[0])[1]
         information = information + symmetry
         values, vectors = jnp.linalg.eigh(information)
         root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T

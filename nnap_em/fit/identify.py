@@ -47,6 +47,10 @@ MakeSmoother = Callable[[StartBank], AbstractSmoother]
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
 
 
+def unwatched(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
+    """The watch that does nothing."""
+
+
 class Identified(NamedTuple):
     """A fitted model with what is needed to use it, to judge it and to go on fitting."""
 
@@ -135,7 +139,7 @@ def identify(
     epochs: int = EPOCHS,
     schedule: Schedule = SCHEDULE,
     start: Identified | None = None,
-    watch: Watch = lambda state, seen, used: None,
+    watch: Watch = unwatched,
 ) -> Identified:
     """Fit the declared unknowns of a rig to logs by Expectation-Maximisation: friction, uncertain parameters, noise.
 

@@ -323,7 +323,7 @@ def finish(
         jac, e, w = predictions.columns[keep].astype(float), predictions.error[keep], weight[keep]
         score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
         start, nodes = weights.read(model), slice(weights.nodes.size)
-        if shaped:
+        if shaped and weights.known is None:
             precision, pull = friction_prior(model, weights)  # parameters have theirs in the fit
             information = information.at[nodes, nodes].add(precision[nodes, nodes])
             score = score.at[nodes].add(-pull[nodes])

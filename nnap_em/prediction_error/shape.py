@@ -18,6 +18,9 @@ def friction_prior(model: StateSpaceModel, weights: Weights) -> tuple[np.ndarray
     """
     nodes, size = np.asarray(weights.nodes), weights.nodes.size + weights.prior.size
     value = np.asarray(weights.phi(model.unknown, weights.read(model)))
+    if weights.known is not None:
+        precision, goal = weights.prior_precision(model.unknown), weights.known.terms(size)[1]
+        return np.asarray(precision), np.asarray(precision @ value - goal)
     precision, pull = np.zeros((size, size)), np.zeros(size)
     count = nodes.shape[1]
     for j, v in enumerate(nodes):

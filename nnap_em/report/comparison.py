@@ -52,6 +52,7 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         "rig": rig.name,
         "system": rig.system,
         "verdict": comparison.verdict,
+        "cause": None if comparison.cause is None else comparison.cause._asdict(),
         "changed": list(comparison.changed),
         "level": CHANGED,
         "least_shared": LEAST_SHARED,
@@ -160,7 +161,8 @@ def table(comparison: Comparison) -> str:
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     # the name of a curve stands over its empty columns
     widths[0] = max(len(line[0]) for line in lines if any(line[1:-2]))
-    text = [comparison.verdict, *(f"Warning: {warning}." for warning in comparison.warnings)]
+    judged = [] if comparison.cause is None else [f"{line}." for line in comparison.cause.judged]
+    text = [comparison.verdict, *judged, *(f"Warning: {warning}." for warning in comparison.warnings)]
     text += ["", *(_aligned(line, widths) for line in lines), "", LEGEND]
     return comparison.fits[0].fitted.rig.named("\n".join(text))
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..data.rig import Rig
+from ..diagnosis.change import changes
 from ..diagnosis.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step
@@ -64,10 +65,13 @@ def write_diagnosis(
     disputed, rivals, suspects = disputes(diagnosis, train.files), undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.complete), moved(diagnosis.after)
+    if diagnosis.change:
+        outcome, far = changes(diagnosis, accepted, error, rivals, suspects), []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *(one.sentence for one in far)]),
         "moved": [one._asdict() for one in far],
         "complete": diagnosis.complete,
+        "since_fit": {"risen": diagnosis.risen and diagnosis.risen._asdict()} if diagnosis.change else None,
         "effects": [entry(f) for f in accepted],
         "interventions": [_disturbance(force, train.files) for force in diagnosis.interventions],
         "error": error,

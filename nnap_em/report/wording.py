@@ -19,8 +19,8 @@ def chance(p: float) -> str:
 
 
 def p_value(p: Any) -> str:
-    """A p-value; one that is too small for a number is below the smallest."""
-    return f"< {ten(-300)}" if p == 0 else number(p, 2)
+    """A p-value; below 1e-6 the tails of a test are not those of its distribution, and no digits mean anything."""
+    return f"< {ten(-6)}" if finite(p) and p < 1e-6 else number(p, 2)
 
 
 def ratio(before: Any, after: Any) -> str:

@@ -1,0 +1,225 @@
+"""What changed since a fit: `diagnose --from` on planted, on unchanged and on simulated recordings, and `monitor`.
+
+    python benchmarks/changed.py planted --out out/changed dfki_c1-spring2-strong dfki_c0-recorded ...
+    python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
+    python benchmarks/changed.py monitor --out out/changed slide-none slide-coulomb
+    python benchmarks/changed.py compare --out out/changed dfki_c1-spring2-strong dfki_c0-recorded
+    python benchmarks/changed.py table out/changed [--out docs/results/changed_table.md]
+
+planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
+planted in them; of `RIG-recorded` nothing is planted.  moved: 8 simulated recordings of 3 s, then 8 of the machine with
+a number that moved.  monitor: 16 recordings, then 200 of 1.5 s, of which the Coulomb friction grows by 1 % a recording
+from number 100 on, or which are of the same machine.  One JSON file a case; a case that has one is not run again.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from planted import _commit, score
+from planted_cases import case_of
+from planted_make import DATA, ROOT, make
+
+from nnap_em.data.formats import write_csv
+from nnap_em.data.rig import Declared, write_rig
+from nnap_em.model.simulate import declared, examples, sweep_experiment
+from nnap_em.storage.files import replace_text
+
+GROWN, LENGTH, FIRST = 0.01, 200, 100
+UNCERTAIN = {"slide": {"m": 0.1}, "pendulum": {"m": 0.05}, "acrobot": {"m2": 0.06}}
+"""Numbers that are estimated, with the standard deviation that is declared [kg]."""
+FACTOR = {"coulomb": 1.2, "viscous": 1.2, "mass": 1.05}
+
+
+def command(*arguments: str | Path) -> tuple[int, float, str]:
+    """Exit status, processor seconds and last line of a command."""
+    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(ROOT)}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    line = [sys.executable, "-m", "nnap_em.commands.cli", *map(str, arguments)]
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return done.returncode, spent, (done.stderr.strip().splitlines() or [""])[-1]
+
+
+def halves(source: Path, rig: Path, out: Path, odd: bool) -> None:
+    """Every second recording of a data set, all windows of a recording together."""
+    (out / "train").mkdir(parents=True)
+    shutil.copy(rig, out / "rig.toml")
+    files = sorted((source / "train").glob("*.csv"))
+    recordings = list(dict.fromkeys(re.sub(r"^\d+_|_w\d+$", "", path.stem) for path in files))
+    if len(recordings) < 4:
+        recordings = [path.stem for path in files]
+    for path in files:
+        name = re.sub(r"^\d+_|_w\d+$", "", path.stem)
+        if recordings.index(name if name in recordings else path.stem) % 2 == odd:
+            shutil.copy(path, out / "train" / path.name)
+
+
+def fit_of(rig: str, out: Path) -> Path:
+    """The fit of one half of a rig as it is, made once."""
+    fit = out / "fits" / rig
+    if not (fit / "model.npz").exists():
+        shutil.rmtree(out / "halves" / rig, ignore_errors=True)
+        halves(DATA / rig, DATA / rig / "rig.toml", out / "halves" / rig, False)
+        status, spent, said = command("identify", out / "halves" / rig, "--out", fit, "--quiet")
+        replace_text(fit / "spent.json", json.dumps({"status": status, "seconds": spent, "said": said}))
+    return fit
+
+
+def planted(name: str, out: Path) -> dict[str, Any]:
+    """The other half, with the effect of a case."""
+    with tempfile.TemporaryDirectory() as folder:
+        case, half, found = (Path(folder, part) for part in ("case", "half", "found"))
+        truth = make(name, case)
+        fit = fit_of(case_of(name).rig, out)
+        halves(case, case / "rig.toml", half, True)
+        status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
+        report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    record = {"case": name, "truth": truth, "seconds": spent, "processor_seconds": spent, "said": said}
+    return record | ({"report": report} if report else {"failed": said})
+
+
+def compared(name: str, out: Path) -> dict[str, Any]:
+    """`compare` of the fit of one half as it is, and of a fit of the other half with the effect of a case."""
+    with tempfile.TemporaryDirectory() as folder:
+        case, half, second, found = (Path(folder, part) for part in ("case", "half", "second", "found"))
+        make(name, case)
+        first = fit_of(case_of(name).rig, out)
+        halves(case, case / "rig.toml", half, True)
+        command("identify", half, "--out", second, "--quiet")
+        status, spent, said = command("compare", first, second, "--out", found)
+        report = json.loads((found / "compare.json").read_text()) if status == 0 else {}
+    return {"case": f"compare {name}", "report": report, "seconds": spent, "said": said}
+
+
+def machine(system: str, kind: str, size: float = 1.0):
+    """A machine whose last joint, or mass, moved by `size` times the step of `FACTOR`."""
+    truth, sweep = examples[system]()
+    law, last = truth.unknown, jnp.zeros_like(truth.unknown.coulomb).at[-1].set(1.0)
+    factor = 1 + size * (FACTOR.get(kind, 1.0) - 1) * last
+    if kind == "coulomb":
+        more = law.coulomb * (factor - 1)
+        return eqx.tree_at(
+            lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, (law.coulomb + more, law.breakaway + more)
+        ), sweep
+    if kind == "viscous":
+        return eqx.tree_at(lambda m: m.unknown.viscous, truth, law.viscous * factor), sweep
+    if kind == "mass":
+        (name,) = UNCERTAIN[system]
+        return dataclasses.replace(
+            truth, system=dataclasses.replace(truth.system, **{name: getattr(truth.system, name) * FACTOR["mass"]})
+        ), sweep
+    return truth, sweep
+
+
+def write(folder: Path, system: str, kind: str, count: int, steps: int, seed: int, sizes=None) -> None:
+    """Simulated recordings of a machine, with rig.toml."""
+    truth, sweep = examples[system]()
+    rig = declared(system, truth)
+    free = {name: Declared(float(getattr(truth.system, name)), std) for name, std in UNCERTAIN[system].items()}
+    (folder / "train").mkdir(parents=True, exist_ok=True)
+    write_rig(dataclasses.replace(rig, parameters={**rig.parameters, **free}), folder / "rig.toml")
+    sizes = [1.0] * count if sizes is None else sizes
+    for size in dict.fromkeys(sizes):  # a program for every machine
+        places = [i for i, other in enumerate(sizes) if other == size]
+        model, _ = machine(system, kind, size)
+        key = jax.random.fold_in(jax.random.key(seed), places[0])
+        data = sweep_experiment(model, sweep, len(places), steps, key=key).data
+        for i, t, u, y in zip(places, data.t, data.u, np.array(data.y), strict=True):
+            if kind == "bias":
+                y[:, 0] += 3 * math.exp(0.5 * float(truth.log_r[0]))
+            columns = {"time": t, **dict(zip(rig.input_columns, u.T, strict=True))}
+            write_csv(folder / "train" / f"{i:03d}.csv", columns | dict(zip(rig.measured, y.T, strict=True)))
+
+
+def moved(name: str, out: Path) -> dict[str, Any]:
+    """A simulated machine before and after a number moved."""
+    system, kind = name.split("-")
+    before, fit = out / "sim" / f"{system}", out / "fits" / f"sim-{system}"
+    if not (fit / "model.npz").exists():
+        write(before, system, "none", 8, 300, 0)
+        command("identify", before, "--out", fit, "--quiet")
+    after, found = out / "sim" / name, out / "found" / name
+    write(after, system, kind, 8, 300, 1)
+    status, spent, said = command("diagnose", after, "--from", fit, "--out", found)
+    report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    return {"case": name, "report": report, "seconds": spent, "said": said}
+
+
+def monitored(name: str, out: Path) -> dict[str, Any]:
+    """Two hundred recordings of a machine, unchanged or with friction that grows."""
+    system, kind = name.split("-")[:2]
+    before, fit = out / "sim" / f"{system}-month", out / "fits" / f"month-{system}"
+    if not (fit / "model.npz").exists():
+        write(before, system, "none", 16, 150, 10)
+        command("identify", before, "--out", fit, "--quiet")
+    after, found = out / "sim" / f"month-{name}", out / "found" / f"month-{name}"
+    grown = [max(0, i - FIRST + 1) * GROWN / (FACTOR["coulomb"] - 1) for i in range(LENGTH)]
+    write(after, system, kind, LENGTH, 150, 11, sizes=grown)
+    status, spent, said = command("monitor", fit, after / "train", "--out", found)
+    report = json.loads((found / "monitor.json").read_text()) if status in (0, 4) else None
+    return {"case": f"month-{name}", "report": report, "status": status, "seconds": spent, "said": said}
+
+
+def row(record: dict[str, Any]) -> str:
+    """A line of the table."""
+    report = record.get("report") or {}
+    named = "; ".join(effect["description"] for effect in report.get("effects", [])) or "nothing"
+    verdict = report.get("verdict") or record.get("failed") or record["said"]
+    truth = "; ".join(
+        f"{e['name']} {e.get('joint') or e.get('channel') or ''} {json.dumps(e['parameters'])}"
+        for e in (record.get("truth") or {}).get("effects", [])
+    )
+    scored = ""
+    if record.get("truth") and record.get("report"):
+        done = score(record, {})
+        scored = f"{done.named} of {done.truths}, {done.extras} extra"
+    return f"| {record['case']} | {truth} | {named} | {scored} | {verdict} | {record['seconds']:.0f} |"
+
+
+def main() -> None:
+    """Run some cases, or write the table."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = arguments.add_subparsers(dest="command", required=True)
+    kinds = {"planted": planted, "moved": moved, "monitor": monitored, "compare": compared}
+    for kind in kinds:
+        one = commands.add_parser(kind)
+        one.add_argument("cases", nargs="+")
+        one.add_argument("--out", type=Path, required=True)
+    writing = commands.add_parser("table")
+    writing.add_argument("folder", type=Path)
+    writing.add_argument("--out", type=Path)
+    args = arguments.parse_args()
+    if args.command == "table":
+        records = [json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json"))]
+        head = "| case | truth | named | score | verdict | processor s |\n| --- | --- | --- | --- | --- | --- |\n"
+        text = head + "\n".join(map(row, records)) + "\n"
+        print(text) if args.out is None else replace_text(args.out, text)
+        return
+    jax.config.update("jax_enable_x64", True)
+    for name in args.cases:
+        file = args.out / f"{args.command}-{name}.json"
+        if not file.exists():
+            record = kinds[args.command](name, args.out) | {"code": _commit()}
+            args.out.mkdir(parents=True, exist_ok=True)
+            replace_text(file, json.dumps(record))
+            print(row(record), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""The outcome of a search that began from a fit, in words: what changed since, or that nothing did."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..numerics.digits import number
+from .findings import Finding, SuspectReport, verdict
+from .keys import Key, listed, words
+from .outcome import Diagnosis
+from .verdict import RISEN
+
+
+def changes(
+    diagnosis: Diagnosis,
+    accepted: Sequence[Finding],
+    error: Mapping[str, Any] | None,
+    rivals: Sequence[Key] = (),
+    suspects: Sequence[SuspectReport] = (),
+) -> str:
+    """The outcome in one sentence, where nothing is named with the test of whether errors have risen."""
+    if not diagnosis.complete:
+        first = changes(diagnosis._replace(complete=True), accepted, error, rivals, suspects)
+        return f"{first} The search is not finished: more may have changed."
+    if accepted:
+        return verdict(accepted, error, opening="Changed since the fit:")
+    if rivals:
+        return f"Something changed since the fit, but {listed([*map(words, rivals)])} explain the same; none is added."
+    suspected = f" Suspected: {suspects[0].description}." if suspects else ""
+    test = diagnosis.risen
+    if test is None:
+        return f"Nothing is certain to have changed since the fit, whose own recordings are not at hand.{suspected}"
+    size = f"errors are {number(test.ratio, 2)} times those on its recordings left out (p = {number(test.p_value, 2)})"
+    if test.p_value < RISEN:
+        return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{suspected}"
+    return f"Nothing changed since the fit that these recordings could show: {size}."

@@ -1,0 +1,100 @@
+"""Numbers that moved since a fit: friction of a joint, an estimated number of the machine.
+
+Where friction and numbers are learned from the same logs these are no candidates: the fit holds them.
+"""
+
+from functools import partial
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .base import AbstractEffect, JointEffect, Scalar, known, one
+
+SIZE, SPREAD = 0.05, 0.5
+"""Torque of a probe, and standard deviation of a change, in the typical torque of the joint."""
+KNEE = 0.01
+"""Rate over which Coulomb friction changes its sign, in the largest rate of the joint: as `Weights` has it."""
+
+
+class CoulombChange(JointEffect):
+    """Coulomb friction of a joint differs from that of the fit: -change sign(w)."""
+
+    name: ClassVar[str] = "coulomb_change"
+    reported_as: ClassVar[str] = "unknown_function"
+    confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
+    units: ClassVar[dict[str, str]] = {"change": "N m"}
+    change: Scalar
+    knee: Scalar = known()
+    """Rate over which the sign is smoothed [rad/s]."""
+
+    @classmethod
+    def candidates(cls, around):
+        joints, out = around.joints if around.moved is not None and around.learned else [], []
+        for j in joints:
+            size, make = float(around.torque[j - 1]), partial(cls, knee=KNEE * float(around.speed[j - 1]), joint=j)
+            out.append(one(make, 0.0, SIZE * size, SPREAD * size))
+        return out
+
+    def force(self, scene, memory):
+        return self.at(scene, -self.change * jnp.tanh(self.own(scene.v) / self.knee))
+
+    def phrase(self, sizes):
+        return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"
+
+    def signals(self, system):
+        return (system.rates[self.joint - 1],)
+
+
+class ViscousChange(JointEffect):
+    """Viscous friction of a joint differs from that of the fit: -change w."""
+
+    name: ClassVar[str] = "viscous_change"
+    reported_as: ClassVar[str] = "unknown_function"
+    confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
+    units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}
+    change: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        joints = around.joints if around.moved is not None and around.learned else []
+        slopes = {j: float(around.torque[j - 1] / around.speed[j - 1]) for j in joints}
+        return [one(partial(cls, joint=j), 0.0, SIZE * slope, SPREAD * slope) for j, slope in slopes.items()]
+
+    def force(self, scene, memory):
+        return self.at(scene, -self.change * self.own(scene.v))
+
+    def phrase(self, sizes):
+        return f"the viscous friction of joint {self.joint} by {sizes['change']}"
+
+    def signals(self, system):
+        return (system.rates[self.joint - 1],)
+
+
+class NumberChange(AbstractEffect):
+    """An estimated number of the machine differs from that of the fit."""
+
+    name: ClassVar[str] = "change"
+    reported_as: ClassVar[str] = "unknown_function"
+    confirm: ClassVar[str] = "Measure it."
+    units: ClassVar[dict[str, str]] = {"change": "unit of the number"}
+    change: Scalar
+    number: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+
+    @classmethod
+    def candidates(cls, around):
+        make = lambda name, unit: partial(cls, number=name, unit=unit)  # noqa: E731
+        return [one(make(name, unit), 0.0, SIZE * size, size) for name, unit, size in around.moved or ()]
+
+    def inputs_named(self):
+        return (self.number,)
+
+    def phrase(self, sizes):
+        return f"{self.number} by {sizes['change']}"
+
+    def units_on(self, system):
+        return {"change": self.unit}
+
+    def physics(self, system, time):
+        return system.with_parameters({self.number: system.parameter(self.number) + self.change})

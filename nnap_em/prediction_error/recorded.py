@@ -1,0 +1,94 @@
+"""Multi-step errors by recording, beside those that a fit has on recordings left out of it."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Bool, Float
+
+from ..data.dataset import Dataset
+from ..em.mstep import ScoringMStep
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from .multistep import HORIZONS, errors, followed, huber, open_loop, weighed
+
+
+class Levels(NamedTuple):
+    """Errors that a fit has on its own recordings, each left out in turn."""
+
+    scale: Float[np.ndarray, "horizon obs"]
+    """Root mean square over the recordings [rad, or m]; errors beyond twice the typical one weigh less."""
+    level: Float[np.ndarray, " recording"]
+    """`level` of every recording."""
+
+
+def left_out(
+    model: StateSpaceModel, m_step: ScoringMStep, path: Gaussian, data: Dataset, used: Bool[np.ndarray, " seq"]
+) -> Float[np.ndarray, "seq start horizon obs"]:
+    """Errors of every recording with the friction and the numbers that the others give, by one Gauss-Newton step.
+
+    e_s + J_s (A - J_s' W J_s)^-1 J_s' W e_s,   A = prior + sum J' W J     [Cook 1977, Technometrics 19(1)]
+    """
+    weights = m_step.weights(model)
+    along = open_loop(followed(model, m_step.prior, path, data), weights)
+    weight = weighed(along, used)
+    columns = np.where(weight[..., None] > 0, along.columns, 0.0).astype(float)
+    error = np.where(weight > 0, along.error, 0.0)
+    prior = np.asarray(weights.prior_precision(model.unknown))
+    rows = len(error), -1
+    moved = deleted(columns.reshape(*rows, columns.shape[-1]), weight.reshape(rows), error.reshape(rows), prior)
+    out = moved.reshape(error.shape)
+    return np.where(used[:, None, None, None] & (weight > 0), out, np.nan)
+
+
+def deleted(
+    columns: Float[np.ndarray, "seq row phi"],
+    weight: Float[np.ndarray, "seq row"],
+    error: Float[np.ndarray, "seq row"],
+    prior: Float[np.ndarray, "phi phi"],
+) -> Float[np.ndarray, "seq row"]:
+    """Errors of each sequence with the numbers that fit the others best, where errors are linear in them."""
+    information = np.einsum("srp,sr,srq->spq", columns, weight, columns)
+    score = np.einsum("srp,sr->sp", columns, weight * error)
+    whole = prior + information.sum(axis=0)
+    away = np.stack([np.linalg.solve(whole - i, g) for i, g in zip(information, score, strict=True)])
+    return error + np.einsum("srp,sp->sr", columns, away)
+
+
+def levels(error: Float[np.ndarray, "seq start horizon obs"]) -> Levels:
+    """Scale and levels of the errors of recordings left out."""
+    size = np.nanmedian(np.abs(error), axis=(0, 1)) * 1.4826 + 1e-12
+    return Levels(size, level(error, size))
+
+
+def level(
+    error: Float[np.ndarray, "seq start horizon obs"], scale: Float[np.ndarray, "horizon obs"]
+) -> Float[np.ndarray, " seq"]:
+    """Log of the root mean square of every recording's errors in `scale`, outliers less; NaN where there is none."""
+    known = np.isfinite(error)
+    square = np.where(known, huber(np.where(known, error, 0.0), scale[None, None]), 0.0).sum(axis=(1, 2, 3))
+    count = known.sum(axis=(1, 2, 3))
+    return np.where(count > 0, 0.5 * np.log(square / np.maximum(count, 1) + 1e-12), np.nan)
+
+
+def errors_of(
+    model: StateSpaceModel, m_step: ScoringMStep, path: Gaussian, data: Dataset
+) -> Float[np.ndarray, "seq start horizon obs"]:
+    """Errors of recordings that are new to a fit."""
+    return errors(followed(model, m_step.prior, path, data), HORIZONS)
+
+
+class Risen(NamedTuple):
+    """Test of whether the errors of new recordings are larger than those of the fit on recordings left out."""
+
+    ratio: float
+    """Root mean square of the new recordings over that of the others, by the medians of the recordings."""
+    p_value: float
+    """Chance of such ranks where nothing changed."""
+
+
+def risen(before: Float[np.ndarray, " recording"], now: Float[np.ndarray, " new"]) -> Risen:
+    """One-sided rank test of levels [Mann & Whitney 1947, Ann. Math. Stat. 18, 50]."""
+    before, now = before[np.isfinite(before)], now[np.isfinite(now)]
+    test = scipy.stats.mannwhitneyu(now, before, alternative="greater")
+    return Risen(float(np.exp(np.median(now) - np.median(before))), float(test.pvalue))

@@ -1,0 +1,280 @@
+"""What changed since a fit: its posterior as a prior, a change that was made and nothing else, and alarms as stated."""
+
+import dataclasses
+import json
+import math
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+
+from nnap_em import diagnose, findings, identify, identify_from
+from nnap_em.commands import cli
+from nnap_em.comparison.monitor import FALSE, MOST, SHIFT, Judged, Reference, cusum, standardised, threshold, trend
+from nnap_em.data.dataset import DataError
+from nnap_em.data.formats import write_csv
+from nnap_em.data.rig import Declared, write_rig
+from nnap_em.diagnosis.change import changes
+from nnap_em.diagnosis.findings import SuspectReport
+from nnap_em.diagnosis.outcome import Diagnosis
+from nnap_em.diagnosis.verdict import MISSING, RISEN, veto
+from nnap_em.fit.known import differences
+from nnap_em.fit.store import load, save
+from nnap_em.model.simulate import declared, examples, sweep_experiment
+from nnap_em.prediction_error.multistep import Grid
+from nnap_em.prediction_error.recorded import Risen, deleted, level, risen
+
+GROWN = 0.2
+"""Growth of the Coulomb friction of a slide [N]; it is 1."""
+
+
+def _rig(friction: bool = True):
+    truth, _ = examples["slide"]()
+    return dataclasses.replace(declared("slide", truth), parameters={"m": Declared(1.1, 0.1)}, friction=friction)
+
+
+def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, frictionless: bool = False):
+    truth, sweep = examples["slide"]()
+    law = truth.unknown
+    if frictionless:
+        law = jax.tree.map(lambda a: 0 * a if a is not law.stribeck and a is not law.smooth else a, law)
+        truth = eqx.tree_at(lambda m: m.unknown, truth, law)
+    grown = eqx.tree_at(
+        lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, (law.coulomb + more, law.breakaway + more)
+    )
+    return sweep_experiment(grown, sweep, sequences, steps, key=jax.random.key(seed)).data
+
+
+# --- the posterior of a fit as a prior
+
+
+def test_a_fit_from_a_fit_is_that_of_all_logs():
+    """Of a mass alone: precisions add, and the mean is weighted by them, as Bayes' rule has it."""
+    rig, first, second = _rig(friction=False), _logs(0, frictionless=True), _logs(1, frictionless=True)
+    key = jax.random.key(0)
+    one = identify(rig, first, key=key)
+    two = identify_from(one, rig, second, key=key)
+    both = identify(rig, jax.tree.map(lambda *a: np.concatenate(a), first, second), key=key)
+    (m, std), (joint, joint_std), (_, alone) = (fit_m(fit) for fit in (two, both, one))
+    assert std == pytest.approx(joint_std, rel=0.05) and std < 0.8 * alone
+    assert m == pytest.approx(joint, abs=0.2 * joint_std)
+
+
+def fit_m(fit):
+    """The mass and its standard deviation [kg]."""
+    cov = np.linalg.inv(np.asarray(fit.state.hessian))[-1, -1]
+    return float(fit.model.system.m), float(fit.m_step.prior.std[0] * math.sqrt(cov))
+
+
+def test_rigs_that_differ_are_named_key_by_key():
+    rig = _rig()
+    assert differences(rig, dataclasses.replace(rig, name="another")) == []
+    heavier = dataclasses.replace(rig, parameters={"m": Declared(1.3, 0.1)})
+    assert differences(rig, heavier) == ["m of parameters is 1.1 ± 0.1 in the fit and 1.3 ± 0.1 here"]
+    with pytest.raises(DataError, match=r"is not that of the fit: dt is 0.01 in the fit and 0.02 here"):
+        differences(rig, dataclasses.replace(rig, dt=0.02))
+    with pytest.raises(DataError, match="written as equations"):
+        differences(rig, dataclasses.replace(rig, equations="x' = -x"))
+
+
+# --- the search
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return identify(_rig(), _logs(0), key=jax.random.key(0))
+
+
+def test_friction_that_grew_is_named_with_its_size(fit, tmp_path):
+    """Inside two of its standard deviations, alone; the outcome can be stored, with the machine as it is now."""
+    closed = diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(0))
+    (found,) = findings(closed)
+    change = found.parameters["change"]
+    assert found.effect.name == "coulomb_change"
+    assert abs(change.value - GROWN) < 2 * change.std < 0.1 * GROWN
+    assert changes(closed, [found], None).startswith("Changed since the fit: the Coulomb friction of joint 1 by 0.")
+    save(tmp_path / "after.npz", closed.after)
+    assert float(load(tmp_path / "after.npz").model.effects[0].change) == float(found.effect.change)
+
+
+def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
+    closed = diagnose(_rig(), _logs(2), key=jax.random.key(0), start=fit, own=_logs(0))
+    assert not findings(closed) and closed.risen.p_value > RISEN
+    assert changes(closed, [], None).startswith(
+        "Nothing changed since the fit that these recordings could show: errors"
+    )
+
+
+def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
+    good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
+    assert veto(**good) is None
+    assert veto(**good, before=MISSING - 0.01) is None
+    assert veto(**good, before=MISSING + 0.01).code == "before"
+
+
+def test_where_nothing_explains_it_the_errors_decide(fit):
+    suspect = SuspectReport("payload", 1, None, [], 0.1, 0.0, "payload", "a payload would remove 10%", "Weigh it.")
+    for p, text, ending in ((0.9 * RISEN, "Something changed", "Suspected: a payload would remove 10%."),
+                            (1.1 * RISEN, "Nothing changed", "(p = 0.011).")):  # fmt: skip
+        outcome = Diagnosis(fit, fit, (), (), change=True, risen=Risen(2.0, p))
+        sentence = changes(outcome, [], None, suspects=[suspect])
+        assert sentence.startswith(text) and sentence.endswith(ending) and "errors are 2.0 times" in sentence
+    assert "not at hand" in changes(outcome._replace(risen=None), [], None)
+
+
+# --- errors by recording
+
+
+def test_errors_left_out_are_those_of_a_fit_without_the_recording():
+    """A linear problem: one step is exact."""
+    rng = np.random.default_rng(0)
+    columns, weight = rng.normal(size=(5, 30, 4)), rng.uniform(0.5, 2, (5, 30))
+    prior, y = np.diag([1.0, 2.0, 0.5, 0.1]), rng.normal(size=(5, 30))
+
+    def solved(some):
+        c, w, e = columns[some].reshape(-1, 4), weight[some].ravel(), y[some].ravel()
+        return np.linalg.solve(prior + c.T @ (w[:, None] * c), c.T @ (w * e))
+
+    error = y - columns @ solved(np.arange(5))
+    out = deleted(columns, weight, error, prior)
+    for i in range(5):
+        np.testing.assert_allclose(out[i], y[i] - columns[i] @ solved(np.arange(5) != i), rtol=1e-9)
+
+
+def test_the_level_of_a_recording_is_the_log_of_its_rms_and_larger_ones_are_seen():
+    rng = np.random.default_rng(1)
+    error, scale = rng.normal(size=(3, 4000, 1, 1)) * np.array([1.0, 2.0, 4.0])[:, None, None, None], np.ones((1, 1))
+    np.testing.assert_allclose(np.diff(level(10 * error, 10 * scale)), np.diff(level(error, scale)))
+    np.testing.assert_allclose(level(1e-3 * error, scale), np.log(1e-3 * np.array([1, 2, 4])), atol=0.05)
+    assert np.isnan(level(np.full((1, 5, 1, 1), np.nan), scale)).all()
+    now, before = np.log([3.0, 2.5, 4.0, 3.5]), np.log([1.0, 1.2, 0.9, 1.1])
+    assert risen(before, now).p_value == pytest.approx(1 / math.comb(8, 4))
+    assert risen(before, now).ratio == pytest.approx(math.exp(np.median(now) - np.median(before)))
+
+
+# --- charts
+
+
+@pytest.mark.parametrize("rate, charts", [(0.01, 1), (0.02, 4)])
+def test_false_alarms_are_as_frequent_as_stated(rate, charts):
+    """Siegmund's formula against simulated runs of standard normal values."""
+    rng, runs = np.random.default_rng(2), 3000
+    total, length, alive = np.zeros((runs, charts)), np.zeros(runs), np.ones(runs, bool)
+    for _ in range(1500):
+        total = np.maximum(0.0, total + rng.standard_normal(total.shape) - SHIFT)
+        length += alive
+        alive &= ~(total > threshold(rate, charts)).any(axis=1)
+    assert not alive.any()
+    assert length.mean() * rate == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_chart_is_the_largest_sum_of_the_last_values():
+    """max(0, max over j of sum_{i > j} (z_i - k)), which the recursion of Page is."""
+    z = np.random.default_rng(3).normal(0.3, 1, 40)
+    sums = [max(0.0, *(float(np.sum(z[j : i + 1] - SHIFT)) for j in range(i + 1))) for i in range(40)]
+    np.testing.assert_allclose(cusum(z), sums, atol=1e-12)
+    np.testing.assert_allclose(cusum(np.array([2.0, np.nan, 2.0])), [1.5, 1.5, 3.0])
+
+
+def test_values_beside_few_are_exactly_normal_whatever_their_scale():
+    rng = np.random.default_rng(4)
+    every = np.stack([standardised(v[:4], v[4:]) for v in rng.normal(size=(4000, 10))])
+    assert scipy.stats.kstest(every[:, 0][np.abs(every[:, 0]) < MOST], "norm").pvalue > 1e-3
+    np.testing.assert_allclose(np.corrcoef(every.T), np.eye(6), atol=4 / math.sqrt(4000))
+    v = rng.normal(size=12)
+    np.testing.assert_allclose(standardised(7 + 3 * v[:4], 7 + 3 * v[4:]), standardised(v[:4], v[4:]), rtol=1e-9)
+
+
+def _reference(rng, names: int = 2, own: int = 20) -> Reference:
+    each = tuple(
+        Judged(x, e, np.eye(names)) for x, e in zip(rng.normal(size=own), rng.normal(size=(own, names)), strict=True)
+    )
+    return Reference(tuple("ab")[:names], ("N",) * names, np.ones((1, 1)), Grid(1, (1,)), 10, each)
+
+
+def test_a_number_that_drifts_is_charted_and_filtered():
+    """By .3 of its standard deviation a recording from number 30 on: seen within 15, and its beginning near there."""
+    rng = np.random.default_rng(5)
+    drift = 0.3 * np.maximum(0, np.arange(60) - 29)
+    judged = [
+        Judged(x, e + np.array([d, 0.0]), np.eye(2))
+        for x, e, d in zip(rng.normal(size=60), rng.normal(size=(60, 2)), drift, strict=True)
+    ]
+    seen = trend(_reference(rng), judged)
+    assert seen.alarm.chart == "a up" and 30 <= seen.alarm.at <= 45 and 25 <= seen.alarm.since <= 36
+    assert abs(seen.value[-1, 0] - drift[-1]) < 3  # of a memory of ten recordings
+    assert abs(seen.value[-1, 1]) < 3 * seen.std[-1, 1]
+    quiet = trend(_reference(rng), judged[:30])
+    assert quiet.alarm is None and quiet.threshold == threshold(FALSE, 5)
+
+
+def test_a_number_that_does_not_move_is_the_weighted_mean(monkeypatch):
+    """Without a memory that ends the filter is the sum of information."""
+    monkeypatch.setattr("nnap_em.comparison.monitor.MEMORY", 1.0)
+    rng = np.random.default_rng(6)
+    beside, judged = _reference(rng), [Judged(0.0, e, 4 * np.eye(2)) for e in rng.normal(size=(7, 2))]
+    own = np.stack([one.estimate for one in beside.own])
+    scatter = np.maximum(np.var(own, axis=0) - 1, 0)
+    seen = trend(beside, judged)
+    information = 20 / (1 + scatter) + 7 / (4 + scatter)
+    mean = np.sum([one.estimate for one in judged], axis=0) / (4 + scatter) / information
+    np.testing.assert_allclose(seen.value[-1], mean, rtol=1e-9)
+    np.testing.assert_allclose(seen.std[-1], information**-0.5, rtol=1e-9)
+
+
+# --- the command
+
+
+def _write(folder, data, rig, names):
+    (folder / "train").mkdir(parents=True, exist_ok=True)
+    write_rig(rig, folder / "rig.toml")
+    for name, t, u, y in zip(names, data.t, data.u, data.y, strict=True):
+        write_csv(folder / "train" / f"{name}.csv", {"time": t, "u": u[:, 0], "x": y[:, 0]})
+
+
+def test_recordings_are_judged_once_and_a_broken_sensor_is_no_change(tmp_path, capsys):
+    names = [f"{i:02d}" for i in range(8)]
+    _write(tmp_path / "own", _logs(0), _rig(), names)
+    _write(tmp_path / "later", _logs(1, sequences=3), _rig(), names[:3])
+    fit, out = tmp_path / "fit", tmp_path / "out"
+    assert cli.main(["identify", str(tmp_path / "own"), "--out", str(fit), "--epochs", "9", "--quiet"]) == 0
+    command = ["monitor", str(fit), str(tmp_path / "later/train"), "--out", str(out)]
+    stuck = (tmp_path / "later/train/02.csv").read_text().splitlines()
+    broken = [stuck[0], *(f"{line.rpartition(',')[0]},0.125" for line in stuck[1:])]
+    (tmp_path / "later/train/02.csv").write_text("\n".join(broken) + "\n")
+    assert cli.main(command) == 0
+    first = json.loads((out / "monitor.json").read_text())
+    reasons = [row["reason"] for row in first["recordings"]]
+    assert reasons[:2] == [None, None] and reasons[2] and not first["changed"]
+    assert first["verdict"] == "No change in 2 recordings; 1 not judged."
+    page = (out / "monitor.html").read_text()
+    assert first["verdict"] in page and "02.csv: " in page
+    _write(tmp_path / "later", _logs(7, sequences=1), _rig(), ["03"])
+    capsys.readouterr()
+    assert cli.main([*command, "--resume"]) == 0
+    said, second = capsys.readouterr().err, json.loads((out / "monitor.json").read_text())
+    assert "03.csv: errors" in said and "00.csv" not in said
+    assert second["recordings"][:3] == first["recordings"] and len(second["recordings"]) == 4
+    assert cli.main(command) == 0
+    anew = json.loads((out / "monitor.json").read_text())
+    assert anew["recordings"] == second["recordings"] and anew["charts"] == second["charts"]
+
+
+def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, fit):
+    save(tmp_path / "model.npz", fit)
+    _write(tmp_path / "logs", _logs(1, sequences=2), dataclasses.replace(_rig(), friction=False), ["0", "1"])
+    arguments = [
+        "diagnose",
+        str(tmp_path / "logs"),
+        "--from",
+        str(tmp_path / "model.npz"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert cli.main(arguments) == 2
+    assert "is not that of the fit: friction is True in the fit and False here" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert cli.main(["monitor", str(tmp_path / "model.npz"), str(tmp_path / "logs/train"), "--out", "x"]) == 2
+    assert "give their folder with --logs FOLDER" in capsys.readouterr().err

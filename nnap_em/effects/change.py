@@ -30,20 +30,21 @@ class CoulombChange(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        joints, out = around.joints if around.moved is not None and around.learned else [], []
-        for j in joints:
-            size, make = float(around.torque[j - 1]), partial(cls, knee=KNEE * float(around.speed[j - 1]), joint=j)
-            out.append(one(make, 0.0, SIZE * size, SPREAD * size))
-        return out
-
-    def force(self, scene, memory):
-        return self.at(scene, -self.change * jnp.tanh(self.own(scene.v) / self.knee))
+        sizes = zip(around.joints, map(float, around.torque), map(float, around.speed), strict=True)
+        return [
+            one(partial(cls, knee=KNEE * speed, joint=j), 0.0, SIZE * torque, SPREAD * torque)
+            for j, torque, speed in sizes
+            if around.moved is not None and around.learned
+        ]
 
     def phrase(self, sizes):
         return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"
 
     def signals(self, system):
         return (system.rates[self.joint - 1],)
+
+    def force(self, scene, memory):
+        return self.at(scene, -self.change * jnp.tanh(self.own(scene.v) / self.knee))
 
 
 class ViscousChange(JointEffect):
@@ -57,18 +58,18 @@ class ViscousChange(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        joints = around.joints if around.moved is not None and around.learned else []
-        slopes = {j: float(around.torque[j - 1] / around.speed[j - 1]) for j in joints}
-        return [one(partial(cls, joint=j), 0.0, SIZE * slope, SPREAD * slope) for j, slope in slopes.items()]
-
-    def force(self, scene, memory):
-        return self.at(scene, -self.change * self.own(scene.v))
+        slopes = zip(around.joints, map(float, around.torque / around.speed), strict=True)
+        learned = around.moved is not None and around.learned
+        return [one(partial(cls, joint=j), 0.0, SIZE * slope, SPREAD * slope) for j, slope in slopes if learned]
 
     def phrase(self, sizes):
         return f"the viscous friction of joint {self.joint} by {sizes['change']}"
 
     def signals(self, system):
         return (system.rates[self.joint - 1],)
+
+    def force(self, scene, memory):
+        return self.at(scene, -self.change * self.own(scene.v))
 
 
 class NumberChange(AbstractEffect):
@@ -84,8 +85,8 @@ class NumberChange(AbstractEffect):
 
     @classmethod
     def candidates(cls, around):
-        make = lambda name, unit: partial(cls, number=name, unit=unit)  # noqa: E731
-        return [one(make(name, unit), 0.0, SIZE * size, size) for name, unit, size in around.moved or ()]
+        numbers = around.moved or ()
+        return [one(partial(cls, number=name, unit=unit), 0.0, SIZE * size, size) for name, unit, size in numbers]
 
     def inputs_named(self):
         return (self.number,)

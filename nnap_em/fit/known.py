@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..data.dataset import DataError, Dataset
+from ..data.machine import unpacked
 from ..data.rig import Rig
 from ..em.loop import EPOCHS, later_state
 from ..em.mstep import ScoringMStep
@@ -30,11 +31,17 @@ def differences(fit: Rig, rig: Rig) -> list[str]:
     """
     if fit.equations or rig.equations:
         raise DataError(f"rig {rig.name!r} is written as equations; start from a fit of a machine with joints")
-    lines = list(_differing(dataclasses.asdict(fit), dataclasses.asdict(rig)))
+    lines = list(_differing(_declared(fit), _declared(rig)))
     foreign = [line for key, line in lines if key in SAME]
     if foreign:
         raise DataError(f"rig {rig.name!r} is not that of the fit: {'; '.join(foreign)}")
     return [line for _, line in lines]
+
+
+def _declared(rig: Rig) -> dict:
+    """All declarations; of a machine file what it holds, wherever it is."""
+    whole = dataclasses.asdict(rig)
+    return whole | ({"machine": str(unpacked(rig.machine)._replace(file=""))} if rig.machine else {})
 
 
 def _differing(fit: dict, rig: dict) -> Iterator[tuple[str, str]]:

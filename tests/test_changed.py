@@ -182,6 +182,7 @@ def test_values_beside_few_are_exactly_normal_whatever_their_scale():
     rng = np.random.default_rng(4)
     every = np.stack([standardised(v[:4], v[4:]) for v in rng.normal(size=(4000, 10))])
     assert scipy.stats.kstest(every[:, 0][np.abs(every[:, 0]) < MOST], "norm").pvalue > 1e-3
+    assert np.mean(np.abs(every) > 1.96) == pytest.approx(0.05, abs=4 * math.sqrt(0.05 / every.size))
     np.testing.assert_allclose(np.corrcoef(every.T), np.eye(6), atol=4 / math.sqrt(4000))
     v = rng.normal(size=12)
     np.testing.assert_allclose(standardised(7 + 3 * v[:4], 7 + 3 * v[4:]), standardised(v[:4], v[4:]), rtol=1e-9)

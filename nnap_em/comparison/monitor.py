@@ -22,7 +22,7 @@ from ..effects.position import TorqueOffset
 from ..em.build import build_system, measure_scales, start_prior
 from ..fit.identify import Identified
 from ..numerics.gaussian import Gaussian
-from ..prediction_error.multistep import HORIZONS, HUBER, Grid, grid_of
+from ..prediction_error.multistep import HORIZONS, HUBER, Grid, grid_of, huber
 from ..prediction_error.recorded import errors_of, left_out, level, levels
 
 SHIFT = 0.5
@@ -115,8 +115,9 @@ def judge(fitted: Identified, reference: Reference, candidates: Sequence[Candida
     fills = ("edge", 0.0, np.nan, False)
     data = Dataset(*(_longer(np.asarray(part), rows, fill) for part, fill in zip(data, fills, strict=True)))
     fit = along(_starting(fitted, data), data, fitted.smoother)
-    if not fit.used.all():
-        return "the fit does not follow it"
+    if not fit.used.all():  # it runs away: as far off as an error counts
+        spread = np.diag([_probe(candidate)[1] ** 2 for candidate in candidates])
+        return Judged(0.5 * math.log(float(huber(np.inf, 1.0))), np.zeros(len(candidates)), spread)
     linearised = MultiStep(bands=(HORIZONS,)).linearise(fit, candidates)[0]
     size = level(errors_of(fit.model, fit.m_step, fit.path, data), reference.scale)
     return Judged(float(size[0]), *_estimate(linearised, 0, candidates, reference.scale))

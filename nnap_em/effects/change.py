@@ -21,7 +21,6 @@ class CoulombChange(JointEffect):
     """Coulomb friction of a joint differs from that of the fit: -change sign(w)."""
 
     name: ClassVar[str] = "coulomb_change"
-    reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m"}
     change: Scalar
@@ -51,7 +50,6 @@ class ViscousChange(JointEffect):
     """Viscous friction of a joint differs from that of the fit: -change w."""
 
     name: ClassVar[str] = "viscous_change"
-    reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}
     change: Scalar
@@ -76,7 +74,6 @@ class NumberChange(AbstractEffect):
     """An estimated number of the machine differs from that of the fit."""
 
     name: ClassVar[str] = "change"
-    reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Measure it."
     units: ClassVar[dict[str, str]] = {"change": "unit of the number"}
     change: Scalar

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import equinox as eqx
 import jax
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from nnap_em import diagnose, findings, identify, identify_from
+from nnap_em import compare, diagnose, findings, identify, identify_from
 from nnap_em.commands import cli
+from nnap_em.comparison import cause
 from nnap_em.comparison.monitor import FALSE, MOST, SHIFT, Judged, Reference, cusum, standardised, threshold, trend
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
@@ -87,9 +89,13 @@ def fit():
     return identify(_rig(), _logs(0), key=jax.random.key(0))
 
 
-def test_friction_that_grew_is_named_with_its_size(fit, tmp_path):
+@pytest.fixture(scope="module")
+def closed(fit):
+    return diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(0))
+
+
+def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
     """Inside two of its standard deviations, alone; the outcome can be stored, with the machine as it is now."""
-    closed = diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(0))
     (found,) = findings(closed)
     change = found.parameters["change"]
     assert found.effect.name == "coulomb_change"
@@ -105,6 +111,22 @@ def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     assert changes(closed, [], None).startswith(
         "Nothing changed since the fit that these recordings could show: errors"
     )
+
+
+def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypatch):
+    """The errors of each rise on those of the other, and the search goes from the first to the second."""
+    second = identify(_rig(), _logs(1, GROWN), key=jax.random.key(0))
+    searched = []
+    monkeypatch.setattr(cause, "diagnose", lambda rig, data, **options: searched.append((data, options)) or closed)
+    recorded = [cause.Recorded(_rig(), logs) for logs in (_logs(0), _logs(1, GROWN))]
+    outcome = cause.explained(compare(fit, second, names=("may", "june")), *recorded)
+    ((data, options),) = searched
+    assert data is recorded[1].data and options["own"] is recorded[0].data and options["start"] is fit
+    assert outcome.cause.friction and outcome.verdict.startswith(
+        "Changed since may: the Coulomb friction of joint 1 by"
+    )
+    ratios = [float(re.search(r"are ([0-9.]+) times", text)[1]) for text in outcome.cause.judged]
+    assert min(ratios) > 1.5 and outcome.cause.judged[0].startswith("On the recordings of june the errors of may")
 
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():

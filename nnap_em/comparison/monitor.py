@@ -147,7 +147,7 @@ def threshold(rate: float, charts: int) -> float:
     1 / rate = (exp(2 k b) - 2 k b - 1) / (2 k^2),   b = h + 1.166     [Siegmund 1985, Sequential Analysis, ch. 2]
     """
     runs = lambda h: (math.exp(2 * SHIFT * (h + 1.166)) - 2 * SHIFT * (h + 1.166) - 1) / (2 * SHIFT**2)  # noqa: E731
-    return float(scipy.optimize.brentq(lambda h: runs(h) - charts / rate, 0.0, 60.0))
+    return scipy.optimize.brentq(lambda h: runs(h) - charts / rate, 0.0, 60.0)  # type: ignore[return-value]
 
 
 def standardised(own: Float[np.ndarray, " own"], values: Float[np.ndarray, " new"]) -> Float[np.ndarray, " new"]:

@@ -227,9 +227,9 @@ def diagnose(
         The models before and after, the evidence, and the course of the search; `findings` has it in sentences.
 
     Raises:
-        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input; or `start` is of
+            another machine.
         FitError: no sequence can be followed.
-        DataError: `start` is of another machine.
 
     Example:
         >>> diagnosis = nnap_em.diagnose(rig, train, key=key, seconds=1.0)

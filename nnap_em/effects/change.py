@@ -31,7 +31,7 @@ class CoulombChange(JointEffect):
     def candidates(cls, around):
         sizes = zip(around.joints, map(float, around.torque), map(float, around.speed), strict=True)
         return [
-            one(partial(cls, knee=KNEE * speed, joint=j), 0.0, SIZE * torque, SPREAD * torque)
+            one(partial(cls, knee=jnp.asarray(KNEE * speed), joint=j), 0.0, SIZE * torque, SPREAD * torque)
             for j, torque, speed in sizes
             if around.moved is not None and around.learned
         ]

@@ -131,9 +131,27 @@ def identify_from(
     epochs: int = EPOCHS,
     watch: Watch = unwatched,
 ) -> Identified:
-    """`identify` with the posterior of `fit` as the prior of `data`, in the place of what `rig` declares.
+    """Identify with the posterior of an earlier fit as the prior, in the place of what a rig declares.
 
-    Raises FitError when no sequence can be followed, and DataError where the rigs are not of one machine.
+    Args:
+        fit: the earlier fit.
+        rig: of the new logs.
+        data: sequences to fit.
+        key: random key of the start.
+        smoother: makes the smoother.
+        epochs: of EM, at most.
+        watch: called after every epoch with its state, the number of rows seen and the sequences used.
+
+    Returns:
+        The fit of the new logs.
+
+    Raises:
+        DataError: the rigs are not of one machine, or one is written as equations.
+        FitError: no sequence can be followed.
+
+    Example:
+        >>> nnap_em.identify_from(fit, rig, test, key=key, epochs=2).rig == rig
+        True
     """
     start = known(fit, rig, data, key=key, smoother=smoother)
     return forgotten(identify(rig, data, key=key, epochs=epochs, start=start, watch=watch))

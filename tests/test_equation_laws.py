@@ -12,14 +12,15 @@ import pytest
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
-from nnap_em.diagnosis.equations import FOLDS, folds, search_equations
+from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
 from nnap_em.draft.equations import draft_equations
-from nnap_em.effects import Scene, catalogue
+from nnap_em.effects import Candidate, Scene, catalogue
+from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
 from nnap_em.fit.identify import begin, identify
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.prediction_error.multistep import Grid
+from nnap_em.prediction_error.simulated import Simulated, Windows
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.acrobot import table_i
 
@@ -68,19 +69,56 @@ def test_units_of_a_law_are_those_of_its_port_and_signals():
 
 
 def test_a_bent_sensor_reads_a_curve():
-    bend = catalogue["sensor_bend"](jnp.asarray(0.2), low=1.0, high=5.0, channel="a")
+    bend = catalogue["sensor_bend"](jnp.asarray(0.2), jnp.asarray(1.0), 4.0, channel="a")
     np.testing.assert_allclose(bend.reading(jnp.asarray(3.0), lambda delay: jnp.nan), 3.0 + 0.2 * 4.0 / 4.0)
 
 
-def test_a_reading_is_in_one_part_whichever_start_predicts_it():
-    at = Grid(2, (10, 20))
-    masks = np.stack(folds(at, 2, 100))
-    np.testing.assert_array_equal(masks.sum(axis=0), 1)
-    assert masks.shape == (FOLDS, 2, len(at.starts(100)), 2, 1)
-    row = at.starts(100)[:, None] + np.asarray(at.ages)[None]
-    for part in masks[..., 0]:
-        for sequence in part:
-            assert not set(row[sequence]) & set(row[~sequence])
+def test_a_reading_is_in_one_part_or_determines_a_start():
+    at = Windows(2, 50, 1, 10)
+    masks = np.stack(folds(at, 2))
+    assert masks.shape == (FOLDS, 2, 2, 50, 1)
+    np.testing.assert_array_equal(masks.sum(axis=0)[..., 0], (at.row % 50 >= 10)[None].repeat(2, axis=0))
+    for part in masks[..., 0]:  # blocks of 25 rows
+        blocks = {int(row) // 25 for sequence in part for row in at.row[sequence]}
+        assert blocks <= {0, 1, 2, 3}
+    assert not (masks[0] & masks[1]).any()
+
+
+def _case(left, numbers, share, error):
+    law = catalogue["linear_flow" if numbers == 1 else "threshold_flow"]
+    start = law(strength=0.0, channel="a", reads=("a",))
+    none = np.zeros((*error.shape, 0))
+    of = Simulated(None, None, np.zeros(0), np.zeros((1, 1, 0)), error, none, none)  # type: ignore[arg-type]
+    return Case((Candidate(start, (), start),), of, 0.0, share=share, left=left)
+
+
+@pytest.mark.parametrize(("left", "chosen"), [(1.05, 1), (1.15, 2)])
+def test_of_laws_as_likely_that_of_fewer_numbers_is_chosen(left, chosen):
+    """100 independent errors: 5 nat are a tenth of the squared error."""
+    error = np.random.default_rng(0).choice([-1.0, 1.0], (1, 1, 100, 1))
+    error[0, 0, 1::2] = -error[0, 0, ::2]  # neighbours never alike: all are independent
+    cases = [_case(1.0, 2, 0.9, error), _case(left, 1, 0.89, error)]
+    assert equations._chosen(cases)[0].numbers == chosen
+
+
+def test_noise_of_readings_is_no_room_for_laws(tmp_path):
+    rng, slow = np.random.default_rng(0), np.sin(np.arange(400) / 20)[None, None, :, None]
+    data = _logs(0.0)
+    search = equations.Search(None, data._replace(y=jnp.full_like(data.y, jnp.nan)), print, 0.0)  # type: ignore[arg-type]
+    for amplitude, room in ((0.0, 0.0), (2.0, 2 / 3)):
+        error = rng.standard_normal((1, 1, 400, 1)) + amplitude * slow
+        of = _case(1.0, 1, 0.5, error).of
+        out = search._replace(scale=np.sqrt(np.mean(error**2)), data=data._replace(y=10 * jnp.asarray(error[0])))
+        np.testing.assert_allclose(out.room(of), room, atol=0.12)
+
+
+def test_the_common_form_of_a_free_function_is_the_same_function():
+    system = Equations({}, json.dumps(PLANT))
+    basis = np.random.default_rng(0).standard_normal((7, 25))
+    term = UnknownTerm(jnp.arange(7.0), basis, np.zeros(2), np.full(2, 4.0), channel="b", reads=("b", "u"))
+    lean = term.lean(system)
+    np.testing.assert_allclose(_pushes(lean), _pushes(term), rtol=1e-12)
+    np.testing.assert_array_equal(term.with_numbers(lean).weights, term.weights)
 
 
 # --- with logs
@@ -156,11 +194,11 @@ def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
 
 @pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
 def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names, monkeypatch):
-    monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 300
+    monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 120
     data = _logs(coupling)
     before = identify(_rig(tmp_path), data, key=jax.random.key(0))
-    diagnosis = search_equations(before, data, lambda text: None)
-    assert {(effect.channel, effect.reads) for effect in diagnosis.after.model.effects} == names
+    closed = search_equations(before, data, lambda text: None)
+    assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
 
 
 def test_an_acrobot_as_equations_moves_as_the_built_in_one():

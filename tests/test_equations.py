@@ -16,10 +16,12 @@ import scipy.optimize
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.effects import catalogue
 from nnap_em.em.build import build_system
 from nnap_em.em.equations import motion
 from nnap_em.fit.identify import begin, identify
 from nnap_em.fit.store import load, save
+from nnap_em.model.hooks import reaching
 from nnap_em.model.state_space import Inputs
 from nnap_em.prediction_error import simulated
 from nnap_em.systems import Equations, register_equations, specs
@@ -196,29 +198,75 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(tmp_path):
     fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
     prior = fitted.m_step.prior
     begin_at = simulated.filtered(fitted.model, data)
-    here = simulated.simulated(fitted.model, prior, data, begin_at)
+    still = np.zeros_like(begin_at.mean)
+
+    def errors(z, start):
+        return simulated.together([prior.write(fitted.model, jnp.asarray(z))], [prior], [start], data, begin_at)[0]
+
+    here = errors(np.zeros(2), still)
     assert np.isfinite(here.error).all()
     for i, step in enumerate(1e-5 * np.eye(2)):
-        ahead, behind = (
-            simulated.simulated(
-                prior.write(fitted.model, jnp.asarray(here.z + sign * step)), prior, data, begin_at
-            ).error
-            for sign in (1, -1)
-        )
-        np.testing.assert_allclose(here.columns[..., i], -(ahead - behind) / 2e-5, rtol=1e-5, atol=1e-7)
+        slope = (errors(step, still).error - errors(-step, still).error) / 2e-5
+        np.testing.assert_allclose(here.columns[..., i], -slope, rtol=1e-5, atol=1e-7)
+        slope = (errors(np.zeros(2), still + step).error - errors(np.zeros(2), still - step).error) / 2e-5
+        np.testing.assert_allclose(here.by_start[..., i], -slope, rtol=1e-5, atol=1e-7)
+
+
+def test_every_row_is_in_one_window(tmp_path):
+    data = _chain()
+    model = begin(_rig(tmp_path), data, key=jax.random.key(0)).model
+    at = simulated.windows(model, data)
+    assert (at.count, at.rows, at.every) == (2, 120, 1)  # 240 rows of .5 s, two paces of 32 s a window
+    np.testing.assert_array_equal(at.row.ravel(), np.arange(240))
 
 
 def test_a_fit_to_open_loop_errors_is_that_of_scipy(tmp_path):
+    """Of parameters and starts; no error is beyond Huber's bend."""
     data = _chain(noise=0.05)
     fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
-    prior, scale = fitted.m_step.prior, np.full((1, 1, 2, 1), 1.0)  # no error is beyond Huber's bend
+    prior, scale = fitted.m_step.prior, np.full((1, 1, 1, 1), 1.0)
+    begin_at = simulated.filtered(fitted.model, data)
     best = simulated.fit(fitted.model, prior, data, scale=scale)
 
-    def rows(z):
-        one = simulated.simulated(prior.write(fitted.model, jnp.asarray(z)), prior, data)
-        return np.concatenate([one.error.ravel(), one.z])
+    def loss(both):
+        start = both[2:].reshape(begin_at.mean.shape)
+        model = prior.write(fitted.model, jnp.asarray(both[:2]))
+        of = simulated.together([model], [prior], [start], data, begin_at)[0]
+        square = np.mean(of.error**2)
+        return of.error.size / 2 * np.log(square) + both @ both / 2
 
-    np.testing.assert_allclose(best.z, scipy.optimize.least_squares(rows, np.zeros(2)).x, atol=2e-3)
+    expected = scipy.optimize.minimize(loss, np.zeros(2 + begin_at.mean.size), method="BFGS").x
+    np.testing.assert_allclose(np.append(best.z, best.start), expected, atol=5e-3)
+
+
+def _simulated(error) -> simulated.Simulated:
+    none = np.zeros((*error.shape, 0))
+    return simulated.Simulated(None, None, np.zeros(0), np.zeros((1, error.shape[1], 0)), error, none, none)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_independent_errors_are_those_of_an_autoregression(rho):
+    """(1 - rho) / (1 + rho) of all; four standard deviations of twenty other seeds."""
+    rng = np.random.default_rng(0)
+    error = rng.standard_normal((1, 50, 400, 1)) * np.sqrt(1 - rho**2)
+    for k in range(1, 400):
+        error[:, :, k] += rho * error[:, :, k - 1]
+    expected = error.size * (1 - rho) / (1 + rho)
+    np.testing.assert_allclose(simulated.independent(_simulated(error)), expected, rtol=0.2)
+
+
+def test_an_input_that_takes_time_begins_as_it_is(tmp_path):
+    data = _chain()
+    system = build_system(_rig(tmp_path))
+    column = jnp.asarray(data.u)[0, :, 0]
+    lag = catalogue["actuator_lag"].of(2.0, channel="u")
+    late = np.asarray(reaching((lag,), system, column[:, None], 0.5))[:, 0]
+    keep, expected, held = np.exp(-0.5 / 2.0), [], float(column[0])
+    for one in np.asarray(column):  # mean over each row of the exact response
+        expected.append(one + (held - one) * 2.0 / 0.5 * (1 - keep))
+        held = one + (held - one) * keep
+    np.testing.assert_allclose(late, expected, rtol=1e-9)
+    np.testing.assert_array_equal(reaching((lag,), system, jnp.full((9, 1), 3.0), 0.5), 3.0)
 
 
 def test_identify_finds_the_parameters_and_the_hidden_state(tmp_path):

@@ -13,35 +13,43 @@ from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Around, Candidate, SensorEffect, catalogue, flat
-from ..effects.equations import PortEffect
-from ..em.equations import motion
+from ..effects.actuator import DriveEffect
+from ..effects.equations import STRONG, PortEffect
+from ..em.equations import free_term, motion
+from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..prediction_error import simulated
-from ..prediction_error.multistep import Grid
 from ..storage.log import Log
 from .hypothesis import Found, Hypothesis
-from .keys import Key, key_of, words
+from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
-from .verdict import AGREE, CERTAIN, EQUIVALENT
+from .verdict import AGREE, CERTAIN, EQUIVALENT_NATS, MULTI_STEP, required
 
-SHARE, PAIR = 0.15, 0.3
-"""Shares of the squared error on parts left out that a law, and a pair of laws, must remove."""
+SHARE = MULTI_STEP.share
+"""Share of the squared error on parts left out that a law must remove, over its prior odds."""
+PAIR = 0.5
+"""Prior odds of a pair of laws to a single one: 120 pairs of the best sixteen laws are tried."""
 SUSPECT = 0.08
 """Share from which on a law is listed as a suspect."""
 FOLDS, BLOCKS = 4, 8
 """Parts that are left out in turn, each of every fourth block of the rows."""
-SHORTLIST, PARTNERS, JUDGED = 8, 30, 16
-"""Laws that are judged on parts left out, laws of which pairs are tried, and pairs that are judged."""
+SHORTLIST, FREE, PARTNERS, JUDGED = 4, 2, 16, 8
+"""Laws of one, of two and of three numbers, and free functions, that are judged on parts left out; laws of which pairs
+are tried, and pairs judged."""
 MOST = 3
 """Laws at most, or one more where the last were a pair."""
-QUICK, STEPS = 10, 15
+MEASURE = "share of the squared error"
+GROWN = 64.0
+"""Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
+QUICK, STEPS = 30, 30
 """Steps of a fit in a screen, and of one that is judged."""
 
 
@@ -51,16 +59,30 @@ class Case(NamedTuple):
     laws: tuple[Candidate, ...]
     of: simulated.Simulated
     loss: float
-    """Squared error with the prior."""
+    """Log of the posterior density, less."""
+    removed: float = math.nan
+    """Share of the squared error that they remove."""
     share: float = math.nan
-    """Share of the squared error that they remove on parts left out."""
+    """The same on parts left out."""
+    left: float = math.nan
+    """Squared error on parts left out."""
     folds: tuple[float, ...] = ()
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:
         """The laws with their numbers."""
         fitted = self.of.model.effects[len(self.of.model.effects) - len(self.laws) :]
-        return tuple(_named(law.start, effect) for law, effect in zip(self.laws, fitted, strict=True))
+        return tuple(law.start.with_numbers(effect) for law, effect in zip(self.laws, fitted, strict=True))
+
+    @property
+    def odds(self) -> float:
+        """Prior odds."""
+        return PAIR ** (len(self.laws) - 1) / math.prod(required(1.0, complexity(law.start)) for law in self.laws)
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that they have."""
+        return sum(len(law.start.values()) or flat(law.start).size for law in self.laws)
 
     @property
     def keys(self) -> tuple[Key, ...]:
@@ -73,17 +95,19 @@ class Search(NamedTuple):
 
     before: Identified
     data: Dataset
-    scale: Float[np.ndarray, "1 1 horizon obs"]
     log: Log
     until: float
     begin: Any = None
     """States at all starts, by the model without further laws."""
+    scale: Any = None
+    """Scale of its errors."""
 
     def with_laws(self, hypothesis: Hypothesis, laws: Sequence[Candidate], starts: Sequence[Any]) -> Hypothesis:
         """The hypothesis with some laws more, which begin with the numbers of `starts`."""
+        system = hypothesis.model.system
         for law, start in zip(laws, starts, strict=True):
-            lean = Candidate(_lean(law.start, self), (), _lean(law.spread, self))
-            hypothesis = hypothesis.plus(_lean(start, self), lean)
+            lean = Candidate(law.start.lean(system), (), law.spread.lean(system))
+            hypothesis = hypothesis.plus(start.lean(system), lean)
         return hypothesis
 
     def fit(
@@ -93,58 +117,66 @@ class Search(NamedTuple):
         full = [self.with_laws(hypothesis, laws, starts) for laws, starts in every]
         groups: dict[Any, list[int]] = {}
         for i, one in enumerate(full):
-            groups.setdefault(jax.tree.structure((one.model, one.m_step.prior)), []).append(i)
+            both = one.model, one.m_step.prior
+            groups.setdefault((jax.tree.structure(both), *map(np.shape, jax.tree.leaves(both))), []).append(i)
         cases: dict[int, Case] = {}
         for places in groups.values():
             models, priors = ([get(full[i]) for i in places] for get in (lambda h: h.model, lambda h: h.m_step.prior))
             fits = simulated.fit_all(models, priors, self.data, scale=self.scale, begin=self.begin, **options)
             for i, of in zip(places, fits, strict=True):
-                cases[i] = Case(tuple(every[i][0]), of, self.loss(of) + float(of.z @ of.z))
+                density = simulated.log_posterior(of, self.scale, of.observed)
+                cases[i] = Case(tuple(every[i][0]), of, -density)
         return [cases[i] for i in range(len(every))]
 
-    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq start #horizon 1"] | None = None) -> float:
+    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"] | None = None) -> float:
         """Squared error of the predictions that count."""
-        known = simulated.observed(of)
+        known = of.observed
         return simulated.cost(of.error, self.scale, known if counts is None else known & counts)
+
+    def screened(self, hypothesis: Hypothesis, candidates: Sequence[Candidate]) -> list[Case]:
+        """The hypothesis with each candidate, fitted; the best case of every law, best first."""
+        cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=QUICK)
+        best: dict[tuple[Key, ...], Case] = {}
+        for case in sorted(cases, key=lambda case: case.loss):
+            best.setdefault(case.keys, case)
+        return list(best.values())
 
     def judged(self, hypothesis: Hypothesis, cases: Sequence[Case], null: Sequence[float]) -> list[Case]:
         """The cases with their errors on parts left out, beside those of `null` on each."""
         out = []
         for case, left in zip(cases, self.left_out(hypothesis, cases), strict=True):
             gains = tuple(1 - b / max(a, 1e-12) for a, b in zip(null, left, strict=True))
-            out.append(case._replace(share=1 - sum(left) / max(sum(null), 1e-12), folds=gains))
+            share = 1 - sum(left) / max(sum(null), 1e-12)
+            out.append(case._replace(share=share, left=sum(left), folds=gains))
         return out
+
+    def room(self, of: simulated.Simulated) -> float:
+        """Share of the squared error that is not noise of the readings: no law can remove more.
+
+        The noise is the smaller of that in the logs and that in the errors, half their mean square change from one to
+        the next [von Neumann 1941, Annals of Mathematical Statistics 12(4), 367].
+        """
+        logs = np.array([reading_noise(y) for y in np.moveaxis(np.asarray(self.data.y), -1, 0)])
+        change = np.ma.mean(np.diff(np.ma.masked_invalid(of.error), axis=2) ** 2, axis=(0, 1, 2)) / 2
+        return 1 - float(np.mean(np.minimum(logs**2, np.ma.filled(change, np.inf)) / self.scale**2))
 
     def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> list[list[float]]:
         """Squared errors of every case on every part by the fit to the others."""
         every, out = [(case.laws, case.effects) for case in cases], [[] for _ in cases]
-        for counts in folds(simulated.grid(self.before.model, self.data), *self.data.t.shape) if cases else ():
+        for counts in folds(simulated.windows(self.before.model, self.data), len(self.data.t)) if cases else ():
             for errors, case in zip(out, self.fit(hypothesis, every, counts=~counts, steps=STEPS), strict=True):
                 errors.append(self.loss(case.of, counts))
         return out
 
 
-def folds(at: Grid, sequences: int, rows: int) -> list[Bool[np.ndarray, "seq start horizon 1"]]:
-    """Masks of the errors of every part, by the rows whose readings are predicted: a fit without a part has none of
-    its readings, although predictions that it counts pass over it.  Blocks go on over all sequences.
+def folds(at: simulated.Windows, sequences: int) -> list[Bool[np.ndarray, "seq window place 1"]]:
+    """Masks of the errors of every part: a fit without a part has none of its readings, although its simulations pass
+    over it.  Blocks go on over all sequences.  What determines the start of a window is in no part, but in every fit.
     """
-    row = at.starts(rows)[:, None] + np.asarray(at.ages)[None]
-    block = (np.arange(sequences)[:, None, None] * rows + row) * BLOCKS // (sequences * rows)
-    return [(block % FOLDS == part)[..., None] for part in range(FOLDS)]
-
-
-def _lean(effect: AbstractEffect, search: Search) -> AbstractEffect:
-    """A law as the formula that all laws of ports share: one program for all."""
-    flow = getattr(effect, "flow", None)
-    return flow(search.before.model.system) if flow else effect
-
-
-def _named(law: AbstractEffect, fitted: AbstractEffect) -> AbstractEffect:
-    """The law with the numbers of its fit."""
-    if not hasattr(law, "flow"):
-        return fitted
-    numbers = lambda e: (e.strength, e.level, e.share)  # noqa: E731
-    return eqx.tree_at(numbers, law, numbers(fitted))
+    rows = at.count * at.rows
+    block = (np.arange(sequences)[:, None, None] * rows + at.row) * BLOCKS // (sequences * rows)
+    settled = at.row - at.row[:, :1] >= at.settles
+    return [(settled & (block % FOLDS == part))[..., None] for part in range(FOLDS)]
 
 
 def around_of(fitted: Identified, data: Dataset) -> Around:
@@ -153,38 +185,53 @@ def around_of(fitted: Identified, data: Dataset) -> Around:
     seen, valid = motion(model, data), np.asarray(data.valid)
     low, high = np.percentile(seen.x, [0.5, 99.5], axis=0)[:, : len(model.system.states)]
     u, y, t = (np.asarray(a)[valid] for a in (data.u, data.y, data.t))
-    ends = [(float(np.nanmin(one)), float(np.nanmax(one))) for one in y.T]
+    pairs = zip(rig.measured, y.T, strict=True)
+    ends = {name: (float(np.nanmin(one)), float(np.nanmax(one))) for name, one in pairs}
     pairs = zip(model.system.states, low, high, strict=True)
     sizes = {name: (float(a), float(b)) for name, a, b in pairs if b > a}
     sizes |= {
         name: (float(a.min()), float(a.max())) for name, a in zip(rig.input_columns, u.T, strict=True) if np.ptp(a)
     }
-    none = np.zeros(0)
+    none, wait = np.zeros(0), max(rig.dt, model.pace / GROWN)
+    drive = np.max(np.abs(u), axis=0, initial=0.0)
     return Around(
-        model.system, np.asarray(cast(Any, model.unknown).scale), none, none, low, high, none,
-        rig.measured, np.array([b - a for a, b in ends]), rig.dt, (float(t.min()), float(t.max())), float(t.max()),
-        rig.clock == "session", False, rig.input_columns, sizes, tuple(ends),
+        model.system, np.asarray(cast(Any, model.unknown).scale), none, none, low, high, drive,
+        rig.measured, np.array([b - a for a, b in ends.values()]), wait,
+        (float(t.min()), float(t.max())), float(t.max()), rig.clock == "session", False, rig.input_columns, sizes, ends,
     )  # fmt: skip
+
+
+def free_functions(before: Identified, around: Around, data: Dataset) -> list[Candidate]:
+    """Functions of one or two signals at every port, free of what the parameters can do."""
+    model, prior = before.model, before.m_step.prior
+    system, seen, out = cast(Any, model.system), motion(model, data), []
+    names = [names for count in (1, 2) for names in itertools.combinations(around.sizes, count)]
+    for port, reads in itertools.product(system.open_ports, names):
+        low, high = np.asarray([around.sizes[name] for name in reads]).T
+        start = free_term(system, seen, prior.declared, port, reads, low, high)
+        spread = jnp.full(start.weights.shape, STRONG * around.torque[system.ports.index(port)])
+        wide, probe = (eqx.tree_at(lambda e: e.weights, start, size * spread) for size in (1.0, 1e-3))
+        out.append(Candidate(start, (probe,), wide))
+    return out
 
 
 def search_equations(before: Identified, data: Dataset, log: Log, until: float = math.inf) -> Diagnosis:
     """Laws that equations lack, added and fitted, one or two at a time, until none passes on parts left out."""
     hypothesis = Hypothesis(before.model, before.m_step, (None,) * len(before.model.effects))
     declared = len(before.model.effects)
-    first = simulated.simulated(before.model, before.m_step.prior, data)
-    search = Search(before, data, simulated.scale_of(first.error), log, until)
-    around, steps, complete, left = around_of(before, data), [], True, 1.0
-    kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect)]
+    search = Search(before, data, log, until)
+    around, steps, complete = around_of(before, data), [], True
+    kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
+    free = free_functions(before, around, data)
     while len(hypothesis.model.effects) - declared < MOST:
         if time.monotonic() > until:
             complete = False
             break
-        chosen, even, step = _round(search, hypothesis, every, left)
+        chosen, even, step = _round(search, hypothesis, every, free)
         steps.append(step)
         if chosen is None:
             break
-        left *= 1 - chosen.share
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
             record = Found(math.nan, math.nan, math.nan, even, chosen.share, chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
@@ -200,61 +247,60 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
 def _with_numbers(hypothesis: Hypothesis, case: Case) -> Any:
     """The model of the hypothesis with the parameters of the case."""
     lean = case.of.model
-    effects = tuple(_named(e, o) for e, o in zip(hypothesis.model.effects, lean.effects, strict=True))
+    effects = tuple(e.with_numbers(o) for e, o in zip(hypothesis.model.effects, lean.effects, strict=True))
     return eqx.tree_at(lambda m: m.system, with_effects(hypothesis.model, effects), lean.system)
 
 
 def _round(
-    search: Search, hypothesis: Hypothesis, every: Sequence[Candidate], remaining: float
+    search: Search, hypothesis: Hypothesis, every: Sequence[Candidate], free: Sequence[Candidate]
 ) -> tuple[Case | None, tuple[Key, ...], Step]:
-    """The laws that pass, if any do, single ones first, then pairs; and single ones that explain the same.
+    """The laws that pass, if any do, and single ones that explain the same.
 
-    Of the first error a share `remaining` is left, and a later law must remove as much of the first as a first one.
+    Pairs, and functions without a name, are tried where no single law removes most of what can be removed.
     """
     lean = hypothesis.refitted(
-        with_effects(hypothesis.model, tuple(_lean(effect, search) for effect in hypothesis.model.effects))
+        with_effects(
+            hypothesis.model, tuple(effect.lean(hypothesis.model.system) for effect in hypothesis.model.effects)
+        )
     )
-    search = search._replace(begin=simulated.filtered(lean.model, search.data))
+    begin = simulated.filtered(lean.model, search.data)
+    first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
+    search = search._replace(begin=begin, scale=simulated.scale_of(first))
     present = {key_of(effect) for effect in hypothesis.model.effects}
     null = search.fit(lean, [((), ())])[0]
+    search = search._replace(scale=simulated.scale_of(null.of))
     base = search.left_out(lean, [null])[0]
     fresh = [c for c in every if key_of(c.start) not in present]
     log, rows = search.log, search.data.t.shape[1]
-    log(f"{len(fresh)} candidates; squared error {null.loss:.1f}, {sum(base):.1f} on parts left out")
-    cases = search.fit(lean, [((c,), c.probes[:1]) for c in fresh], steps=QUICK)
-    singles = _best_of_keys(sorted(cases, key=lambda case: case.loss))
-    judged = search.judged(lean, singles[:SHORTLIST], base)
-    for case in judged:
-        _report(search, case)
-    passing, tried = [case for case in judged if _passes(case, SHARE / remaining)], [*judged]
-    if not passing and remaining > PAIR and time.monotonic() < search.until:
+    whole, room = search.loss(null.of), search.room(null.of)
+    log(f"{len(fresh)} candidates; {room:.0%} of the squared error is not noise of the readings")
+    if room < SHARE:
+        return None, (), Step(rows, (), (), None, 0, MEASURE)
+    singles = search.screened(lean, fresh)
+    short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and _sound(c)][:SHORTLIST]]
+    judged = search.judged(lean, short, base)
+    passing, tried = [case for case in judged if _passes(case)], [*judged]
+    most = max([SHARE, *(case.share for case in passing)]) / PAIR
+    if room > most and time.monotonic() < search.until:  # else no pair and no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
         pairs = sorted(search.fit(lean, joined, steps=QUICK), key=lambda case: case.loss)
-        pairs = search.judged(lean, [case for case in pairs if _sound(case)][:JUDGED], base)
-        for case in pairs:
-            _report(search, case)
-        passing = [case for case in pairs if _passes(case, PAIR / remaining)]
-        tried += pairs
-    listed = tuple((case.keys[0], 1 - case.loss / null.loss) for case in singles)
+        functions = search.screened(lean, [c for c in free if key_of(c.start) not in present])
+        best = [*[case for case in pairs if _sound(case)][:JUDGED], *functions[:FREE]]
+        tried += search.judged(lean, best, base)
+        passing = [case for case in tried if _passes(case)]
+    for case in tried:
+        _report(search, case)
+    listed = tuple((case.keys[0], 1 - search.loss(case.of) / whole) for case in singles)
     refitted = tuple((case.keys[-1], case.share) for case in tried)
-    best = _chosen(passing)
+    best, alike = _chosen(passing)
     suspects = ()
     if best is None:
         near = sorted((c for c in judged if c.share > SUSPECT and _sound(c)), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, 0.0) for case in near[:4])
     accepted = best.keys[0] if best else None
-    step = Step(rows, listed, refitted, accepted, len(fresh), "share of the squared error", suspects=suspects)
-    even = [case for case in passing if best and len(case.laws) == 1 and case.share >= EQUIVALENT * best.share]
-    return best, tuple(case.keys[0] for case in even if case is not best), step
-
-
-def _best_of_keys(cases: Sequence[Case]) -> list[Case]:
-    """The best case of every law, best first."""
-    best: dict[tuple[Key, ...], Case] = {}
-    for case in cases:
-        best.setdefault(case.keys, case)
-    return list(best.values())
+    step = Step(rows, listed, refitted, accepted, len(fresh), MEASURE, suspects=suspects)
+    return best, tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1), step
 
 
 def _sound(case: Case) -> bool:
@@ -262,31 +308,35 @@ def _sound(case: Case) -> bool:
     return all(effect.possible() for effect in case.effects)
 
 
-def _passes(case: Case, share: float) -> bool:
+def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
     agree = sum(gain > 0 for gain in case.folds) >= AGREE * len(case.folds)
-    return case.share >= share and agree and _sound(case) and _certain(case)
+    return case.share * case.odds >= SHARE and agree and _sound(case) and _certain(case)
 
 
 def _certain(case: Case) -> bool:
     """True where every strength differs from none."""
-    cov = np.linalg.inv(simulated.precision(case.of, simulated.scale_of(case.of.error)))
-    std, size = np.asarray(case.of.prior.std), sum(flat(law.start).size for law in case.laws)
-    cov, place = (cov * np.outer(std, std))[-size:, -size:], 0
-    for law, effect in zip(case.laws, case.effects, strict=True):
-        part = slice(place, place := place + flat(law.start).size)
-        if certainty(law, effect, cov[part, part]) < CERTAIN / 2:
+    cov = np.linalg.inv(simulated.precision(case.of))
+    std = np.asarray(case.of.prior.std)
+    cov = cov * np.outer(std, std)
+    sizes = [flat(effect).size for effect in case.of.model.effects[-len(case.laws) :]]
+    for law, effect, place in zip(case.laws, case.effects, np.cumsum([0, *sizes[:-1]]) - sum(sizes), strict=True):
+        part = np.arange(flat(law.start).size) + place
+        if certainty(law, effect, cov[np.ix_(part, part)]) < CERTAIN:
             return False
     return True
 
 
-def _chosen(passing: Sequence[Case]) -> Case | None:
-    """The case of the largest share; of those even with it the one of the fewest numbers."""
+def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
+    """Of the case of the largest share, and those as likely on parts left out, the one of the fewest numbers; and all
+    of these.
+    """
     if not passing:
-        return None
-    top = max(case.share for case in passing)
-    even = [case for case in passing if case.share >= EQUIVALENT * top]
-    return min(even, key=lambda case: (sum(len(law.start.values()) for law in case.laws), -case.share))
+        return None, []
+    top = max(passing, key=lambda case: case.share * case.odds)
+    independent = simulated.independent(top.of)
+    even = [case for case in passing if 0.5 * independent * math.log(case.left / top.left) < EQUIVALENT_NATS]
+    return min(even, key=lambda case: (case.numbers, case.left)), even
 
 
 def _report(search: Search, case: Case) -> None:

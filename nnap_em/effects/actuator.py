@@ -8,14 +8,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .base import JointEffect, Scalar, Stream, input_of, one
+from .base import AbstractEffect, Scalar, Stream, input_of, one
 
 
-class InputEffect(JointEffect):
-    """A law of the input that drives its joint."""
+class DriveEffect(AbstractEffect):
+    """A law of the input that drives its joint, or of equations of that which its channel names."""
+
+    def units_on(self, system):
+        return {
+            name: system.unit(self.channel) if unit == "N m" and self.channel else unit
+            for name, unit in super().units_on(system).items()
+        }
+
+
+class InputEffect(DriveEffect):
+    """One that takes no time."""
 
     def signals(self, system):
-        return (input_of(self.joint),)
+        return (input_of(self.joint) if self.joint else str(self.channel),)
 
 
 class MotorGain(InputEffect):
@@ -29,7 +39,7 @@ class MotorGain(InputEffect):
 
     @classmethod
     def candidates(cls, around):
-        return [one(partial(cls, joint=j), 0.0, 0.05, 1.0) for j, _ in around.driven]
+        return [one(partial(cls, **place), 0.0, 0.05, 1.0) for place, _ in around.drives]
 
     def values(self):
         return {"gain": 1 + self.excess}
@@ -51,7 +61,7 @@ class DeadZone(InputEffect):
     @classmethod
     def candidates(cls, around):
         grid = (0.03, 0.08, 0.15, 0.25, 0.4)
-        return [one(partial(cls, joint=j), 0.0, s * size, 0.3 * size) for j, size in around.driven for s in grid]
+        return [one(partial(cls, **place), 0.0, s * size, 0.3 * size) for place, size in around.drives for s in grid]
 
     def drive(self, torque):
         return torque - jnp.clip(torque, -self.width, self.width)
@@ -72,7 +82,9 @@ class Saturation(InputEffect):
     @classmethod
     def candidates(cls, around):
         grid = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)
-        return [one(partial(cls, joint=j), 2 * size, s * size, 0.2 * size) for j, size in around.driven for s in grid]
+        return [
+            one(partial(cls, **place), 2 * size, s * size, 0.2 * size) for place, size in around.drives for s in grid
+        ]
 
     def drive(self, torque):
         return jnp.clip(torque, -self.limit, self.limit)
@@ -105,7 +117,7 @@ class OneSidedLoss(InputEffect):
         return torque - self.side * self.loss * jnp.maximum(self.side * torque, 0.0)
 
 
-class InputDelay(JointEffect):
+class InputDelay(DriveEffect):
     """u acts later by any time; before the first row it was 0."""
 
     name: ClassVar[str] = "input_delay"
@@ -117,7 +129,7 @@ class InputDelay(JointEffect):
     @classmethod
     def candidates(cls, around):
         grid, dt = (0.5, 1.5, 2.5, 4.0, 6.0, 9.0), around.dt
-        return [one(partial(cls, joint=j), 0.0, n * dt, 3 * dt) for j, _ in around.driven for n in grid]
+        return [one(partial(cls, **place), 0.0, n * dt, 3 * dt) for place, _ in around.drives for n in grid]
 
     def input(self, u, dt):
         late = jnp.arange(u.shape[0], dtype=u.dtype) - jnp.maximum(self.delay, 0.0) / dt
@@ -138,7 +150,7 @@ class InputDelay(JointEffect):
         return Stream(jnp.zeros(rows, self.delay.dtype), step)
 
 
-class ActuatorLag(JointEffect):
+class ActuatorLag(DriveEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
 
     name: ClassVar[str] = "actuator_lag"
@@ -150,7 +162,7 @@ class ActuatorLag(JointEffect):
     @classmethod
     def candidates(cls, around):
         grid, dt = (0.7, 1.5, 3.0, 5.0, 8.0, 15.0), around.dt
-        return [one(partial(cls, joint=j), 0.0, n * dt, 5 * dt) for j, _ in around.driven for n in grid]
+        return [one(partial(cls, **place), 0.0, n * dt, 5 * dt) for place, _ in around.drives for n in grid]
 
     def input(self, u, dt):
         stream = self.stream(dt)

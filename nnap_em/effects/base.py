@@ -56,6 +56,7 @@ class Around(NamedTuple):
     reading: Float[np.ndarray, " obs"]
     """Typical size of each reading."""
     dt: float
+    """Sample interval, or what counts as one where sizes are grown from it [s]."""
     duration: tuple[float, float]
     """First and last time on the clock [s]."""
     ending: float
@@ -68,21 +69,15 @@ class Around(NamedTuple):
     """Column of every input."""
     sizes: Mapping[str, tuple[float, float]] = {}
     """Ranges of states and inputs, of equations."""
-    ends: tuple[tuple[float, float], ...] = ()
+    ends: Mapping[str, tuple[float, float]] = {}
     """Ranges of the readings, of equations."""
     moved: tuple[tuple[str, str, float], ...] | None = None
     """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
 
     @property
-    def open_ports(self) -> tuple[str, ...]:
-        """Ports of equations."""
-        return () if self.system.coordinates else self.system.ports
-
-    @property
     def ordered(self) -> list[tuple[str, str]]:
-        """Pairs of different states of equations, in either order."""
-        states = () if self.system.coordinates else self.system.states
-        return list(itertools.permutations(states, 2))
+        """Pairs of different states that are open ports, in either order."""
+        return list(itertools.permutations([name for name in self.system.open_ports if name in self.system.states], 2))
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -102,7 +97,12 @@ class Around(NamedTuple):
     @property
     def driven(self) -> list[tuple[int, float]]:
         """Joints whose input ever moves, with its largest value [N m]."""
-        return [(j, float(size)) for j, size in zip(self.system.joints, self.drive, strict=True) if size > 0]
+        return [(place["joint"], size) for place, size in self.drives if "joint" in place]
+
+    @property
+    def drives(self) -> list[tuple[dict[str, Any], float]]:
+        """Places of laws of inputs that ever move, with the largest value [N m]."""
+        return [(place, float(size)) for place, size in zip(self.system.drives, self.drive, strict=True) if size > 0]
 
     def column(self, joint: int) -> str:
         """Column of the input that drives a joint; "u" where there is one input."""
@@ -257,6 +257,14 @@ class AbstractEffect(eqx.Module):
     def answers(self) -> bool:
         """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False
+
+    def lean(self, system: Any) -> "AbstractEffect":
+        """The law as a formula that it shares with others, so that one program serves all; itself without one."""
+        return self
+
+    def with_numbers(self, lean: "AbstractEffect") -> "AbstractEffect":
+        """The law with the numbers of its `lean` form."""
+        return lean
 
     def curve(self, cov: Float[np.ndarray, "param param"], system: Any) -> Curve | None:
         """A learned function of one signal, its parameters of covariance `cov`; None for a law given by numbers."""

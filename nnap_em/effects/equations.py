@@ -5,7 +5,6 @@ Each is a `Flow`: one formula for all of them, so that a search compiles one pro
 
 import itertools
 import math
-from functools import partial
 from typing import Any, ClassVar, cast
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Around, Candidate, Scalar, SensorEffect, a, known, one
+from .base import AbstractEffect, Around, Candidate, Scalar, SensorEffect, a, known
 
 EDGE = 0.02
 """Width of a step at a level, as a share of the range of its signal."""
@@ -86,7 +85,7 @@ class PortEffect(AbstractEffect):
     share: Scalar = eqx.field(kw_only=True, default=1.0, converter=a)
     edge: Any = known(kw_only=True, default=0.0)
 
-    def flow(self, system) -> Flow:
+    def lean(self, system) -> Flow:
         """The law as the formula of all."""
         signals, ports = (*system.states, *system.inputs), system.ports
 
@@ -101,7 +100,11 @@ class PortEffect(AbstractEffect):
         return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
 
     def force(self, scene, memory):
-        return self.flow(scene.system).force(scene, memory)
+        return self.lean(scene.system).force(scene, memory)
+
+    def with_numbers(self, lean):
+        numbers = lambda e: (e.strength, e.level, e.share)  # noqa: E731
+        return eqx.tree_at(numbers, self, numbers(lean))
 
     def values(self):
         return {name: getattr(self, name) for name in self.reports}
@@ -176,7 +179,7 @@ class ConstantFlow(PortEffect):
 
     @classmethod
     def candidates(cls, around):
-        return [cls.at(around, port, ()) for port in around.open_ports]
+        return [cls.at(around, port, ()) for port in around.system.open_ports]
 
 
 class LinearFlow(PortEffect):
@@ -188,7 +191,7 @@ class LinearFlow(PortEffect):
 
     @classmethod
     def candidates(cls, around):
-        return [cls.at(around, port, (name,)) for port in around.open_ports for name in around.sizes]
+        return [cls.at(around, port, (name,)) for port in around.system.open_ports for name in around.sizes]
 
 
 class SquareFlow(PortEffect):
@@ -200,7 +203,7 @@ class SquareFlow(PortEffect):
 
     @classmethod
     def candidates(cls, around):
-        return [cls.at(around, port, (name,)) for port in around.open_ports for name in around.sizes]
+        return [cls.at(around, port, (name,)) for port in around.system.open_ports for name in around.sizes]
 
 
 class ProductFlow(PortEffect):
@@ -213,7 +216,7 @@ class ProductFlow(PortEffect):
     @classmethod
     def candidates(cls, around):
         pairs = [tuple(pair) for pair in itertools.combinations(around.sizes, 2)]
-        return [cls.at(around, port, pair) for port in around.open_ports for pair in pairs]
+        return [cls.at(around, port, pair) for port in around.system.open_ports for pair in pairs]
 
 
 class ThresholdFlow(PortEffect):
@@ -226,7 +229,7 @@ class ThresholdFlow(PortEffect):
 
     @classmethod
     def candidates(cls, around):
-        places = [(port, name) for port in around.open_ports for name in around.sizes]
+        places = [(port, name) for port in around.system.open_ports for name in around.sizes]
         return [cls.at(around, port, (n,), level=level) for port, n in places for level in _levels(around, n)]
 
 
@@ -276,30 +279,61 @@ class Overflow(PortEffect):
 
 
 class Bend(SensorEffect):
-    """value + bend (value - low)^2 / (high - low), of the range of the reading."""
+    """value + bend (value - true)^2 / range, the range that of the readings: it reads `true` as it is."""
 
     name: ClassVar[str] = "sensor_bend"
     confirm: ClassVar[str] = "Compare the sensor with another one at three places of its range."
-    units: ClassVar[dict[str, str]] = {"bend": "-"}
+    units: ClassVar[dict[str, str]] = {"bend": "-", "true": "unit of the channel"}
     bend: Scalar
-    low: Any = known()
-    high: Any = known()
+    true: Scalar
+    range: Any = known()
 
     @classmethod
     def candidates(cls, around):
-        if around.system.coordinates:
-            return []
-        return [
-            one(partial(cls, low=low, high=high, channel=name), 0.0, 0.02, 0.5)
-            for name, (low, high) in zip(around.measured, around.ends, strict=True)
-        ]
+        def make(bend: float, true: float, name: str):
+            low, high = around.ends[name]
+            return cls(a(bend), a(low + true * (high - low)), high - low, channel=name)
+
+        at = [(make(0.0, 0.0, name), make(0.02, 0.0, name)) for name in around.ends]
+        wide = [eqx.tree_at(lambda e: (e.bend, e.true), one, (a(0.5), a(one.range))) for one, _ in at]
+        return [Candidate(start, (probe,), std) for (start, probe), std in zip(at, wide, strict=True)]
 
     def reading(self, value, past):
-        return value + self.bend * (value - self.low) ** 2 / (self.high - self.low)
+        return value + self.bend * (value - self.true) ** 2 / self.range
 
 
 NODES = {1: 9, 2: 5, 3: 4}
 """Basis functions along each signal of an unknown term, by the number of its signals."""
+
+
+def _grid(values: Float[Array, " axis"], low: Any, high: Any) -> Float[Array, " node"]:
+    """Gaussian basis functions of a grid between `low` and `high`; beyond the ends those of the end."""
+    count, out = NODES[values.shape[0]], jnp.ones(1, values.dtype)
+    for i in range(values.shape[0]):
+        centres = jnp.linspace(low[i], high[i], count)
+        inside = jnp.clip(values[i], low[i], high[i])
+        out = (
+            out[:, None] * jnp.exp(-0.5 * ((inside - centres) * (count - 1) / (high[i] - low[i])) ** 2)[None]
+        ).ravel()
+    return out
+
+
+class FreeFlow(AbstractEffect):
+    """A free function of the signals that `pick` takes of states and inputs, at the port `at`; one program for all."""
+
+    name: ClassVar[str] = "free_flow"
+    named: ClassVar[bool] = False
+    confirm: ClassVar[str] = "Change one signal of it at a time."
+    weights: Float[Array, " node"]
+    basis: Any = known()
+    low: Any = known()
+    high: Any = known()
+    pick: Any = known()
+    at: Any = known()
+
+    def force(self, scene, memory):
+        values = self.pick @ jnp.concatenate([scene.q, cast(Array, scene.u)])
+        return (self.weights @ (self.basis @ _grid(values, self.low, self.high))) * self.at
 
 
 class UnknownTerm(AbstractEffect):
@@ -324,13 +358,7 @@ class UnknownTerm(AbstractEffect):
 
     def grid(self, values: Float[Array, " axis"]) -> Float[Array, " node"]:
         """Basis functions of the grid at values of the signals; beyond the ends those of the end."""
-        count, out = NODES[len(self.reads)], jnp.ones(1, values.dtype)
-        for i in range(len(self.reads)):
-            centres = jnp.linspace(self.low[i], self.high[i], count)
-            width = (self.high[i] - self.low[i]) / (count - 1)
-            inside = jnp.clip(values[i], self.low[i], self.high[i])
-            out = (out[:, None] * jnp.exp(-0.5 * ((inside - centres) / width) ** 2)[None]).ravel()
-        return out
+        return _grid(values, self.low, self.high)
 
     def at(self, values: Float[Array, " axis"]) -> Scalar:
         """The function at values of its signals."""
@@ -342,8 +370,23 @@ class UnknownTerm(AbstractEffect):
         value = self.at(jnp.stack([every[name] for name in self.reads]))
         return jnp.zeros_like(scene.drive).at[system.ports.index(self.channel)].set(value)
 
+    def lean(self, system):
+        nodes, numbers = self.basis.shape[1], self.weights.shape[0]
+        signals = (*system.states, *system.inputs)
+        fill = [(0, nodes - numbers)]
+        pick = np.asarray([[float(name == other) for other in signals] for name in self.reads])
+        at = np.asarray([float(name == self.channel) for name in system.ports])
+        basis = jnp.pad(jnp.asarray(self.basis), [*fill, (0, 0)])
+        return FreeFlow(jnp.pad(self.weights, fill, constant_values=1.0), basis, self.low, self.high, pick, at)
+
+    def with_numbers(self, lean):
+        return eqx.tree_at(lambda e: e.weights, self, lean.weights[: self.weights.shape[0]])
+
     def values(self):
         return {}
+
+    def phrase(self, sizes):
+        return f"a flow into {self.channel} that depends on {' and '.join(self.reads)}"
 
     def inputs_named(self):
         return self.reads

@@ -195,7 +195,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     curvature is its precision.  Equations are always fitted to errors over their horizon of use.
     """
     data = jax.device_put(data)
-    if not fitted.model.system.coordinates:
+    if fitted.model.system.simulated:
         return _simulating(fitted, data)
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
@@ -232,34 +232,40 @@ def _simulating(fitted: Identified, data: Dataset) -> Identified:
     """
     prior = fitted.m_step.prior
     likely = simulated.simulated(fitted.model, prior, data)
-    scale = simulated.scale_of(likely.error)
+    scale = simulated.scale_of(likely)
     declared = prior.write(fitted.model, jnp.zeros_like(prior.mean))
-    cost = lambda of: simulated.cost(of.error, scale, simulated.observed(of)) + of.z @ of.z  # noqa: E731
-    best = min((simulated.fit(model, prior, data, scale=scale) for model in (declared, fitted.model)), key=cost)
-    fitted = fitted_to_horizon(fitted._replace(state=fitted.state._replace(best=best.model)), data)
-    return fitted._replace(horizon_note=_horizon_note(fitted, likely, simulated.simulated(fitted.model, prior, data)))
+    fits = [simulated.fit(model, prior, data, scale=scale) for model in (declared, fitted.model)]
+    best = max(fits, key=lambda of: simulated.log_posterior(of, scale, of.observed))
+    kept = fitted_to_horizon(fitted._replace(state=fitted.state._replace(best=best.model)), data)
+    fits = (simulated.fit(one.model, _nothing(prior), data, scale=scale) for one in (fitted, kept))
+    return kept._replace(horizon_note=_horizon_note(kept, *fits))
+
+
+def _nothing(prior: ParameterPrior) -> ParameterPrior:
+    """Prior of no parameters: starts or noise alone are fitted."""
+    return ParameterPrior((), prior.mean[:0], prior.std[:0])
 
 
 def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
     """Equations with noise by EM at their parameters, then parameters by errors over the horizon of use."""
     prior, data = fitted.m_step.prior, jax.device_put(data)
-    rule = eqx.tree_at(lambda rule: rule.prior, fitted.m_step, ParameterPrior((), prior.mean[:0], prior.std[:0]))
+    rule = eqx.tree_at(lambda rule: rule.prior, fitted.m_step, _nothing(prior))
     begun = later_state(fitted.model, rule, key=fitted.state.key)
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     state = fit(begun, data, fitted.smoother, rule, epochs=NOISE_EPOCHS, schedule=Schedule(first=longest))
     best = simulated.fit(cast(StateSpaceModel, state.best), prior, data)
-    hessian = jnp.asarray(simulated.precision(best, simulated.scale_of(best.error)))
+    hessian = jnp.asarray(simulated.precision(best))
     state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
     return fitted._replace(state=state)
 
 
 def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulated.Simulated) -> str:
     """Errors of both fits over the horizon of use, and what it means where they disagree."""
-    first, second = (np.sqrt(np.nanmean(of.error[:, :, -1] ** 2, axis=(0, 1))) for of in (likely, best))
+    first, second = (np.sqrt(np.nanmean(of.error**2, axis=(0, 1, 2))) for of in (likely, best))
     unit = fitted.model.system.unit
     each = zip(fitted.rig.measured, first, second, strict=True)
     parts = [f"{name}: {a:.3g} and {b:.3g} {unit(name)}".rstrip() for name, a, b in each]
-    text = f"errors {best.reach:.3g} s ahead of the fit by likelihood and of the one to such errors, which is kept: "
+    text = "errors of free simulations of the fit by likelihood and of the one to such errors, which is kept: "
     odd = " They differ: something is missing in the equations." if np.any(first > WORSE * second) else ""
     return f"{text}{', '.join(parts)}.{odd}"
 

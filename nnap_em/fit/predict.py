@@ -17,18 +17,17 @@ from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
 from ..prediction_error.stated import of_states
 from ..smoother.posterior import AbstractSmoother, Posterior
+from ..systems.plant import AbstractPlant
 from .identify import Identified, phi_samples
 
-GIVEN = 1.0  # s of readings before a reported error
+GIVEN = AbstractPlant.given  # s of readings before a reported error of a machine
 HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
-GIVEN_SHARE = 0.25
-"""Readings before a reported error of equations, in their pace: two time constants determine a start."""
 
 
 def given_of(fitted: Identified) -> float:
     """Readings before a reported error [s]."""
-    return GIVEN if fitted.model.system.coordinates else GIVEN_SHARE * fitted.model.pace
+    return fitted.model.system.given * fitted.model.pace
 
 
 def horizons_of(fitted: Identified) -> tuple[float, ...]:
@@ -111,7 +110,7 @@ def drawn_paths(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Paths:
     model, prior = fitted.model, fitted.m_step.prior
     nodes = fitted.m_step.weights(model).nodes
     deviations = phi_samples(fitted, count, key=key)
-    if not model.system.coordinates:
+    if model.system.simulated:
         deviations = deviations.at[0].set(0.0)
     tables = deviations[:, : nodes.size].reshape(count, *nodes.shape)
     return Paths(model, prior, nodes, tables, prior.read(model)[None] + deviations[:, nodes.size :])
@@ -128,7 +127,7 @@ def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Arra
     spread = lower(cholesky(cov[last] + 1e-16 * jnp.eye(shape[1], dtype=cov.dtype)))
     start = mean[last][None] + jax.random.normal(key_start, shape, mean.dtype) @ spread.T
     kick = jax.random.normal(key_noise, (mean.shape[0], *shape), mean.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
-    nominal = not model.system.coordinates  # the first path is that of the model itself, and the mean
+    nominal = model.system.simulated  # the first path is that of the model itself, and the mean
     if nominal:
         start, kick = start.at[0].set(mean[last]), kick.at[:, 0].set(0.0)
 

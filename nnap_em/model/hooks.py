@@ -31,7 +31,8 @@ def reaching(
     """Torques at the joints of the commanded torques of a sequence [N m]."""
     for effect in effects:
         if (i := system.input_of(effect.joint, effect.channel)) is not None:
-            u = u.at[:, i].set(effect.drive(effect.input(u[:, i], dt)))
+            late = system.late(lambda column, effect=effect: effect.input(column, dt), u[:, i])
+            u = u.at[:, i].set(effect.drive(late))
     return u
 
 

@@ -15,7 +15,6 @@ from ..data.dataset import Dataset
 from ..effects.base import AbstractEffect, Scalar, Scene
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import in_loop, integrate
-from ..systems.base import AbstractSystem
 from . import hooks
 from .base import AbstractModel
 from .servo import Servo
@@ -144,12 +143,7 @@ class StateSpaceModel(AbstractModel):
 
         Max over joints and poses of dt (M^-1)_jj |d tau_j / d v_j|, over `STEEP`.
         """
-        if not self.system.coordinates:
-            return self
-        q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(self.system.coordinates))), float)
-        fastest = self.dt * np.max(
-            np.asarray(_mobility(self.system, q)) * np.asarray(cast(Any, self.unknown).steepest())
-        )
+        fastest = self.dt * np.max(self.system.mobility() * np.asarray(cast(Any, self.unknown).steepest()))
         steps = min(MOST_STEPS, 2 ** math.ceil(math.log2(max(float(fastest) / STEEP, 1.0))))
         return dataclasses.replace(self, substeps=max(self.substeps, steps))
 
@@ -209,12 +203,6 @@ class StateSpaceModel(AbstractModel):
         """Mean of the reading at the state x, and at the input that is held from then on."""
         r = self.readable(x, u, force)
         return jnp.stack([r[i] for i in self.measured])
-
-
-@eqx.filter_jit
-def _mobility(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof"]:
-    """Acceleration of every joint by a unit of its own torque."""
-    return jax.vmap(lambda q: jnp.diag(jnp.linalg.inv(system.mass(q))))(q)
 
 
 def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) -> StateSpaceModel:

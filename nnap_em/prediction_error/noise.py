@@ -27,7 +27,7 @@ def white_readings(data: Dataset, model: StateSpaceModel) -> bool:
     Where no coordinate is measured, one other reading is enough.  Rates and accelerations are no evidence against it:
     they may change within a sample.  White readings are no proof of right equations, whose horizons are long.
     """
-    if not model.system.coordinates:
+    if model.system.simulated:
         return False
     lags = [third_differences(y) for y in np.moveaxis(np.asarray(data.y), -1, 0)]
     dof = len(model.system.coordinates)

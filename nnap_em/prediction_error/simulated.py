@@ -1,12 +1,12 @@
-"""Open-loop errors of a model with their exact derivatives, and a fit to them by Levenberg-Marquardt's method.
+"""Errors of free simulations with their exact derivatives, and a fit to them by Levenberg-Marquardt's method.
 
-    e(z) = y_{k+h} - g(x_{k+h}(z)),   x_k the state that a filter has at row k
+    e(z, s) = y_{k+h} - g(x_{k+h}(z, s)),   x_k = m_k + W s the start of a window
 
 The derivatives go through the simulation, unlike those of `multistep`, which are linear about a smoothed path: a model
 of a few equations may be wrong by as much as its signals move, and its parameters move by as much as they are large.
-Over the horizons here a start hardly matters: it is filtered once, and again when the parameters have moved.
-[Ljung 1999, "System Identification", 2nd ed., chapter 7, for prediction errors; More 1978, "The Levenberg-Marquardt
-algorithm", LNM 630]
+Starts are estimated with the parameters: those of a filter are wrong where its model is.
+[Ljung 1999, "System Identification", 2nd ed., chapter 7, for output errors; More 1978, "The Levenberg-Marquardt
+algorithm", LNM 630; Bock 1983 for many starts]
 """
 
 import math
@@ -25,66 +25,96 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
-from .multistep import Grid
 
-HORIZONS = (0.5, 1.0)
-"""Horizons of the errors, in the pace of the model: four and eight of its slowest time constants, or as declared. Fits
-to nearer ones trade parameters for errors of the start: on two tanks without their overflow .12 and .25 more made a
-free simulation worse by a tenth."""
-APART = 1 / 8
-"""Distance of independent errors, in the pace of the model: one slowest time constant."""
+WINDOW = 2.0
+"""Length of a simulation, in the pace of the model: a reading is one pace from its start on average."""
+SETTLES = 0.5
+"""Time after which 2 % of an error of a start are left, in the pace of the model: four slowest time constants."""
+FINE = 128
+"""Errors in a pace at most, sixteen in a slowest time constant: what follows closer tells the same."""
 HUBER = 3.0
-"""Errors of more standard deviations weigh less."""
-FALLS = 1e-4
-"""Share by which a step must lower the squared error for another one to follow."""
-STEPS, PASSES = 30, 3
-"""Steps at most from the same starts, and how often these are filtered."""
+"""Errors of more standard deviations weigh less: of Gaussian ones three in a thousand."""
+FALLS = 0.01
+"""Gain in the log of the posterior [nat] below which a fit ends."""
+STEPS = 40
+"""Steps of a fit at most."""
 
-Errors = Float[np.ndarray, "seq start horizon obs"]
+
+class Windows(eqx.Module):
+    """Windows of `rows` rows each, and those in a window whose errors count."""
+
+    count: int = eqx.field(static=True)
+    rows: int = eqx.field(static=True)
+    every: int = eqx.field(static=True)
+    settles: int = eqx.field(static=True)
+    """Rows after which a start has no effect any more."""
+
+    @property
+    def row(self) -> np.ndarray:
+        """Rows of a sequence by window and place."""
+        return self.rows * np.arange(self.count)[:, None] + np.arange(0, self.rows, self.every)[None]
+
+
+def windows(model: StateSpaceModel, data: Dataset) -> Windows:
+    """Windows of the errors of a model: each sequence in equal parts."""
+    rows, pace = int(np.max(np.sum(np.asarray(data.valid), axis=1))), model.pace / model.dt
+    count = max(1, round(rows / (WINDOW * pace)))
+    return Windows(count, rows // count, max(1, round(pace / FINE)), round(SETTLES * pace))
+
+
+Errors = Float[np.ndarray, "seq window place obs"]
+Counts = Bool[np.ndarray, "seq window #place #obs"]
+Scale = Float[np.ndarray, "1 1 1 obs"]
+
+
+class Starts(NamedTuple):
+    """Prior of the states at the starts of all windows."""
+
+    mean: Float[np.ndarray, "seq window state"]
+    """By a filter."""
+    width: Float[np.ndarray, " state"]
+    """Standard deviation: as large as the states of the filter."""
 
 
 class Simulated(NamedTuple):
-    """A model with its open-loop errors."""
+    """A model with the errors of its simulations."""
 
     model: StateSpaceModel
     prior: ParameterPrior
     z: Float[np.ndarray, " param"]
     """Parameters in standard deviations of their prior."""
+    start: Float[np.ndarray, "seq window state"]
+    """Starts in standard deviations of their prior."""
     error: Errors
     """Reading minus prediction; NaN where there is none."""
-    columns: Float[np.ndarray, "seq start horizon obs param"]
+    columns: Float[np.ndarray, "seq window place obs param"]
     """Derivatives of the predictions by z."""
-    reach: float
-    """Longest horizon [s]."""
+    by_start: Float[np.ndarray, "seq window place obs state"]
+    """Derivatives of the predictions by the start."""
 
-
-def grid(model: StateSpaceModel, data: Dataset) -> Grid:
-    """Starts and horizons of the errors: starts so far apart that errors are independent."""
-    rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    stride = max(1, round(APART * model.pace / model.dt))
-    longest = max(1, rows // 2 // stride)
-    return Grid(stride, tuple(stride * min(longest, max(1, round(h / APART))) for h in HORIZONS))
-
-
-Starts = Float[Array | np.ndarray, "seq start state"]
+    @property
+    def observed(self) -> Counts:
+        """Errors that have a reading."""
+        return np.isfinite(self.error)
 
 
 def filtered(model: StateSpaceModel, data: Dataset) -> Starts:
-    """States at all starts by the filter of a model."""
-    return each(_filtered, (model, grid(model, data)), jax.device_put(data))
+    """Starts of all windows by the filter of a model."""
+    path = np.asarray(each(_filtered, model, jax.device_put(data)))
+    width = np.sqrt(np.mean(path[np.asarray(data.valid)] ** 2, axis=0))
+    return Starts(path[:, windows(model, data).row[:, 0]], width + 1e-9)
 
 
-def _filtered(common, seq: Dataset) -> Float[Array, "start state"]:
-    model, grid = common
-    return ekf(model, model.start, prepare(model, seq), TANGENT).state.mean[grid.starts(seq.t.shape[0])]
+def _filtered(model: StateSpaceModel, seq: Dataset) -> Float[Array, "time state"]:
+    return ekf(model, model.start, prepare(model, seq), TANGENT).state.mean
 
 
 def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begin: Starts | None = None) -> Simulated:
-    """The open-loop errors of a model, and how its estimated parameters move the predictions; from the states `begin`,
-    or those that its own filter has.
+    """The errors of a model, and how its estimated parameters move the predictions; from the states `begin`, or those
+    that its own filter has.
     """
     begin = filtered(model, data) if begin is None else begin
-    return together([model], [prior], data, begin)[0]
+    return together([model], [prior], [np.zeros_like(begin.mean)], data, begin)[0]
 
 
 GROUPS = (1, 16, 64)
@@ -93,24 +123,26 @@ take as long for one as for many."""
 
 
 def together(
-    models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], data: Dataset, begin: Starts
+    models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], starts: Sequence, data: Dataset, begin: Starts
 ) -> list[Simulated]:
-    """`simulated` of models of one structure."""
-    at, count = grid(models[0], data), len(data.t)
+    """`simulated` of models of one structure, from `starts` about `begin`."""
+    at, count = windows(models[0], data), len(data.t)
     numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
     static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
     out = []
     for first in range(0, len(models), GROUPS[-1]):
-        some = numbers[first : first + GROUPS[-1]]
+        some, begun = numbers[first : first + GROUPS[-1]], list(starts[first : first + GROUPS[-1]])
         size = next(size for size in GROUPS if size >= len(some))
         stacked = jax.tree.map(_stacked(size, count), *some)
-        tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin))
-        error, columns = each(_errors, (static, at), (stacked, Dataset(*tiled[0]), tiled[1]))
+        tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
+        begun = np.concatenate([*begun, *begun[-1:] * (size - len(begun))])
+        error, columns, by_start = each(
+            _errors, (static, at, begin.width), (stacked, Dataset(*tiled[0]), tiled[1], begun)
+        )
         for i, (_, _, z) in enumerate(some):
             part = slice(i * count, (i + 1) * count)
-            model, prior = models[first + i], priors[first + i]
-            values = np.asarray(error[part]), np.asarray(columns[part])
-            out.append(Simulated(model, prior, np.asarray(z), *values, at.ages[-1] * model.dt))
+            values = (np.asarray(a[part]) for a in (begun, error, columns, by_start))
+            out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))
     return out
 
 
@@ -121,80 +153,121 @@ def _stacked(size: int, count: int) -> Callable[..., np.ndarray]:
     )
 
 
-def _errors(common, one) -> tuple[Float[Array, "start horizon obs"], Float[Array, "start horizon obs param"]]:
-    (static, grid), (numbers, seq, begin) = common, one
+def _errors(common, one):
+    (static, at, width), (numbers, seq, begin, start) = common, one
     model, prior, z = eqx.combine(numbers, static)
-    starts = grid.starts(seq.t.shape[0])
+    first = at.row[:, 0]
 
-    def predicted(z):
+    def predicted(z, start):
         changed = prior.write(model, z)
         ready = prepare(changed, seq)
         row = lambda k: jax.tree.map(lambda a: a[k], ready.inputs)  # noqa: E731
 
         def step(x, h):
-            x = jax.vmap(changed.transition)(x, row(starts + h))
-            return x, jax.vmap(changed.emission)(x, row(starts + h + 1))
+            inputs = row(first + h)
+            return jax.vmap(changed.transition)(x, inputs), jax.vmap(changed.emission)(x, inputs)
 
-        _, read = jax.lax.scan(step, begin, jnp.arange(grid.ages[-1]))
+        _, read = jax.lax.scan(step, begin + start * width[None], jnp.arange(at.rows))
         known = jnp.where(ready.observed, ready.y, jnp.nan)
-        out = jnp.stack([read[age - 1] for age in grid.ages], axis=1)
-        return out, jnp.stack([known[starts + age] for age in grid.ages], axis=1) - out
+        out = jnp.moveaxis(read[:: at.every], 0, 1)
+        return out, known[at.row] - out
 
-    columns, error = jax.jacfwd(predicted, has_aux=True)(z)
-    return error, columns
-
-
-def scale_of(error: Errors) -> Float[np.ndarray, "1 1 horizon obs"]:
-    """Root mean square of the errors at every horizon."""
-    square = np.ma.masked_invalid(error) ** 2
-    return np.sqrt(np.ma.filled(square.mean(axis=(0, 1), keepdims=True), 1.0)) + 1e-12
+    by_start = jax.jacfwd(lambda shift: predicted(z, start + shift[None])[0])(jnp.zeros_like(start[0]))
+    columns, error = jax.jacfwd(predicted, has_aux=True)(z, start)
+    return error, columns, by_start
 
 
-def cost(error: Errors, scale, counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None) -> float:
+def scale_of(of: Simulated) -> Scale:
+    """Root mean square of the errors of every reading."""
+    square = np.ma.masked_invalid(of.error) ** 2
+    return np.sqrt(np.ma.filled(square.mean(axis=(0, 1, 2), keepdims=True), 1.0)) + 1e-12
+
+
+def independent(of: Simulated) -> float:
+    """Number of independent errors.
+
+        n / (1 + 2 sum_k rho_k),   rho_k the correlation of errors k places apart, as long as the sum of two neighbours
+        is above zero
+
+    Errors of a wrong model go on for some time constants, those of a right one are the noise of the readings.
+    [Geyer 1992, Statistical Science 7(4), 473, for the end of the sum]
+    """
+    unit, total = np.ma.masked_invalid(of.error) / scale_of(of), 1.0
+    places = unit.shape[2]
+    lagged = [np.ma.filled((unit[:, :, k:] * unit[:, :, : places - k]).mean(), 0.0) for k in range(places // 2 + 1)]
+    for odd, even in zip(lagged[1::2], lagged[2::2], strict=False):
+        if odd + even <= 0:
+            break
+        total += 2 * float(odd + even)
+    return float(of.observed.sum()) / total
+
+
+def cost(error: Errors, scale: Scale, counts: Counts) -> float:
     """Squared errors in scales; linear beyond `HUBER` [Huber 1964]."""
     size = np.where(np.isfinite(error), np.minimum(np.abs(error) / scale, 30.0), 30.0)
-    each_one = np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER))
-    return float(np.sum(np.where(counts if counts is not None else True, each_one, 0.0)))
+    return float(np.sum(np.where(counts, np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER)), 0.0)))
 
 
-def observed(of: Simulated) -> Bool[np.ndarray, "seq start horizon obs"]:
-    """Errors that have a reading."""
-    return np.isfinite(of.error)
+def log_posterior(of: Simulated, scale: Scale, counts: Counts) -> float:
+    """Log of the posterior density of a model, of unknown variance of its errors, less a constant [nat].
 
-
-def normal(
-    of: Simulated, scale, counts: Bool[np.ndarray, "seq start horizon obs"]
-) -> tuple[Float[np.ndarray, " param"], Float[np.ndarray, "param param"]]:
-    """Score and information of the parameters by the errors that count, without the prior."""
-    keep = counts & np.isfinite(of.error) & np.isfinite(of.columns).all(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        weight = np.minimum(1.0, HUBER * scale / np.abs(of.error)) / scale**2
-    columns, error, weight = of.columns[keep], of.error[keep], weight[keep]
-    return columns.T @ (weight * error), (columns * weight[:, None]).T @ columns
-
-
-def fit(
-    model: StateSpaceModel,
-    prior: ParameterPrior,
-    data: Dataset,
-    *,
-    scale: Float[np.ndarray, "1 1 horizon obs"] | None = None,
-    counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None,
-    steps: int = STEPS,
-    begin: Starts | None = None,
-) -> Simulated:
-    """`model` with the parameters of the smallest open-loop errors under their prior; noise and start stay.
-
-    `counts` are the starts whose errors count; a `scale` of the errors that is not given is that of the first model.
-    Without states to `begin` from they are filtered, `PASSES` times.
+    -n/2 log(sum e^2 / n) - (z' z + s' s) / 2
     """
-    if begin is None:
-        for _ in range(PASSES):
-            begin = filtered(model, data)
-            best = fit(model, prior, data, scale=scale, counts=counts, steps=steps, begin=begin)
-            model = best.model
-        return simulated(model, prior, data)
-    return fit_all([model], [prior], data, scale=scale, counts=counts, steps=steps, begin=begin)[0]
+    number = max(float(np.sum(counts)), 1.0)
+    prior = float(of.z @ of.z) + float(np.sum(of.start**2))
+    return -0.5 * number * math.log(cost(of.error, scale, counts) / number + 1e-12) - 0.5 * prior
+
+
+class _Normal(NamedTuple):
+    """Normal equations of parameters and starts, with their prior."""
+
+    score: Float[np.ndarray, " param"]
+    information: Float[np.ndarray, "param param"]
+    start_score: Float[np.ndarray, "window state"]
+    start_information: Float[np.ndarray, "window state state"]
+    both: Float[np.ndarray, "window state param"]
+
+    def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Damped steps of parameters and starts."""
+        damped = lambda a: a + damping * np.einsum("...ij,ij->...ij", a, np.eye(a.shape[-1]))  # noqa: E731
+        joint = np.concatenate([self.start_score[..., None], self.both], axis=-1)
+        inner = np.linalg.solve(damped(self.start_information), joint)
+        reduced = damped(self.information) - np.einsum("wsp,wsq->pq", self.both, inner[..., 1:])
+        step = np.linalg.solve(reduced, self.score - np.einsum("wsp,ws->p", self.both, inner[..., 0]))
+        return step, inner[..., 0] - inner[..., 1:] @ step
+
+    @property
+    def reduced(self) -> Float[np.ndarray, "param param"]:
+        """Precision of the parameters, all starts integrated out."""
+        inner = np.linalg.solve(self.start_information, self.both)
+        return self.information - np.einsum("wsp,wsq->pq", self.both, inner)
+
+
+def _normal(of: Simulated, scale: Scale, counts: Counts, worth: float = 1.0) -> _Normal:
+    """Normal equations by the errors that count, each `worth` so many independent ones."""
+    keep = counts & np.isfinite(of.error) & np.isfinite(of.columns).all(axis=-1) & np.isfinite(of.by_start).all(axis=-1)
+    variance = max(cost(of.error, scale, counts) / max(float(np.sum(counts)), 1.0), 1e-12)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight = worth * np.minimum(1.0, HUBER * scale / np.abs(of.error)) / (variance * scale**2)
+    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], a.shape[2] * a.shape[3], *a.shape[4:])  # noqa: E731  a row for a window
+    clean = lambda a, mask: np.where(mask, a, 0.0)  # noqa: E731
+    weight, error = flat(clean(weight, keep)), flat(clean(of.error, keep))
+    columns, by_start = flat(clean(of.columns, keep[..., None])), flat(clean(of.by_start, keep[..., None]))
+    weighted, start = weight[..., None] * columns, of.start.reshape(len(error), -1)
+    return _Normal(
+        np.einsum("wep,we->p", weighted, error) - of.z,
+        np.einsum("wep,weq->pq", weighted, columns) + np.eye(len(of.z)),
+        np.einsum("wes,we->ws", by_start, weight * error) - start,
+        np.einsum("wes,wet->wst", weight[..., None] * by_start, by_start) + np.eye(start.shape[1]),
+        np.einsum("wes,wep->wsp", by_start, weighted),
+    )
+
+
+def fit(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, *, scale: Scale | None = None) -> Simulated:
+    """`fit_all` of one model, with the starts of its filter; without a scale that of its first errors."""
+    begin = filtered(model, data)
+    scale = scale_of(simulated(model, prior, data, begin)) if scale is None else scale
+    return fit_all([model], [prior], data, begin=begin, scale=scale)[0]
 
 
 def fit_all(
@@ -203,36 +276,38 @@ def fit_all(
     data: Dataset,
     *,
     begin: Starts,
-    scale: Float[np.ndarray, "1 1 horizon obs"] | None = None,
-    counts: Bool[np.ndarray, "seq start #horizon #obs"] | None = None,
+    scale: Scale,
+    counts: Counts | None = None,
     steps: int = STEPS,
 ) -> list[Simulated]:
-    """`fit` of models of one structure, side by side."""
-    best = together(models, priors, data, begin)
-    known = observed(best[0]) & (counts if counts is not None else True)
-    scale = scale_of(best[0].error) if scale is None else scale
-    loss = lambda one: cost(one.error, scale, known) + float(one.z @ one.z)  # noqa: E731
-    values, damping, open_ = [loss(one) for one in best], [1e-2] * len(best), list(range(len(best)))
+    """Models of one structure with the parameters of the largest `log_posterior`, side by side; their noise stays.
+
+    `counts` are the errors that count.
+    """
+    best = together(models, priors, [np.zeros_like(begin.mean)] * len(models), data, begin)
+    known = best[0].observed & (True if counts is None else counts)
+    values = [log_posterior(one, scale, known) for one in best]
+    damping, open_ = [1e-2] * len(best), list(range(len(best)))
     for _ in range(steps):
-        ahead = []
+        ahead, moved = [], []
         for i in open_:
-            score, information = normal(best[i], scale, known)
-            score, information = score - best[i].z, information + np.eye(len(best[i].z))
-            step = np.linalg.solve(information + damping[i] * np.diag(np.diag(information)), score)
+            step, start = _normal(best[i], scale, known).solved(damping[i])
             ahead.append(best[i].prior.write(best[i].model, jnp.asarray(best[i].z + step)))
-        trials = together(ahead, [priors[i] for i in open_], data, begin) if open_ else []
+            moved.append(best[i].start + start.reshape(best[i].start.shape))
+        trials = together(ahead, [priors[i] for i in open_], moved, data, begin) if open_ else []
         for i, trial in zip(list(open_), trials, strict=True):
-            after = loss(trial)
-            if after < values[i]:
-                gain, best[i], values[i] = 1 - after / values[i], trial, after
-                damping[i] = max(0.2 * damping[i], 1e-6)
+            after = log_posterior(trial, scale, known)
+            if after > values[i]:
+                gain, best[i], values[i] = after - values[i], trial, after
+                damping[i] = max(0.4 * damping[i], 1e-6)
             else:
-                gain, damping[i] = math.inf, 8 * damping[i]
-            if gain < FALLS or damping[i] > 1e5:
+                gain, damping[i] = math.inf, 4 * damping[i]
+            if (gain < FALLS and damping[i] < 1.0) or damping[i] > 1e6:  # a damped step is short, whatever it gains
                 open_.remove(i)
     return best
 
 
-def precision(of: Simulated, scale) -> Float[np.ndarray, "param param"]:
-    """Posterior precision of the parameters."""
-    return normal(of, scale, observed(of))[1] + np.eye(len(of.z))
+def precision(of: Simulated) -> Float[np.ndarray, "param param"]:
+    """Posterior precision of the parameters, by as many errors as are independent."""
+    known = of.observed
+    return _normal(of, scale_of(of), known, independent(of) / max(float(known.sum()), 1.0)).reduced

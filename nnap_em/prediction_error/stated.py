@@ -145,8 +145,7 @@ def discrepancy_columns(
     """
     dof, states = len(model.system.ports), len(model.system.states)
     known = jnp.asarray(data.valid & used[:, None])[..., None]
-    inputs = len(model.system.joints) if model.system.coordinates else data.u.shape[-1]
-    u = jnp.nan_to_num(jnp.asarray(data.u)[..., :inputs])
+    u = jnp.nan_to_num(jnp.asarray(data.u)[..., : len(model.system.drives)])
     signals = jnp.concatenate([path.mean[..., :states], u], axis=-1)
     seen = jnp.where(known, signals, jnp.nan)
     spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)

@@ -100,7 +100,7 @@ def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified],
     t, valid = (np.asarray(a) for a in (test.data.t, test.data.valid))
     return {
         "given_s": given,
-        **({} if first.model.system.coordinates else {"judged_s": horizons[-1]}),
+        **({"judged_s": horizons[-1]} if first.model.system.simulated else {}),
         "horizons_s": list(horizons),
         "reach_s": float(np.max((t - t[:, :1])[valid])) - given,
         **by_model,

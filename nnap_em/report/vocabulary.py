@@ -43,6 +43,7 @@ MEANINGS = {
     "sensor_bend": "A sensor bends: what it reads is a curve of the value.",
     "unknown_term": "A rate as a function of these signals, outside the vocabulary of effects.",
     "flow": "A flow.",
+    "free_flow": "A flow as a function of some signals.",
     "unknown_function": "A force as a function of these signals, outside the vocabulary of effects.",
 }
 WORDS = {

@@ -121,7 +121,7 @@ def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
     filtered = relinearised(model, posterior.state, prepared, CUBATURE)
 
     def force(system, x, change):
-        nodes = (change @ system.mass(x[:dof]).T if dof else change) / model.dt
+        nodes = system.push_of(x[:dof], change) / model.dt
         return jnp.mean(nodes, axis=0), jnp.std(nodes, axis=0)
 
     def both(x, kick, u, command):

@@ -5,7 +5,10 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.units import force_unit, quantities, state_unit
@@ -75,6 +78,24 @@ class AbstractSystem(AbstractPlant):
         dof = len(self.coordinates)
         return x[:dof], x[dof : 2 * dof]
 
+    def mobility(self) -> Float[np.ndarray, " dof"]:
+        """Largest acceleration of every joint by a unit of its own torque, over poses."""
+        q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(self.coordinates))), float)
+        return np.max(np.asarray(_mobility(self, q)), axis=0)
+
+    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
+        """Impulse M(q) dv [N m s, or N s]."""
+        return change @ self.mass(q).T
+
+    @property
+    def drives(self) -> list[dict[str, Any]]:
+        """The driven joints."""
+        return [{"joint": joint} for joint in self.joints]
+
+    def late(self, law, u):
+        """From 0."""
+        return law(u)
+
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """The torques themselves."""
         return torque
@@ -133,3 +154,9 @@ class AbstractSystem(AbstractPlant):
     def shake(self, q: Float[Array, " dof"]) -> Float[Array, " dof"] | None:
         """Generalised force of a unit horizontal acceleration of the base [N m s^2/m], where the base can shake."""
         return None
+
+
+@eqx.filter_jit
+def _mobility(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof"]:
+    """Acceleration of every joint by a unit of its own torque."""
+    return jax.vmap(lambda q: jnp.diag(jnp.linalg.inv(system.mass(q))))(q)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.units import quantities
@@ -72,6 +73,9 @@ functions: dict[str, Rate] = {}
 class Equations(AbstractPlant):
     """x' = f(x, u, p) + push, y = g(x, u, p); an unknown term is a port whose push stands where its name does."""
 
+    simulated: ClassVar[bool] = True
+    given: ClassVar[float] = 0.25
+    """Two slowest time constants determine a start."""
     joints: ClassVar[tuple[int, ...]] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
 
     values: dict[str, Float[Array, ""]]
@@ -103,6 +107,11 @@ class Equations(AbstractPlant):
     def ports(self) -> tuple[str, ...]:
         """States, to whose rates something may add, then unknown terms."""
         return (*self.of.states, *self.of.terms)
+
+    @property
+    def open_ports(self) -> tuple[str, ...]:
+        """All of them."""
+        return self.ports
 
     @property
     def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -146,6 +155,23 @@ class Equations(AbstractPlant):
     def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
         """None: inputs stand in the equations."""
         return jnp.zeros(len(self.ports), u.dtype)
+
+    def mobility(self) -> Float[np.ndarray, " port"]:
+        """None: there are no joints."""
+        return np.zeros(len(self.ports))
+
+    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
+        """The change itself."""
+        return change
+
+    @property
+    def drives(self) -> list[dict[str, Any]]:
+        """All inputs."""
+        return [{"channel": name} for name in self.of.inputs]
+
+    def late(self, law, u):
+        """From the first row on."""
+        return u[0] + law(u - u[0])
 
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
         """None: there are no joints."""

@@ -2,10 +2,11 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -23,6 +24,13 @@ class AbstractPlant(eqx.Module):
     angles: ClassVar[tuple[bool, ...]] = ()
     optional: ClassVar[dict[str, float]] = {}
 
+    simulated: ClassVar[bool] = False
+    """True where free simulations over many time constants count: fits, predictions and errors are those of them.  The
+    prediction of a machine with joints, which may be chaotic, is the mean of sample paths."""
+
+    given: ClassVar[float] = 1.0
+    """Readings before a reported error, in the pace of the model."""
+
     sensors: ClassVar[dict[str, str]] = {}
     """Columns of sensors that are read beside the states, in the order of `senses`, and their units."""
 
@@ -38,6 +46,11 @@ class AbstractPlant(eqx.Module):
     def ports(self) -> tuple[str, ...]:
         """Places of pushes: of machines the coordinates, with generalised forces."""
         return self.coordinates
+
+    @property
+    def open_ports(self) -> tuple[str, ...]:
+        """Ports that a law of any states and inputs may push; of machines none: their laws belong to joints."""
+        return ()
 
     @property
     def readable(self) -> tuple[str, ...]:
@@ -85,6 +98,25 @@ class AbstractPlant(eqx.Module):
     @abstractmethod
     def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
         """Push of the inputs at the ports; 0 where inputs stand in the equations themselves."""
+
+    @abstractmethod
+    def mobility(self) -> Float[np.ndarray, " dof"]:
+        """Largest acceleration of every joint by a unit of its own torque; 0 without joints."""
+
+    @abstractmethod
+    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node rate"]) -> Float[Array, "node rate"]:
+        """Impulse that changes the rates of a machine so, or the change itself, of states of equations."""
+
+    @property
+    @abstractmethod
+    def drives(self) -> list[dict[str, Any]]:
+        """Joint of every input, or its name as a channel: columns behind these scale numbers of servos."""
+
+    @abstractmethod
+    def late(
+        self, law: Callable[[Float[Array, " time"]], Float[Array, " time"]], u: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """An input by a law that takes time and begins at 0; that of equations begins as it is in the first row."""
 
     @abstractmethod
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:

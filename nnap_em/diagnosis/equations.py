@@ -328,8 +328,8 @@ def _certain(case: Case) -> bool:
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
-    """Of the case of the largest share, and those as likely on parts left out, the one of the fewest numbers; and all
-    of these.
+    """The case of the fewest numbers among that of the largest share and those as likely on parts left out; and all of
+    these.
     """
     if not passing:
         return None, []

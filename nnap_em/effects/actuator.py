@@ -8,11 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .base import AbstractEffect, Scalar, Stream, input_of, one
+from .base import JointEffect, Scalar, Stream, input_of, one
 
 
-class DriveEffect(AbstractEffect):
+class DriveEffect(JointEffect):
     """A law of the input that drives its joint, or of equations of that which its channel names."""
+
+    joint: int | None = eqx.field(static=True, default=None, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def units_on(self, system):
         return {

@@ -31,7 +31,7 @@ WINDOW = 2.0
 SETTLES = 0.5
 """Time after which 2 % of an error of a start are left, in the pace of the model: four slowest time constants."""
 FINE = 128
-"""Errors in a pace at most, sixteen in a slowest time constant: what follows closer tells the same."""
+"""Errors in a pace at most, sixteen in a slowest time constant: closer ones are the same but for noise."""
 HUBER = 3.0
 """Errors of more standard deviations weigh less: of Gaussian ones three in a thousand."""
 FALLS = 0.01
@@ -71,7 +71,7 @@ class Starts(NamedTuple):
     """Prior of the states at the starts of all windows."""
 
     mean: Float[np.ndarray, "seq window state"]
-    """By a filter."""
+    """Those of a filter."""
     width: Float[np.ndarray, " state"]
     """Standard deviation: as large as the states of the filter."""
 

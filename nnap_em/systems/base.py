@@ -93,7 +93,7 @@ class AbstractSystem(AbstractPlant):
         return [{"joint": joint} for joint in self.joints]
 
     def late(self, law, u):
-        """From 0."""
+        """The law itself."""
         return law(u)
 
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " dof"]:

@@ -170,7 +170,7 @@ class Equations(AbstractPlant):
         return [{"channel": name} for name in self.of.inputs]
 
     def late(self, law, u):
-        """From the first row on."""
+        """The law of the difference from the first row."""
         return u[0] + law(u - u[0])
 
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:

@@ -315,14 +315,16 @@ def _passes(case: Case) -> bool:
 
 
 def _certain(case: Case) -> bool:
-    """True where every strength differs from none."""
+    """True where every strength differs from none: half as far as in a fit by likelihood, since correlated errors count
+    as few, and parts left out have to confirm it besides.
+    """
     cov = np.linalg.inv(simulated.precision(case.of))
     std = np.asarray(case.of.prior.std)
     cov = cov * np.outer(std, std)
     sizes = [flat(effect).size for effect in case.of.model.effects[-len(case.laws) :]]
     for law, effect, place in zip(case.laws, case.effects, np.cumsum([0, *sizes[:-1]]) - sum(sizes), strict=True):
         part = np.arange(flat(law.start).size) + place
-        if certainty(law, effect, cov[np.ix_(part, part)]) < CERTAIN:
+        if certainty(law, effect, cov[np.ix_(part, part)]) < CERTAIN / 2:
             return False
     return True
 

@@ -122,14 +122,6 @@ def test_an_input_that_never_moves_is_no_signal():
     assert all(np.isfinite(v.share.inside) for v in _screened(asked, some))
 
 
-def test_models_saved_with_u_read_the_first_driven_joint():
-    model = build(RIG, _recorded_blank(), key=jax.random.key(0)).model
-    old = UnknownFunction(jnp.ones(20), (Axis(("u",), -1.0, 1.0, False, 20),), joint=2)
-    full = with_effects(model, (old,))
-    scene = full.scene(jnp.zeros(4), Inputs.held(jnp.asarray([0.3, 0.7])))
-    assert float(old.axes[0].value(scene)) == 0.3
-
-
 class Chain(AbstractSystem):
     """Three links in a row, with unit masses that do not move each other."""
 

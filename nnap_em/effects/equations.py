@@ -380,7 +380,8 @@ class UnknownTerm(AbstractEffect):
         return FreeFlow(jnp.pad(self.weights, fill, constant_values=1.0), basis, self.low, self.high, pick, at)
 
     def with_numbers(self, lean):
-        return eqx.tree_at(lambda e: e.weights, self, lean.weights[: self.weights.shape[0]])
+        weights = cast(FreeFlow, lean).weights[: self.weights.shape[0]]
+        return eqx.tree_at(lambda e: e.weights, self, weights)
 
     def values(self):
         return {}

@@ -175,7 +175,7 @@ def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
 
 
 def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> list[Picture]:
-    steps = [step for step in steps if step.screened]
+    steps = tuple(step for step in steps if step.screened)
     if not steps:
         return []
     first = next((step for step in steps if step.accepted), steps[0])

@@ -101,6 +101,13 @@ def test_of_laws_as_likely_that_of_fewer_numbers_is_chosen(left, chosen):
     assert equations._chosen(cases)[0].numbers == chosen
 
 
+@pytest.mark.parametrize(("share", "chosen"), [(0.46, 1), (0.44, 2)])
+def test_a_simpler_law_that_removes_clearly_less_is_not_chosen(share, chosen):
+    """One independent error makes no law likelier; nine tenths of the best share decide."""
+    cases = [_case(0.5, 2, 0.5, np.ones((1, 1, 100, 1))), _case(0.55, 1, share, np.ones((1, 1, 100, 1)))]
+    assert equations._chosen(cases)[0].numbers == chosen
+
+
 def test_noise_of_readings_is_no_room_for_laws(tmp_path):
     rng, slow = np.random.default_rng(0), np.sin(np.arange(400) / 20)[None, None, :, None]
     data = _logs(0.0)

@@ -31,7 +31,7 @@ from .hypothesis import Found, Hypothesis
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
-from .verdict import AGREE, CERTAIN, EQUIVALENT_NATS, MULTI_STEP, required
+from .verdict import AGREE, CERTAIN, EQUIVALENT_NATS, MULTI_STEP, even, required
 
 SHARE = MULTI_STEP.share
 """Share of the squared error on parts left out that a law must remove, over its prior odds."""
@@ -228,12 +228,12 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
         if time.monotonic() > until:
             complete = False
             break
-        chosen, even, step = _round(search, hypothesis, every, free)
+        chosen, alike, step = _round(search, hypothesis, every, free)
         steps.append(step)
         if chosen is None:
             break
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Found(math.nan, math.nan, math.nan, even, chosen.share, chosen.share)
+            record = Found(math.nan, math.nan, math.nan, alike, chosen.share, chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
@@ -330,15 +330,23 @@ def _certain(case: Case) -> bool:
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
-    """The case of the fewest numbers among that of the largest share and those as likely on parts left out; and all of
-    these.
+    """The case of the fewest numbers among those that explain the same as the best, and all of these.
+
+    They are worth as much, and as likely on parts left out: few independent errors make much likely, and of a law that
+    removes nearly all the rest counts.
     """
     if not passing:
         return None, []
-    top = max(passing, key=lambda case: case.share * case.odds)
-    independent = simulated.independent(top.of)
-    even = [case for case in passing if 0.5 * independent * math.log(case.left / top.left) < EQUIVALENT_NATS]
-    return min(even, key=lambda case: (case.numbers, case.left)), even
+    worths = [case.share * case.odds for case in passing]
+    top = passing[int(np.argmax(worths))]
+    errors = simulated.independent(top.of)
+    alike = [case for case in (passing[i] for i in even(worths)) if _nats(case, top, errors) < EQUIVALENT_NATS]
+    return min(alike, key=lambda case: (case.numbers, case.left)), alike
+
+
+def _nats(case: Case, top: Case, errors: float) -> float:
+    """Log-likelihood that a case loses to another one on parts left out, of so many independent errors."""
+    return 0.5 * errors * math.log(case.left / top.left)
 
 
 def _report(search: Search, case: Case) -> None:

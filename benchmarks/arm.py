@@ -2,7 +2,7 @@
 
     python benchmarks/arm.py [--joints 6] [--seeds 3] [--first 0] [--imu]
     python benchmarks/arm.py --lacks payload --out OUT      # `nnap-em diagnose` on logs of an arm with a payload
-    python benchmarks/arm.py --lacks off_axis --out OUT     # 2.8 kg, its centre .25 m off the axis of joint 6
+    python benchmarks/arm.py --lacks off_axis --out OUT     # 2.8 kg, its centre 0.25 m off the axis of joint 6
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
 of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold

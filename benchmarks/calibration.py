@@ -96,7 +96,7 @@ def prior_draw(start: Identified, key, moves: int = 200):
 
 
 def stribeck_draw(start: Identified, key) -> StribeckLaw:
-    """Coulomb 0.5 to 1.5 N, breakaway up to half more, Stribeck speed .05 to .2 m/s, viscous 0.5 to 3 N s/m."""
+    """Coulomb 0.5 to 1.5 N, breakaway up to half more, Stribeck speed 0.05 to 0.2 m/s, viscous 0.5 to 3 N s/m."""
     low, high = jnp.asarray([0.5, 1.0, 0.05, 0.5]), jnp.asarray([1.5, 1.5, 0.2, 3.0])
     coulomb, ratio, speed, viscous = jax.random.uniform(key, (4, 1), minval=low[:, None], maxval=high[:, None])
     return StribeckLaw(coulomb, coulomb * ratio, speed, viscous, 0.4 * speed)

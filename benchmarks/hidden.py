@@ -5,8 +5,8 @@
 
 The paper's acrobot, joint 1 read.  `circle`: theta2 of the first row is uniform on the circle and not declared; the
 true model smooths, once as a single Gaussian and once with the mixture.  A sequence is on the true branch where theta2
-is within .3 rad of the truth, root mean square, multiples of a turn aside.  `late`: friction identified with and
-without the readings of the first .3 s, its error over the visited velocities.  Real rigs: `measured.py`.
+is within 0.3 rad of the truth, root mean square, multiples of a turn aside.  `late`: friction identified with and
+without the readings of the first 0.3 s, its error over the visited velocities.  Real rigs: `measured.py`.
 """
 
 import argparse

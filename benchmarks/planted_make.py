@@ -258,7 +258,7 @@ def _toml(truth: dict[str, Any]) -> str:
 
 
 def touches(folder: Path) -> list[dict[str, Any]]:
-    """Torques from outside that were taken out of the training logs: where a hidden column passes .1 N m."""
+    """Torques from outside that were taken out of the training logs: where a hidden column passes 0.1 N m."""
     out = []
     for path in sorted(folder.glob("truth/train/*.csv")):
         hidden = np.genfromtxt(path, delimiter=",", names=True)

@@ -3,7 +3,7 @@
 A truth is named right by its own name, by an exact equivalent (`SAME`, and the gain of the other input, which is the
 same where masses and friction are scaled too), or by its free form, an unknown function of the same signals; all at the
 same joint or channel.  A law told in parts (an overtone as a second ripple, harmonics of a square wave) is no extra.
-Parameters are scored where the law has its own name: right within 15 % (angles: .15 rad), and inside two stated
+Parameters are scored where the law has its own name: right within 15 % (angles: 0.15 rad), and inside two stated
 standard deviations.  An error is that of all measured angles together, root of the sum of squares [rad].
 """
 
@@ -23,7 +23,7 @@ Entry = Mapping[str, Any]
 Place = tuple[str, int | None, str | None]
 HORIZONS = (0.25, 0.5, 1.0)
 DECIDES = 1
-"""Place of the horizon that is judged by, .5 s."""
+"""Place of the horizon that is judged by, 0.5 s."""
 RAISED = 1.02
 """An error beyond this times the one before is one that was raised."""
 SAME: dict[Place, tuple[tuple[Place, ...], ...]] = {
@@ -187,7 +187,7 @@ def errors(report: Entry, side: str) -> tuple[float, ...]:
 
 
 def _touches(true: Sequence[Entry], reported: Sequence[Entry]) -> tuple[int, int, int]:
-    """True touches, those found (middle within .1 s, sign right), and what was told beside."""
+    """True touches, those found (middle within 0.1 s, sign right), and what was told beside."""
 
     def same(a: Entry, b: Entry) -> bool:
         apart = abs(a["from"] + a["to"] - b["from"] - b["to"]) / 2

@@ -71,7 +71,7 @@ MACHINES = {
 
 
 def drive(rng: np.random.Generator) -> np.ndarray:
-    """Sums of three sines of .1 to .8 Hz, a row for every log."""
+    """Sums of three sines of 0.1 to 0.8 Hz, a row for every log."""
     t = np.arange(ROWS) * DT
     rate, phase, size = rng.uniform(0.1, 0.8, (3, LOGS, 1)), rng.uniform(0, 6.3, (3, LOGS, 1)), rng.uniform(0.3, 1)
     return np.sum(size * np.sin(2 * np.pi * rate * t + phase), axis=0)

@@ -82,7 +82,7 @@ def _dropped(log: Spoilt, case: plant.Case, rng: np.random.Generator) -> Spoilt:
 
 
 def _stuck(log: Spoilt, case: plant.Case, rng: np.random.Generator) -> Spoilt:
-    """Each column of a third of the files repeats a reading for .5 s."""
+    """Each column of a third of the files repeats a reading for 0.5 s."""
     columns, wrong = dict(log.columns), dict(log.wrong)
     for name in wrong:
         if rng.random() < 1 / 3:
@@ -95,7 +95,7 @@ def _stuck(log: Spoilt, case: plant.Case, rng: np.random.Generator) -> Spoilt:
 
 
 def _late(log: Spoilt, case: plant.Case, rng: np.random.Generator) -> Spoilt:
-    """All sensors read 0 for the first .3 s."""
+    """All sensors read 0 for the first 0.3 s."""
     early = np.arange(log.kept.size) < 30
     columns = log.columns | {name: np.where(early, 0.0, log.columns[name]) for name in log.wrong}
     return log._replace(columns=columns, wrong={name: wrong | early for name, wrong in log.wrong.items()})

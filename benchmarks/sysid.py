@@ -4,9 +4,9 @@
     python benchmarks/sysid.py [--data ../shared/data/measured] [--alone] [rig ...]     # alone: without the peer's rows
 
 Both get the same training recordings and the same declared unknowns.  The peer fits them with joint damping and dry
-friction (`damping`, `frictionloss`) by least squares of the angles over chunks of .5 s, each from the measured state; a
+friction (`damping`, `frictionloss`) by least squares of the angles over chunks of 0.5 s, each from measured states; a
 declared standard deviation becomes bounds of three times it, as the toolbox knows no priors.  Predictions start every
-.25 s of every test recording; the errors are those of their end points: root mean square, and the median, which a few
+0.25 s of every test recording; the errors are those of their end points: root mean square, and the median, which a few
 starts near the upright do not rule.  The library starts from what it filtered (`predict`), and once more from the start
 of the peer: angles as measured, rates as their differences.  Times are those of the processor, compiling included.
 

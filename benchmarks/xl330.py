@@ -2,7 +2,7 @@
 
     python benchmarks/xl330.py [--bam PYTHON] [--laws load] [--search SECONDS] [--seeds 0]
 
-Raw logs of a Dynamixel XL330 that swings .49 kg at .1 m (`../shared/data/raw/README.md`), its firmware gain 100, 200
+Raw logs of a Dynamixel XL330 that swings 0.49 kg at 0.1 m (`../shared/data/raw/README.md`), its firmware gain 100, 200
 or 400.  Declared are weight, length and the law of the firmware: a position servo whose gain is proportional to the
 columns of firmware gain and supply, numbers uncertain by half.  Six logs are fitted; two are left out, and nobody looks
 at them before the end: 10h28m32 and 10h28m57, the test split that `../shared/data/measured/xl330` has had from the

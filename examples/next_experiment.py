@@ -1,7 +1,7 @@
 """The next experiment, end to end from a seed: logs that hardly discriminate two laws, and inputs that do.
 
 The rig is simulated by `plant.py`, which shares no code with the library: an acrobot whose second joint nobody
-measures and whose drive acts a little late.  Six sequences of sines hardly discriminate a delay of .4 samples and
+measures and whose drive acts a little late.  Six sequences of sines hardly discriminate a delay of 0.4 samples and
 a lag: by some 5 nats.  `nnap-em design` proposes six more, the plant plays them, and old and new logs are diagnosed
 together.  Written into `out/next_experiment/`: the logs, both reports and the design.
 

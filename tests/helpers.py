@@ -104,7 +104,7 @@ def around(model: StateSpaceModel) -> Around:
 
 
 def slide() -> tuple[StateSpaceModel, ScoringMStep]:
-    """A slide without friction whose mass, 1.2 kg, is known to .1 kg, and the rule that fits it."""
+    """A slide without friction whose mass, 1.2 kg, is known to 0.1 kg, and the rule that fits it."""
     start = Gaussian(jnp.zeros(2), jnp.eye(2))
     body = Slide(m=jnp.asarray(1.2), joints=(1,))
     model = StateSpaceModel(body, NoFriction(jnp.ones(1)), start, jnp.zeros(2), jnp.zeros(2), (0, 1), 0.05)

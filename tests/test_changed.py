@@ -218,7 +218,7 @@ def _reference(rng, names: int = 2, own: int = 20) -> Reference:
 
 
 def test_a_number_that_drifts_is_charted_and_filtered():
-    """By .3 of its standard deviation a recording from number 30 on: seen within 15, and its beginning near there."""
+    """By 0.3 of its standard deviation a recording from number 30 on: seen within 15, and its beginning near there."""
     rng = np.random.default_rng(5)
     drift = 0.3 * np.maximum(0, np.arange(60) - 29)
     judged = [

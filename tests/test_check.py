@@ -77,7 +77,7 @@ UPRIGHT = """
 </mujoco>
 """
 """Its joint `twist` bears nothing while the arm is upright; with shoulder and elbow at a quarter turn and half a turn
-of its own between them, 2 kg act .4 m off its axis: 7.8 N m."""
+of its own between them, 2 kg act 0.4 m off its axis: 7.8 N m."""
 
 
 def test_torques_are_held_against_the_loads_along_the_log(tmp_path):

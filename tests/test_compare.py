@@ -223,7 +223,7 @@ def test_a_prior_that_all_runs_share_counts_once():
 
 
 def _with_effect(fitted: Identified, mu: float) -> Identified:
-    """The fit with friction that grows with the load, known to .01."""
+    """The fit with friction that grows with the load, known to 0.01."""
     law = one(lambda mu: LoadFriction(mu, jnp.asarray(0.02), names=("u", "dx"), joint=1), mu, 0.05, 0.5)
     grown = Hypothesis(fitted.model, fitted.m_step, ()).plus(law.start, law)
     hessian = jax.scipy.linalg.block_diag(fitted.state.hessian, jnp.asarray([[(0.5 / 0.01) ** 2]]))
@@ -239,7 +239,7 @@ def test_effects_are_compared_and_those_of_one_fit_are_a_difference(unchanged):
     assert comparison.verdict.startswith("No tested quantity changed between may and june")
     assert comparison.verdict.endswith("at 1%. Load friction of u and dx at joint 1 is in may, not in june.")
     name = "mu of load friction of u and dx at joint 1"
-    for value, news in ((0.11, ()), (0.2, (name,))):  # known to .01 each
+    for value, news in ((0.11, ()), (0.2, (name,))):  # known to 0.01 each
         comparison = compare(_with_effect(first, 0.1), _with_effect(second, value), names=("may", "june"))
         assert (comparison.differences, comparison.changed) == ((), news)
         np.testing.assert_allclose(comparison.numbers[-1].std, 0.01, rtol=1e-6)

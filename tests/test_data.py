@@ -194,7 +194,7 @@ def calls(folder, rig) -> int:
 
 
 def test_a_coarse_encoder_takes_no_more_calls_a_row_than_another(shared):
-    """Six files took 7 s when noise was estimated at standstill, and take .05 s: 10 calls a row (42 with checks)."""
+    """Six files took 7 s when noise was estimated at standstill, and take 0.05 s: 10 calls a row (42 with checks)."""
     rig = read_rig(shared / "data/measured/xl330/rig.toml", specs)
     folder = shared / "data/measured/xl330/train"
     read_logs(folder, rig)  # modules that are loaded when they are needed

@@ -79,7 +79,7 @@ def test_covariance_after_more_information_is_that_of_the_sum_of_precisions():
 
 
 def test_new_logs_tell_the_share_that_the_old_ones_told():
-    """A posterior that is wider than the information of its logs says explains a share of it, by construction .3."""
+    """A posterior that is wider than the information of its logs says explains a share of it, by construction 0.3."""
     rng = np.random.default_rng(4)
     jac = rng.standard_normal((30, 4))
     prior, expected = 9 * np.eye(4), jac.T @ jac

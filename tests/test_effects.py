@@ -117,7 +117,7 @@ CRUDE = {
     **{"payload_step": 0.02, "presliding_friction": 0.03, "sensor_delay": 0.02},
     **{"joint_flexibility": 0.03, "backlash": 0.03, "hard_stop": 0.05},
 }
-"""Share of the effect that may be missed where the model is approximate on purpose; .01 elsewhere."""
+"""Share of the effect that may be missed where the model is approximate on purpose; 0.01 elsewhere."""
 CASES = plant.STRONG | plant.UNNAMED
 NOT_COMPARED = {
     "sensor_quantization": "as noise it moves no mean",

@@ -216,7 +216,7 @@ def test_every_row_is_in_one_window(tmp_path):
     data = _chain()
     model = begin(_rig(tmp_path), data, key=jax.random.key(0)).model
     at = simulated.windows(model, data)
-    assert (at.count, at.rows, at.every) == (2, 120, 1)  # 240 rows of .5 s, two paces of 32 s a window
+    assert (at.count, at.rows, at.every) == (2, 120, 1)  # 240 rows of 0.5 s, two paces of 32 s a window
     np.testing.assert_array_equal(at.row.ravel(), np.arange(240))
 
 

@@ -29,7 +29,7 @@ def _extended(fitted, model):
 
 
 def test_friction_too_steep_for_the_integration_is_left(fitted):
-    """No step leads from 200 N m at .02 rad/s to a friction of .1 N m and .05 N m s/rad; a fit from the start does.
+    """No step leads from 200 N m at 0.02 rad/s to a friction of 0.1 N m and 0.05 N m s/rad; a fit from the start does.
 
     It is that of `identify`: the same network, noise and schedule.
     """

@@ -186,7 +186,7 @@ def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
 
 
 def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
-    """Errors at .25 and .5 s fall to a half with the step, those at 1 s grow by three halves."""
+    """Errors at 0.25 and 0.5 s fall to a half with the step, those at 1 s grow by three halves."""
     size = lambda model: float(RULE.prior.read(model)[0])  # noqa: E731
 
     def many(model, horizons):

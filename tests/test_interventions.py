@@ -88,7 +88,7 @@ def _data():
 
 @pytest.mark.parametrize("restart", [True, False])
 def test_a_recording_is_cut_at_a_touch(restart):
-    """Rows of the touch and .1 s about it are in no sequence; all others are where their readings say."""
+    """Rows of the touch and 0.1 s about it are in no sequence; all others are where their readings say."""
     cut, pieces = without(_data(), (TOUCH,), DT, restart=restart)
     assert pieces == ((0, 1, 1) if restart else (0, 1))
     lengths = np.asarray(cut.valid).sum(axis=1).tolist()

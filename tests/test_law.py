@@ -25,7 +25,7 @@ def _torque(v, values=TRUTH, offset=OFFSET):
 
 
 def _kernel(v, std: float, length: float = 0.5):
-    """Covariance of a curve that is smooth in asinh(v / .05), as a learned one."""
+    """Covariance of a curve that is smooth in asinh(v / 0.05), as a learned one."""
     s = np.arcsinh(v[0] / 0.05) / length
     return std**2 * np.exp(-0.5 * (s[:, None] - s[None, :]) ** 2)[None]
 
@@ -39,7 +39,7 @@ def test_law_limits_are_those_of_the_formula():
     force = lambda v: float(law(jnp.asarray([v]))[0])  # noqa: E731
     assert force(0.0) == 0.0
     assert force(10.0) == pytest.approx(-(2.0 + 0.5 * 10.0), rel=1e-12)
-    assert force(0.005) == pytest.approx(-(3.0 + 0.5 * 0.005), rel=3e-3)  # exp(-.0025) = 1 - .0025, of a third
+    assert force(0.005) == pytest.approx(-(3.0 + 0.5 * 0.005), rel=3e-3)  # exp(-0.0025) = 1 - 0.0025, of a third
     assert force(-0.3) == -force(0.3)
     v = jnp.linspace(-5.0, 5.0, 101)
     assert jnp.all(v * jax.vmap(law)(v[:, None])[:, 0] <= 0)  # friction never adds energy
@@ -83,7 +83,7 @@ def test_std_is_the_scatter_of_repeated_tables():
     draws = _torque(v) + np.random.default_rng(1).normal(size=(n, v.shape[1])) @ factor.T
     fits = fit_law(jnp.tile(jnp.asarray(v), (n, 1)), jnp.asarray(draws), jnp.tile(jnp.asarray(cov), (n, 1, 1)))
     z = (np.asarray(fits.value) - np.asarray((*TRUTH, OFFSET))) / np.asarray(fits.std)
-    # standard deviation of a sample std is 1 / sqrt(2 n) = .06; the delta method itself errs as the curvature: 15 %
+    # standard deviation of a sample std is 1 / sqrt(2 n) = 0.06; the delta method itself errs as the curvature: 15 %
     np.testing.assert_allclose(z.std(0), 1.0, atol=0.15 + 4 / np.sqrt(2 * n))
     assert np.all(np.abs(z.mean(0)) < 0.2 + 4 / np.sqrt(n))
     # 2 std: 4.6 % of the nodes of a true law are called departures, in runs; 60 tables hold some 300 runs

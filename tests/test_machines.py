@@ -240,7 +240,7 @@ def test_payload_is_a_point_mass_at_the_site(tmp_path):
 
 @pytest.mark.parametrize("place", [*OWN, 3, 6], ids=lambda p: p.name if isinstance(p, Path) else f"arm{p}")
 def test_a_payload_of_any_mass_and_centre_moves_the_machine_as_in_mujoco(place, tmp_path):
-    """A body of .7 kg with its centre off the axis, added by MuJoCo's own model editing to the body of the joint."""
+    """A body of 0.7 kg with its centre off the axis, added by MuJoCo's own model editing to the body of the joint."""
     path = place if isinstance(place, Path) else tmp_path / "arm.xml"
     if not isinstance(place, Path):
         path.write_text(arm(place))

@@ -125,7 +125,7 @@ def test_an_elastic_contact_that_yields_is_stiff_until_it_slides():
 
 
 def _logs(stiffness: float | None, seed: int, sequences: int = 16, rows: int = 60) -> Dataset:
-    """A pendulum with Dahl friction of .08 N m and .02 N m s/rad, or with its static limit; both states read."""
+    """A pendulum with Dahl friction of 0.08 N m and 0.02 N m s/rad, or with its static limit; both states read."""
     rng, dt, sub = np.random.default_rng(seed), 0.02, 20
     t = dt * np.arange(rows)
     amplitude, period, phase = (rng.uniform(*r, sequences) for r in ((0.1, 0.6), (0.5, 2.0), (0.0, 6.3)))
@@ -192,7 +192,7 @@ def test_a_static_map_is_kept_where_there_is_no_memory():
     ("turns", "amplitude", "marks"), [(20, 0.5, "ok"), (19, 0.5, "warning"), (20, 0.02, "warning")]
 )
 def test_check_counts_reversals_and_compares_the_noise_with_the_range(turns, amplitude, marks):
-    """A sine that reverses so often, its angle read with 6 mrad: below a tenth of a range of 1 rad, not of .04 rad."""
+    """A sine that reverses so often, its angle read with 6 mrad: below a tenth of a range of 1 rad, not of 0.04 rad."""
     t = 0.02 * np.arange(1000)
     rate = np.pi * turns / t[-1]
     y = amplitude * np.stack([np.sin(rate * t), rate * np.cos(rate * t)], axis=-1)[None]

@@ -380,7 +380,7 @@ def test_acrobot_agrees_with_the_kalman_smoother():
     mean, cov = map(np.asarray, smoothed.state)
     std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     x = np.asarray(exact.x)
-    # mean of 400 paths through 300 particles: error std sqrt(1/400 + 1/300) = .08 std, the curvature of f on top
+    # mean of 400 paths through 300 particles: error std sqrt(1/400 + 1/300) = 0.08 std, the curvature of f on top
     assert np.sqrt(np.mean(((x.mean(axis=1) - mean) / std) ** 2)) < 0.2
     assert abs(np.mean(np.log(x.std(axis=1) / std))) < 0.1
     assert np.min(ess) > 150

@@ -346,7 +346,7 @@ def test_a_case_writes_the_same_files_again(tmp_path):
     "effects", [(), plant.STRONG["sensor_delay"] + plant.STRONG["actuator_lag"]], ids=["none", "late sensor and lag"]
 )
 def test_the_oracle_foretells_the_next_tenth_to_the_noise(effects, tmp_path):
-    """Noise .005 rad and .05 rad/s; 5 x 10 readings know their RMS to 1 / sqrt(100) = 10 %, so 1.5 is 5 deviations."""
+    """Noise 0.005 rad and 0.05 rad/s; 5 x 10 readings give the RMS to 1 / sqrt(100) = 10 %, so 1.5 is 5 deviations."""
     case = plant.Case(effects=effects, sequences=1, tests=5, steps=75, seed=2, missing=0.02)
     plant.write(case, tmp_path)
     error = plant.oracle_errors(case, tmp_path, given=0.6, horizons=(0.1,))

@@ -334,7 +334,7 @@ def test_another_law_or_place_is_wrong_and_an_extra(true, entry):
 def test_parameters_are_held_against_the_truth():
     true = _true("cogging", 1, amplitude=0.2, k=5.0, phase=3.1)
     judged = score(_record([true], [_entry("cogging", 1, amplitude=0.25, k=5.01, phase=-3.1)]), {})
-    assert judged.near == (False, True, True)  # the phase is .08 rad away, across half a turn
+    assert judged.near == (False, True, True)  # the phase is 0.08 rad away, across half a turn
     assert judged.inside == (False, True, False)
 
 

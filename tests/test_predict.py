@@ -141,7 +141,7 @@ def test_the_smoother_of_the_fit_is_the_one_that_smooths():
     posterior = posterior_of(drawn, case.data)
     assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(posterior.ess) > 100)
     std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
-    # means of 400 paths through 300 particles: a standard error of .08, 480 of them
+    # means of 400 paths through 300 particles: a standard error of 0.08, 480 of them
     assert np.max(np.abs(np.asarray(posterior.state.mean - kalman.state.mean)) / std) < 5 * 0.08
     again = predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50)
     np.testing.assert_array_equal(again.mean, predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=50).mean)

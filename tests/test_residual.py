@@ -57,7 +57,7 @@ def test_every_column_has_the_unit_of_its_joint():
 
 
 def test_holm_by_hand():
-    # sorted .005 .01 .03 .04, times 4 3 2 1, then never falling: .02 .03 .06 .06
+    # sorted 0.005 0.01 0.03 0.04, times 4 3 2 1, then never falling: 0.02 0.03 0.06 0.06
     np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02], rtol=1e-12)
     np.testing.assert_allclose(holm([0.6, 0.9]), [1.0, 1.0])
     assert holm([]).size == 0

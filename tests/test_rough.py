@@ -357,7 +357,7 @@ def test_a_prediction_knows_nothing_of_later_readings(tmp_path):
     seen = []
     for later in ("as it is", "restless"):
         columns = {name: values.copy() for name, values in swing().items()}
-        columns["theta1"][[40, 100, 150]] += 0.5  # at .4 s, 1 s and 1.5 s
+        columns["theta1"][[40, 100, 150]] += 0.5  # at 0.4 s, 1 s and 1.5 s
         if later == "restless":  # beside this the first spike is none
             columns["theta1"][101:] += np.random.default_rng(0).normal(0.0, 0.5, len(columns["time"]) - 101)
         _write(tmp_path, columns)

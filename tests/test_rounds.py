@@ -113,7 +113,7 @@ def test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reac
 
 @pytest.mark.parametrize(("error", "accepted"), [(0.54, "torsional_spring"), (0.56, "unknown_function")])
 def test_a_refit_may_show_that_a_named_law_is_even_with_the_function_that_contains_it(monkeypatch, error, accepted):
-    """The screen is linear: it gave the spring .4, and its refit removes more."""
+    """The screen is linear: it gave the spring 0.4, and its refit removes more."""
     entries = [_screened(_function("x"), 0.5), _screened(_spring(), 0.4)]
     outcome, tried = _run(monkeypatch, entries, {"torsional_spring": error})
     assert set(tried) == {"torsional_spring", "unknown_function"} and outcome.accepted.effect.name == accepted
@@ -256,8 +256,8 @@ SCREENED = (("unknown_function", 0.14), ("dead_zone", 0.12), ("motor_gain", 0.10
 @pytest.mark.parametrize(
     ("chance", "names"),
     [
-        (0.0, ["dead_zone", "motor_gain", "unknown_function"]),  # .08 is less than .6 of the best
-        (0.055, ["dead_zone", "unknown_function"]),  # .10 is within twice the chance level
+        (0.0, ["dead_zone", "motor_gain", "unknown_function"]),  # 0.08 is less than 0.6 of the best
+        (0.055, ["dead_zone", "unknown_function"]),  # 0.10 is within twice the chance level
         (0.071, []),
     ],
 )

@@ -90,7 +90,7 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
     rows = project(linearised, none, none, weak, np.zeros(count))
     whole = np.sum(linearised.columns[..., count:].astype(float) ** 2 * linearised.weight[..., None], axis=(0, 1, 2))
     share = np.sum(rows.columns**2, axis=0) / whole
-    # what the map has no nodes for, and what a spring keeps: 4e-4 at most and .025 at least with this key
+    # what the map has no nodes for, and what a spring keeps: 4e-4 at most and 0.025 at least with this key
     assert np.all(share[: len(held)] < 0.003)
     slope, moment = share[len(held) :: 2], share[len(held) + 1 :: 2]
     assert np.all(slope > 0.01) and np.all(moment < 0.003)  # the moment of a spring at zero is a constant torque
@@ -122,7 +122,7 @@ def test_a_tilt_is_a_biased_angle_and_a_spring_is_not(bench):
     candidates = [catalogue[name].candidates(around)[0] for name in names]
     seen = screen(OneStep(), _fit(bench), candidates)
     tilt, bias, spring = overlaps(seen, seen.screened[0])
-    # itself; the same but for the prior of the first row (3e-4 with this key); another force (.7)
+    # itself; the same but for the prior of the first row (3e-4 with this key); another force (0.7)
     assert tilt < 1e-6
     assert bias < 0.02
     assert spring > 0.2

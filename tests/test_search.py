@@ -223,7 +223,7 @@ def _pretend(monkeypatch, worth: dict[str, float], others=()):
 @pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])
 @pytest.mark.parametrize(("least", "stays"), [(0.04, False), (0.06, True)])
 def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, names, least, stays):
-    """Of an error of one half .09, the smallest share that counts, are .045; without either the other is worth more."""
+    """Of an error of 0.5, 0.09 of it, the least that counts, are 0.045; without either the other is worth more."""
     _pretend(monkeypatch, {"motor_gain": 0.5, "dead_zone": least})
     left = backward.backward(_context(), _with(*names))
     assert set(_names(left.model)) == {"motor_gain"} | ({"dead_zone"} if stays else set())

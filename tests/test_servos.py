@@ -120,7 +120,7 @@ def test_every_kind_has_a_law():
 def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
     """m x'' = kp (u - x): x = u (1 - cos(w t)) from rest at 0, at 4 rad per sample, by as many steps as that asks for.
 
-    Tolerance: the fourth-order method at STIFF = .5 loses (w h)^5 / 120 of the phase in a step.
+    Tolerance: the fourth-order method at STIFF = 0.5 loses (w h)^5 / 120 of the phase in a step.
     """
     rig = _servo(tmp_path, 'kind = "position"\nkp = 160000.0', model="m = 1.0", kind="slide", read='"x"')
     model = _model(dataclasses.replace(rig, friction=False))
@@ -396,7 +396,7 @@ def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner
 
 
 def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
-    """Within 5 % and 1 ms, friction to .08 of its size; it predicts, is stored as it is, and is not exported."""
+    """Within 5 % and 1 ms, friction to 0.08 of its size; it predicts, is stored as it is, and is not exported."""
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'
     rig = _servo(tmp_path, lines)
     data = _simulated(tmp_path, 0)
@@ -409,7 +409,7 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
     assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
     part = jax.tree.map(lambda a: a[:2], data)
     ahead = horizon_errors(predict(fit, part, 1.0, key=jax.random.key(1), samples=20), fit, part, 1.0, (1.0, 3.0))
-    assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is .001
+    assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is 0.001
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
     assert parameter_table(again) == table and again.rig == rig
@@ -418,7 +418,7 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
 
 
 def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
-    """RMS of kp (u - q) - kd v along a sine, behind a gear; differences over 5 rows to each side shrink it by .3 %."""
+    """RMS of kp (u - q) - kd v along a sine, behind a gear; differences over 5 rows to each side shrink it by 0.3 %."""
     t, w = 0.01 * np.arange(629), 2.0
     q = np.sin(w * t)[None, :, None]
     data = _logs(1.5 * q, np.concatenate([q, 0 * q], axis=2))

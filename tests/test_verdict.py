@@ -131,7 +131,7 @@ SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 
         ({"certainty": 4.9}, "uncertain"),
         ({"certainty": math.nan}, "uncertain"),
         ({"amplitude": 2.1}, None),
-        ({"amplitude": 1.9}, "undetermined"),  # an amplitude of .20 +- .83 is no ripple
+        ({"amplitude": 1.9}, "undetermined"),  # an amplitude of 0.20 +- 0.83 is no ripple
         ({"removed": 0.09}, None),
         ({"removed": 0.089}, "small"),
         ({"removed": math.nan}, "small"),

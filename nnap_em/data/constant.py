@@ -23,7 +23,7 @@ _MORE = 4.0  # times a usual step, or a usual disagreement of two columns, that 
 _DELAY = 5  # rows by which a filtered rate may be late
 _SHORT = 0.002  # runs of two to four rows, per row, above which a column is coarse
 _SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
-_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise .2 % of the runs have as many
+_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise 0.2 % of the runs have as many
 _USUAL = 95  # percentile of the steps of a column
 
 

@@ -164,7 +164,7 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMSt
     and where friction and noise are those of a fit.
 
     Friction that was fitted without a law may stand in its place, too steep for the step of the integration, and no
-    step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within .07 rad/s.
+    step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within 0.07 rad/s.
     """
     before = context.before
     if context.change:

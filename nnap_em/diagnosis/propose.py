@@ -37,7 +37,7 @@ def surroundings(
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
-    # what rises between .4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
+    # what rises between 0.4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
     viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
     return Around(
         model.system,

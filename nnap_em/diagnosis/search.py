@@ -127,8 +127,8 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
 def _ladder(context: SearchContext) -> list[int]:
     """Rows of the first rounds where a joint is hidden: the two shortest horizons of the fit, and one in the middle.
 
-    Over the whole length a fit takes a strong effect for noise of the process: on a simulated arm a spring explains .38
-    of the multi-step error over .6 s and less than .09 over 5 s; of the one-step error .17, and nothing.
+    Over the whole length a fit takes a strong effect for process noise: on a simulated arm a spring explains 0.38
+    of the multi-step error over 0.6 s and less than 0.09 over 5 s; of the one-step error 0.17, and nothing.
     """
     longest = context.longest
     short = [length for length in sorted(context.stages) if length < longest]

@@ -49,7 +49,7 @@ KEEP = 0.6
 refit, which is not linear, differs from the screen by less than the rest."""
 SUSPECT = 0.5
 """Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
-candidates removed .02 and .07 of the multi-step error."""
+candidates removed 0.02 and 0.07 of the multi-step error."""
 
 HELD = 0.2
 """Standard deviation of declared numbers in a search by multi-step errors over the declared one: likelihood counts rows
@@ -58,7 +58,7 @@ FOLLOWED = 0.5
 """Share of the sequences that the first round follows: over the whole length, or as many rows as so many keep."""
 REPEATS = 0.2
 """Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
-differ by up to .13, others by .25 and more."""
+differ by up to 0.13, others by 0.25 and more."""
 MISSING = 0.0
 """Share of the squared error of an earlier fit's recordings above which a law was missing there: one that came since
 adds to it what it removes now, one that was always there removes the same, and 0 lies in the middle."""
@@ -84,9 +84,9 @@ class Bars(NamedTuple):
 
 
 MULTI_STEP = Bars(0.15, 0.0)
-"""Three real rigs as recorded: aliases of what their models lack remove up to .14."""
+"""Three real rigs as recorded: aliases of what their models lack remove up to 0.14."""
 ONE_STEP = Bars(0.004, 12.0)
-"""400 candidates gain 6 nat by chance; .002 nat a reading are certain with many readings, and nobody would notice."""
+"""400 candidates gain 6 nat by chance; 0.002 nat a reading are certain with many readings, and nobody would notice."""
 
 
 class Share(NamedTuple):

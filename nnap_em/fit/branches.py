@@ -15,7 +15,7 @@ from ..smoother.posterior import AbstractSmoother
 APART = 1.0
 """Largest distance of two paths in an angle beyond which they are two branches [rad].
 
-Paths of one branch, linearised about different starts, differ by up to .5 rad on real machines; those of an arm that is
+Paths of one branch, linearised about different starts, differ by up to 0.5 rad on machines; those of an arm that is
 folded and one that is stretched by 3.
 """
 LEAST = 0.01

@@ -13,14 +13,14 @@ from .predict import GIVEN
 PUSHED = 0.85
 """Random acceleration of a fit as a share of that of the motion, from which on forces without a law move the joint.
 
-With a torque of the wrong sign it is 1.1, with an encoder off by 10 degrees .13, on measured double pendulums .2 to .5
-and on a servo whose friction grows with the load .66.
+With a torque of the wrong sign it is 1.1, with an encoder off by 10 degrees 0.13, on real double pendulums 0.2 to 0.5
+and on a servo whose friction grows with the load 0.66.
 """
 UNPREDICTED = 0.25
 """Error 1 s ahead on test sequences, as a share of the motion, below which a fit predicts whatever pushes."""
 LEFT = 3.0
 """Distance of a fitted number from its declaration that is reported [standard deviations]: 1 in 370 by chance.
-Three measured rigs with planted effects had 3.4 to 16 without their law, and .8 to 2.5 with it."""
+Three measured rigs with planted effects had 3.4 to 16 without their law, and 0.8 to 2.5 with it."""
 
 
 class Misfit(NamedTuple):

@@ -41,13 +41,13 @@ ROWS = 5 * NODES
 WITHIN = 3.0
 """Standard deviations within which an uncertain number may move."""
 MISFIT = 5e-5
-"""Share of the squared torque that may stay unexplained: .7 % of the torque, as a zero off by .4 degrees leaves."""
+"""Share of the squared torque that may stay unexplained: 0.7 % of the torque, as a zero off by 0.4 degrees leaves."""
 FALLS = 0.25
 """Largest ratio of the unexplained with a named mistake corrected to that without.
 
-On logs of seven double pendulums and a servo as recorded no correction leaves less than .6; where the mistake was made
-on purpose the right one leaves .3 at most at its joint, but for zeros off by 2 degrees and some by 10.  A six-axis arm
-leaves .07 without the gravity of the joint whose counterbalance is not declared, and is silent only because a unit
+On logs of seven double pendulums and a servo as recorded no correction leaves less than 0.6; where the mistake was made
+on purpose the right one leaves 0.3 at most at its joint, but for zeros off by 2 degrees and some by 10.  A six-axis arm
+leaves 0.07 without the gravity of the joint whose counterbalance is not declared, and is silent only because a unit
 ranks before that and explains too little.
 """
 UNEXPLAINED = 0.2

@@ -6,12 +6,12 @@ from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 
 READINGS = -0.55
-"""Lag-1 correlation of third differences below which readings are white noise at the sampling: that has -.75, a
-filtered or quantised sensor -.45 and more."""
+"""Lag-1 correlation of third differences below which readings are white noise at the sampling: that has -0.75, a
+filtered or quantised sensor -0.45 and more."""
 
 
 def third_differences(y) -> float:
-    """Lag-1 correlation of third differences of a reading, outliers cut: -.75 for white noise on a smooth motion."""
+    """Lag-1 correlation of third differences of a reading, outliers cut: -0.75 for white noise on a smooth motion."""
     d: np.ndarray = np.diff(np.asarray(y, float), 3, axis=1)
     both = np.isfinite(d[:, 1:]) & np.isfinite(d[:, :-1])
     size = 3 * np.median(np.abs(d[np.isfinite(d)])) / 0.6745 if np.isfinite(d).any() else 0.0

@@ -6,7 +6,7 @@ from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 
 SHAPE = 0.1
-"""Rms of a friction map beside the span of known laws, over that of the map; .03 to .3 gave the same answers."""
+"""Rms of a friction map beside the span of known laws, over that of the map; 0.03 to 0.3 gave the same answers."""
 KNEES = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Knees of the Coulomb and Stribeck laws that friction is free in, over the largest speed."""
 

@@ -18,7 +18,7 @@ from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, 
 SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
 """Sizes below which a failed test is called small."""
 WHITE = 0.25
-"""Largest autocorrelation at which innovations count as white; .4 to .5 on real machines."""
+"""Largest autocorrelation at which innovations count as white; 0.4 to 0.5 on real machines."""
 
 
 class Test(NamedTuple):

@@ -27,9 +27,9 @@ from .posterior import AbstractBranching, Posterior, likeliest
 WIDE = 0.2
 """Standard deviation of an unread angle beyond which one Gaussian does not describe it [rad].
 
-Three narrower ones of .13 rad, about that of a hypothesis of the start, do. On four real double pendulums the filter's
-exceeds .4 rad in every recording in which the arm passed the upright position and could be followed on two branches,
-and is below .13 rad in all others.
+Three narrower ones of 0.13 rad, about that of a hypothesis of the start, do. On four real double pendulums the filter's
+exceeds 0.4 rad in every recording in which the arm passed the upright position and could be followed on two branches,
+and is below 0.13 rad in all others.
 """
 NARROW = 2 / 3
 """Standard deviation of each part over that of the component that is split."""

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,16 @@ def test_a_simpler_law_that_removes_clearly_less_is_not_chosen(share, chosen):
     """One independent error makes no law likelier; nine tenths of the best share decide."""
     cases = [_case(0.5, 2, 0.5, np.ones((1, 1, 100, 1))), _case(0.55, 1, share, np.ones((1, 1, 100, 1)))]
     assert equations._chosen(cases)[0].numbers == chosen
+
+
+@pytest.mark.parametrize(("strength", "determined"), [(1.9, False), (2.1, True)])
+def test_a_strength_that_is_not_determined_is_refused(monkeypatch, strength, determined):
+    """A standard deviation of one: two of them are asked for."""
+    law, start = (catalogue["linear_flow"](strength=x, channel="a", reads=("a",)) for x in (strength, 0.0))
+    of = SimpleNamespace(prior=SimpleNamespace(std=np.ones(1)), model=SimpleNamespace(effects=(law,)))
+    monkeypatch.setattr(equations.simulated, "precision", lambda of: np.eye(1))
+    case = SimpleNamespace(of=of, laws=(Candidate(start, (law,), start),), effects=(law,))
+    assert equations._certain(case) == determined  # type: ignore[arg-type]
 
 
 def test_noise_of_readings_is_no_room_for_laws(tmp_path):

@@ -31,7 +31,7 @@ from .hypothesis import Found, Hypothesis
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
-from .verdict import AGREE, CERTAIN, EQUIVALENT_NATS, MULTI_STEP, even, required
+from .verdict import AGREE, DETERMINED, EQUIVALENT_NATS, MULTI_STEP, even, required
 
 SHARE = MULTI_STEP.share
 """Share of the squared error on parts left out that a law must remove, over its prior odds."""
@@ -315,16 +315,14 @@ def _passes(case: Case) -> bool:
 
 
 def _certain(case: Case) -> bool:
-    """True where every strength differs from none: half as far as in a fit by likelihood, since correlated errors count
-    as few, and parts left out have to confirm it besides.
-    """
+    """True where every strength is determined beside its level and share; parts left out confirm that it is there."""
     cov = np.linalg.inv(simulated.precision(case.of))
     std = np.asarray(case.of.prior.std)
     cov = cov * np.outer(std, std)
     sizes = [flat(effect).size for effect in case.of.model.effects[-len(case.laws) :]]
     for law, effect, place in zip(case.laws, case.effects, np.cumsum([0, *sizes[:-1]]) - sum(sizes), strict=True):
         part = np.arange(flat(law.start).size) + place
-        if certainty(law, effect, cov[np.ix_(part, part)]) < CERTAIN / 2:
+        if certainty(law, effect, cov[np.ix_(part, part)]) < DETERMINED:
             return False
     return True
 

@@ -15,7 +15,7 @@ from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
 from nnap_em.draft.equations import draft_equations
-from nnap_em.effects import Candidate, Scene, catalogue
+from nnap_em.effects import Candidate, Scene, catalogue, flat
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
 from nnap_em.fit.identify import begin, identify
@@ -113,10 +113,12 @@ def test_a_simpler_law_that_removes_clearly_less_is_not_chosen(share, chosen):
 def test_a_strength_that_is_not_determined_is_refused(monkeypatch, strength, determined):
     """A standard deviation of one: two of them are asked for."""
     law, start = (catalogue["linear_flow"](strength=x, channel="a", reads=("a",)) for x in (strength, 0.0))
-    of = SimpleNamespace(prior=SimpleNamespace(std=np.ones(1)), model=SimpleNamespace(effects=(law,)))
-    monkeypatch.setattr(equations.simulated, "precision", lambda of: np.eye(1))
-    case = SimpleNamespace(of=of, laws=(Candidate(start, (law,), start),), effects=(law,))
-    assert equations._certain(case) == determined  # type: ignore[arg-type]
+    numbers = flat(law).size
+    of = SimpleNamespace(prior=SimpleNamespace(std=np.ones(numbers)), model=SimpleNamespace(effects=(law,)))
+    monkeypatch.setattr(equations.simulated, "precision", lambda of: np.eye(numbers))
+    monkeypatch.setattr(Case, "effects", (law,))
+    case = Case((Candidate(start, (law,), start),), of, 0.0)  # type: ignore[arg-type]
+    assert equations._certain(case) == determined
 
 
 def test_noise_of_readings_is_no_room_for_laws(tmp_path):

@@ -16,6 +16,10 @@ FOLDERS = ("numerics", "storage", "data", "machines", "recordings", "systems", "
 PACKAGE = ROOT / "nnap_em"
 
 
+LINES, CONSTANTS = 35_870, 584
+"""Lines and module constants of the package: they may fall, and then these fall with them."""
+
+
 def _imports(path: Path) -> set[str]:
     """Folders of the package that a module imports from, at the top or inside a function."""
     package, imported = ("nnap_em", *path.relative_to(PACKAGE).parent.parts), set()
@@ -48,6 +52,21 @@ def test_no_folder_has_the_name_of_a_public_function():
 def test_the_names_at_the_top_fit_on_a_screen():
     """What most users need; the rest is in namespaces."""
     assert 25 <= len(nnap_em._home) <= 30
+
+
+def test_the_package_does_not_grow():
+    """What is added takes the place of something; CHANGELOG.md says of what."""
+    sources = [path.read_text() for path in PACKAGE.rglob("*.py")]
+    assert sum(len(source.splitlines()) for source in sources) <= LINES
+    assert sum(len(_constants(source)) for source in sources) <= CONSTANTS
+
+
+def _constants(source: str) -> list[str]:
+    """Names in capitals that a module sets."""
+    sets = [node for node in ast.parse(source).body if isinstance(node, ast.Assign | ast.AnnAssign)]
+    targets = [target for node in sets for target in (node.targets if isinstance(node, ast.Assign) else [node.target])]
+    names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+    return [name for name in names if name.isupper()]
 
 
 def test_no_test_imports_another():

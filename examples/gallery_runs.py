@@ -24,7 +24,6 @@ from nnap_em.commands.cli import main as nnap_em
 from nnap_em.residual.interventions import WIDTHS, averaged
 from nnap_em.residual.residual import residual
 from nnap_em.residual.undisturbed import disturbance_free
-from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = ROOT.parent / "shared" / "data" / "measured"
@@ -104,7 +103,7 @@ def touch(out: Path) -> Arrays:
     Torques are means over the windows of the search.
     """
     folder = _recordings("dfki_c1_hidden_pert")
-    rig = read_rig(folder / "rig.toml", specs)
+    rig = read_rig(folder / "rig.toml")
     logs = read_logs(folder / "train", rig)
     fit = lambda data: identify(rig, data, key=jax.random.key(0))  # noqa: E731
     fitted, _, disturbances, _ = disturbance_free(fit, fit(logs.data), logs.data)

@@ -1011,7 +1011,7 @@ MUTANTS = (
         "diagnosis/rounds.py",
         "return case.gain - PRICE",
         "return -case.gain - PRICE",
-        "test_rounds.py::test_refits_decide_between_laws_that_the_screen_undecided_apart",
+        "test_rounds.py::test_refits_decide_between_laws_that_the_screen_cannot_tell_apart",
     ),
     Mutant(
         "a bump is a ripple",

@@ -68,7 +68,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MU
 
     size = sum(len(s.candidate.probes) for s in entries)
     seen = Screen(tuple(entries), (np.eye(size),) * 2, (np.eye(3, 6, dtype=bool) if members is None else members,) * 2)
-    monkeypatch.setattr(rounds, "surroundings", lambda *_: None)
+    monkeypatch.setattr(rounds, "surroundings", lambda *_, **__: None)
     monkeypatch.setattr(AbstractEffect, "visible", lambda *_: True)
     monkeypatch.setattr(rounds, "proposals", lambda *_: [])
     monkeypatch.setattr(rounds, "screen", lambda *_: seen)
@@ -193,7 +193,7 @@ def test_the_next_is_refitted_where_the_best_is_rejected(monkeypatch):
         (0.46, {"dead_zone": 0.51}, {"dead_zone": 160.0}, "motor_gain"),
     ],
 )
-def test_refits_decide_between_laws_that_the_screen_undecided_apart(monkeypatch, share, errors, gains, accepted):
+def test_refits_decide_between_laws_that_the_screen_cannot_tell_apart(monkeypatch, share, errors, gains, accepted):
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), share)]
     outcome, tried = _run(monkeypatch, entries, errors, gains)
     assert outcome.accepted.effect.name == accepted

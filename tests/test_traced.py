@@ -101,7 +101,7 @@ def _own(common, one):
     return common * one
 
 
-def test_what_a_key_undecided_is_not_kept(cache):
+def test_what_a_key_cannot_tell_is_not_kept(cache):
     """A function of another package may say something else tomorrow under the same name."""
     np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(2.0), jnp.arange(3.0)), [0.0, 2.0, 4.0])
     assert not _kept(cache)

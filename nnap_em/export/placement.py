@@ -244,6 +244,7 @@ REASONS: Mapping[str, str] = {
     "base_vibration": "the base of a fixed machine does not move",
     "sensor_bias": "a sensor has no offset",
     "sensor_scale": "a sensor has no scale",
+    **dict.fromkeys(("change", "coulomb_change", "viscous_change"), "it is a change since a fit: identify --from"),
 }
 """Reasons against a place for each other law, by name."""
 

@@ -1,4 +1,4 @@
-"""How often does `diagnose` name the law that equations lack, and none where nothing is missing?
+"""Study of `diagnose` on equations: how often it names the law that they lack, and none where nothing is missing.
 
 Machines are simulated here with NumPy alone, in classical Runge-Kutta steps, so that no law of the finder makes them.
 
@@ -90,7 +90,7 @@ class Case(NamedTuple):
     right: tuple[tuple[str, set[str]], ...] = ()
     """Port or reading of the law and its signals: what is named must have them."""
     push: Callable[..., list] = lambda x, u: [0.0, 0.0]
-    """What comes on top of the rates."""
+    """Missing flow by state and input, added to the rates of the states."""
     lag: float = 0.0
     """Time constant of the first input [s]."""
     reading: Callable[[np.ndarray], np.ndarray] = lambda x: x

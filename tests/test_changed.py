@@ -1,4 +1,4 @@
-"""What changed since a fit: its posterior as a prior, a change that was made and nothing else, and alarms as stated."""
+"""Searches that begin from a fit: its posterior is the prior, a change is found alone, alarms have their rate."""
 
 import dataclasses
 import json
@@ -53,7 +53,7 @@ def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, fr
 
 
 def test_a_fit_from_a_fit_is_that_of_all_logs():
-    """Of a mass alone: precisions add, and the mean is weighted by them, as Bayes' rule has it."""
+    """The precisions of a mass add, and its mean is weighted by them, as Bayes' rule has it."""
     rig, first, second = _rig(friction=False), _logs(0, frictionless=True), _logs(1, frictionless=True)
     key = jax.random.key(0)
     one = identify(rig, first, key=key)

@@ -114,6 +114,10 @@ def test_friction_is_not_blamed_where_it_cannot_be(changed):
         assert changed._replace(curves=(curve._replace(law=tuple(law)),)).other.startswith(reason)
         law[place] = law[place]._replace(value=np.asarray([5.5, 2.5]), test=certain._replace(p_value=2 * CHANGED))
         assert not changed._replace(curves=(curve._replace(law=tuple(law)),)).other
+    for value in ([5.5, 2.5], [4.5, 1.5]):  # a viscous number that was not sure, or has not gone
+        law = list(curve.law)
+        law[3] = law[3]._replace(value=np.asarray(value), std=np.ones(2), test=certain)
+        assert not changed._replace(curves=(curve._replace(law=tuple(law)),)).other
     loaded = both._replace(cause=Cause("Changed since first: a payload.", False, ()))
     assert loaded.verdict.startswith(
         "Changed since first: a payload. The friction curves of joint 1 and joint 2 differ"

@@ -226,7 +226,7 @@ def test_calls_of_reading_grow_with_the_rows_and_no_faster(tmp_path):
     ],
 )
 def test_arrays_that_are_not_of_the_rig_are_refused(change, problem):
-    """What is in the padding does not count; a lost row and a missing reading may be."""
+    """Each mistake is refused by its place; padding does not count, a lost row and a missing reading are no mistake."""
     rig, t = dataclasses.replace(swing_rig(), dt=0.01), 0.01 * np.arange(5)
     good = pad([(t, np.zeros((5, 1)), np.full((5, 2), np.nan)), (t[[0, 1, 3]], np.zeros((3, 1)), np.zeros((3, 2)))])
     assert sequences_of(good, rig) is good

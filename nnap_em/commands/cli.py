@@ -280,7 +280,7 @@ def parser() -> argparse.ArgumentParser:
     monitor.add_argument("model", metavar="FIT", type=Path, help="model.npz, or the folder that holds it")
     monitor.add_argument("folder", metavar="FOLDER", type=Path, help="the recordings")
     monitor.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the page and the numbers")
-    monitor.add_argument("--rate", type=_rate, default=1e-3, metavar="P", help="false alarms a recording (.001)")
+    monitor.add_argument("--rate", type=_rate, default=1e-3, metavar="P", help="false alarms a recording (0.001)")
     monitor.add_argument("--resume", action="store_true", help="keep what OUT/monitor.json says of recordings")
     monitor.add_argument(
         "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
@@ -417,9 +417,9 @@ def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: s
 _N = TypeVar("_N", int, float)
 
 
-def _number(text: str, kind: type[_N], low: int | float, form: str) -> _N:
+def _number(text: str, kind: type[_N], low: int | float, form: str, below: float = math.inf) -> _N:
     try:
-        if low <= (value := kind(text)) < math.inf:
+        if low <= (value := kind(text)) < below:
             return value
     except ValueError:
         pass
@@ -443,8 +443,7 @@ def _minutes(text: str) -> float:
 
 
 def _rate(text: str) -> float:
-    value = _number(text, float, 1e-12, "false alarms a recording, above 0 and below .2")
-    return value if value < 0.2 else _number("", float, 0.0, "false alarms a recording, above 0 and below .2")
+    return _number(text, float, 1e-12, "false alarms a recording, above 0 and below 0.2", below=0.2)
 
 
 def _part(text: str) -> float:

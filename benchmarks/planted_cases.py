@@ -1,7 +1,8 @@
 """The laws that are planted on real logs, and the list of cases: no law shares code with the library's catalogue.
 
 A case is `rig-laws-strength`, its laws a tag and its place each, joined by `+`: `dfki_c1-spring2-strong`,
-`dfki_a0-bias_theta2+shake-medium`, `dfki_c0-recorded` for a rig as it is.
+`dfki_a0-bias_theta2+shake-medium`, `dfki_c0-recorded` for a rig as it is, `dfki_c0-wrong2` for a rig as it is whose
+declared numbers are two of their standard deviations off.
 """
 
 import hashlib
@@ -18,6 +19,8 @@ Body = Mapping[str, float]
 Values = Mapping[str, float]
 STRENGTHS = {"strong": 0.30, "medium": 0.15, "weak": 0.07}
 """Root mean square of the torque that an effect adds, as a share of the typical torque at its joint."""
+WRONG = {"wrong1": 1.0, "wrong2": 2.0}
+"""Standard deviations by which declared numbers are off; the signs are drawn by the name."""
 REST = 0.3
 """Velocity at which planted friction turns over [rad/s]: some times the noise of the velocities."""
 
@@ -318,15 +321,19 @@ def case_of(name: str) -> Case:
     rig, _, planted = name.partition("-")
     if planted == "recorded":
         return Case(name, rig, (), "none")
+    if planted in WRONG:
+        return Case(name, rig, (), planted)
     laws, _, strength = planted.rpartition("-")
     if strength not in STRENGTHS:
-        raise ValueError(f"{name!r}: a case is RIG-LAWS-STRENGTH or RIG-recorded, strengths are {', '.join(STRENGTHS)}")
+        raise ValueError(
+            f"{name!r}: a case is RIG-LAWS-STRENGTH, RIG-recorded or RIG-wrong1, strengths are {', '.join(STRENGTHS)}"
+        )
     return Case(name, rig, tuple(map(_plant, laws.split("+"))), strength)
 
 
 def split(name: str) -> str:
     """`look`: may be looked at while something is built, as rigs as recorded may; `kept`: run at the end only."""
-    if name.endswith("-recorded"):
+    if name.endswith(("-recorded", *WRONG)):
         return "look"
     return ("look", "kept")[hashlib.sha256(name.encode()).digest()[0] % 2]
 

@@ -17,13 +17,14 @@ import functools
 import hashlib
 import json
 import math
+import re
 import shutil
 import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from planted_cases import STRENGTHS, Body, Case, Columns, Motion, Plant, Ranges, Values, case_of, split
+from planted_cases import STRENGTHS, WRONG, Body, Case, Columns, Motion, Plant, Ranges, Values, case_of, split
 
 from nnap_em.data.formats import csv_fields
 from nnap_em.storage.files import replace_text
@@ -220,7 +221,7 @@ def make(name: str, out: Path, data: Path = DATA) -> dict[str, Any]:
     old = f'name = "{case.rig}"'
     text = (rig.folder / "rig.toml").read_text()
     assert text.count(old) == 1
-    replace_text(out / "rig.toml", text.replace(old, f'name = "{name}"'))
+    replace_text(out / "rig.toml", wrong(text.replace(old, f'name = "{name}"'), name, WRONG.get(case.strength, 0.0)))
     truth = {"case": name, "rig": case.rig, "split": split(name), "strength": case.strength, "effects": []}
     for plant, values, reached in chosen:
         place = {"joint": plant.joint, "channel": plant.channel}
@@ -232,6 +233,18 @@ def make(name: str, out: Path, data: Path = DATA) -> dict[str, Any]:
         truth["touches"] = touches(rig.folder)
     replace_text(out / "truth.toml", _toml(truth))
     return truth
+
+
+def wrong(text: str, name: str, size: float) -> str:
+    """rig.toml with every number that is declared with a standard deviation off by `size` of them."""
+    rng = np.random.default_rng(list(hashlib.sha256(name.encode()).digest()))
+
+    def moved(found: re.Match[str]) -> str:
+        mean, std = float(found["mean"]), float(found["std"])
+        return f"{{ mean = {mean + size * rng.choice((-1, 1)) * std:.8g}, std = {found['std']} }}"
+
+    head, mark, tail = text.partition("[measurement]")
+    return re.sub(r"\{ mean = (?P<mean>\S+), std = (?P<std>\S+) \}", moved, head) + mark + tail if size else text
 
 
 def _write(path: Path, columns: Columns, real: Columns, text: Text, shown: list[str]) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from typing import Any, NamedTuple
 
-from planted_cases import LAWS, Law
+from planted_cases import LAWS, STRENGTHS, WRONG, Law
 
 Entry = Mapping[str, Any]
 Place = tuple[str, int | None, str | None]
@@ -279,10 +279,10 @@ def table(records: Sequence[Entry]) -> str:
     """Sums of all cases as Markdown: by strength, and of the rigs as recorded."""
     controls = {r["truth"]["rig"]: r for r in records if r["truth"]["strength"] == "none"}
     scores = {r["case"]: score(r, controls) for r in records}
-    planted = [s for s in scores.values() if s.strength != "none"]
+    planted = [s for s in scores.values() if s.strength in STRENGTHS]
     outside = {r["case"] for r in records if any(t["name"] == "unknown_function" for t in r["truth"]["effects"])}
     hidden = {r["case"] for r in records if r["truth"]["rig"].endswith("_joint1")}
-    groups = {strength: [s for s in planted if s.strength == strength] for strength in ("strong", "medium", "weak")}
+    groups = {strength: [s for s in planted if s.strength == strength] for strength in STRENGTHS}
     groups |= {part: [s for s in planted if s.split == part] for part in ("look", "kept")}
     groups |= {
         "one effect": [s for s in planted if s.truths == 1],
@@ -307,6 +307,11 @@ def table(records: Sequence[Entry]) -> str:
             f"\nAs recorded: {len(as_recorded)} rigs, something reported on {reported}, the 0.5 s test error raised"
         )
         lines.append(f"by more than 2 % on {raised}.")
+    if off := [s for s in scores.values() if s.strength in WRONG]:
+        lines.append(
+            f"\nDeclared numbers one or two standard deviations off: {len(off)} runs, something reported on "
+            f"{sum(s.extras > 0 for s in off)}."
+        )
     true, hits = (sum(s.touches[i] for s in scores.values()) for i in range(2))
     lines += ["", f"External disturbances: {hits} of {true} known ones found; beside them", ""]
     for state, kept in (("as recorded", as_recorded), ("with planted effects", planted)):

@@ -253,6 +253,15 @@ def test_every_case_is_made(name, shared, tmp_path):
     assert same and all(same) if name in CONTROLS else not all(same)  # an input that is never negative loses nothing
 
 
+def test_wrong_numbers_are_off_by_so_many_standard_deviations():
+    text = "[model]\nm1 = { mean = 0.5, std = 0.1 }\nl1 = 0.3\n[measurement]\nx = { mean = 1.0, std = 1.0 }\n"
+    for size in (1.0, 2.0):
+        moved = tomllib.loads(planted_make.wrong(text, "rig-wrong1", size))
+        assert abs(moved["model"]["m1"]["mean"] - 0.5) == pytest.approx(0.1 * size)
+        assert moved["measurement"] == tomllib.loads(text)["measurement"] and moved["model"]["l1"] == 0.3
+    assert planted_make.wrong(text, "rig-recorded", 0.0) == text
+
+
 @pytest.mark.parametrize("name", [PLANTED[0], PLANTED[-1]])
 def test_a_planted_rig_is_read_under_its_name(name, shared, tmp_path):
     planted_make.make(name, tmp_path, shared / "data" / "measured")

@@ -19,7 +19,7 @@ from nnap_em.diagnosis.context import EFFORT, SearchContext, ahead
 from nnap_em.diagnosis.hypothesis import Found, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
-from nnap_em.diagnosis.outcome import Step
+from nnap_em.diagnosis.outcome import Step, Suspect
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round
@@ -329,6 +329,32 @@ def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(remo
     assert following.found[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
 
 
+@pytest.mark.parametrize(
+    ("certain", "names"), [(2.1, ["motor_gain", "dead_zone"]), (1.9, ["dead_zone"]), (0.9, ["dead_zone"])]
+)
+def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, certain, names):
+    """The gain is 1, of so many standard deviations as stated; the dead zone of 2 is sure."""
+    hypothesis = _with("motor_gain", "dead_zone")
+    records = (_found(0.5)._replace(candidate=_candidate("motor_gain"), share=0.3, chance=0.1), _found(0.5))
+    hypothesis = hypothesis._replace(found=records)
+    spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": np.eye(1)}
+    monkeypatch.setattr(search, "covariances", lambda model, *_: [spreads[e.name] for e in model.effects])
+    monkeypatch.setattr(search, "extend", lambda context, one, length: _emstate(one.model, 1.0))
+    rounds = [Step(9, (), (), key_of(effect), 2) for effect in hypothesis.model.effects]
+    state, log = _emstate(hypothesis.model, 1.0), []
+    context = _context()._replace(log=log.append)
+    left, outcome, steps = search._determined(context, hypothesis, state, rounds, lambda fitted, data: fitted)
+    assert _names(left.model) == _names(outcome.model) == names
+    dropped = key_of(hypothesis.model.effects[0])
+    assert steps[0].accepted == (dropped if len(names) == 2 else None) and steps[1].accepted is not None
+    assert steps[-1].suspects == (() if len(names) == 2 else (Suspect(dropped, 0.3, 0.1),))
+    assert log == (
+        []
+        if len(names) == 2
+        else [f"  motor gain at joint 1 is removed: it is {certain} standard deviations from none after its refit"]
+    )
+
+
 def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there():
     state, every, most, few = _emstate(MODEL, 0.0), np.ones(6, bool), np.arange(6) < 3, np.arange(6) < 2
     assert search._first(_context(stages={4: (state, every), 9: (state, most)})) == 9
@@ -362,7 +388,8 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
     def run(context, hypothesis, state, lengths):
         ran.append(type(context.loss))
         names = ("motor_gain", "dead_zone")[: len(ran)]
-        return search._Searched(_with(*names), _emstate(MODEL, 1.0), [], complete)
+        hypothesis = _with(*names)
+        return search._Searched(hypothesis, _emstate(hypothesis.model, 1.0), [], complete)
 
     def white_innovations(fitted, data):
         assert fitted.smoother.second() is None  # branches are not chosen by a model that may lack something
@@ -382,6 +409,7 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
     monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
     monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
     monkeypatch.setattr(search, "white_innovations", white_innovations)
+    monkeypatch.setattr(search, "covariances", lambda model, rule, hessian: [np.eye(1)] * len(model.effects))
     monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     monkeypatch.setattr(search, "_released", lambda rig: search.finished)
     monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)

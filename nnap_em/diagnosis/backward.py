@@ -87,7 +87,7 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
             leads[key] = max(lead, leads.get(key, -math.inf))
             if lead > 1:
                 context.log(f"  {words(key)} takes the place of {words(key_of(law))}")
-                record = evidence._replace(removed=trial.removed, equivalent=())
+                record = evidence._replace(removed=trial.removed, equivalent=(), candidate=trial.candidate)
                 return trial.after._replace(found=(*trial.after.found[:-1], record))
         same = tuple(key for key in evidence.equivalent if leads.get(key, 0.0) >= -1)
         found[place] = evidence._replace(equivalent=same)

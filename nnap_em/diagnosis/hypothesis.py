@@ -35,6 +35,8 @@ class Found(NamedTuple):
     """Number of parts left out on which the error fell, and of all."""
     removed: float = math.nan
     """Share of the squared error that its refit removed where it was found."""
+    candidate: Candidate | None = None
+    """What was fitted; None for a law that was read off."""
 
 
 class Addition(NamedTuple):

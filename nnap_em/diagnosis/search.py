@@ -35,15 +35,15 @@ from ..storage.log import Log, silent
 from .backward import backward
 from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
-from .hypothesis import Found, Hypothesis
+from .hypothesis import Found, Hypothesis, covariances
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
-from .outcome import Diagnosis, Step
+from .outcome import Diagnosis, Step, Suspect
 from .quantised import quantised
 from .rounds import Round, screening_round
 from .smoothed import SmoothedFit, along
-from .trial import Trial
-from .verdict import FOLLOWED, HELD, even
+from .trial import Trial, certainty
+from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -91,7 +91,7 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Trial, outcome.accepted)
     screened, share = case.screened, case.screened.share
-    evidence = Found(equivalent=outcome.equivalent, removed=case.removed)
+    evidence = Found(equivalent=outcome.equivalent, removed=case.removed, candidate=case.candidate)
     if loss.predicts:  # a likelihood proves nothing there
         parts = sum(part > 0 for part in share.folds), len(share.folds)
         return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
@@ -118,10 +118,42 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
-    if not hypothesis.found or state is None:
+    hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
+    if outcome is None:
         return Diagnosis(before, before, (), tuple(steps), complete=complete)
-    outcome = release(_outcome(before, hypothesis, state), data)
     return Diagnosis(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
+
+
+def _determined(
+    context: SearchContext,
+    hypothesis: Hypothesis,
+    state: EMState | None,
+    steps: list[Step],
+    release: Callable[[Identified, Dataset], Identified],
+) -> tuple[Hypothesis, Identified | None, list[Step]]:
+    """The outcome without laws that are not determined as they are stated, the least sure first: those are suspects.
+
+    The search counts rows by their likelihood, which is surer than recordings agree.
+    """
+    while state is not None and any(evidence is not None for evidence in hypothesis.found):
+        outcome = release(_outcome(context.before, hypothesis, state), context.data)
+        model, found = outcome.model, hypothesis.found
+        spreads = covariances(model, outcome.m_step, outcome.state.hessian)
+        sure = [
+            certainty(one.candidate, effect, cov) if one and one.candidate else math.inf
+            for one, effect, cov in zip(found, model.effects, spreads, strict=True)
+        ]
+        least = int(np.argmin(sure))
+        if sure[least] > DETERMINED:
+            return hypothesis, outcome, steps
+        law, evidence = key_of(model.effects[least]), cast(Found, found[least])
+        context.log(f"  {words(law)} is removed: it {Rejection('uncertain', sure[least]).sentence}")
+        steps = [step._replace(accepted=None) if step.accepted == law else step for step in steps]
+        suspects = Suspect(law, evidence.share, evidence.chance), *steps[-1].suspects
+        steps[-1] = steps[-1]._replace(suspects=suspects)
+        hypothesis = hypothesis.refitted(cast(StateSpaceModel, state.best)).without(least)
+        state = extend(context, hypothesis, context.longest) if hypothesis.found else None
+    return hypothesis, None, steps
 
 
 def _ladder(context: SearchContext) -> list[int]:

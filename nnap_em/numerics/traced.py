@@ -88,7 +88,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> C
 
         flat.__name__ = flat.__qualname__ = run.__name__
         try:
-            exported = jax.export.export(jax.jit(flat), platforms=(jax.default_backend(),))(*arrays)
+            exported = jax.export.export(jax.jit(flat), platforms=(jax.export.default_export_platform(),))(*arrays)
             cache.put(key, pickle.dumps((bytes(exported.serialize()), structures[-1])))
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)

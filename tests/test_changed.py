@@ -138,9 +138,12 @@ def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
 
 def test_where_nothing_explains_it_the_errors_decide(fit):
     suspect = SuspectReport("payload", 1, None, [], 0.1, 0.0, "payload", "a payload would remove 10%", "Weigh it.")
-    for p, text, ending in ((0.9 * RISEN, "Something changed", "Suspected: a payload would remove 10%."),
-                            (1.1 * RISEN, "Nothing changed", "(p = 0.011).")):  # fmt: skip
-        outcome = Diagnosis(fit, fit, (), (), change=True, risen=Risen(2.0, p))
+    for p, least, text, ending in (
+        (0.9 * RISEN, 1e-3, "Something changed", "Suspected: a payload would remove 10%."),
+        (1.1 * RISEN, 0.9 * RISEN, "Nothing changed", "(p = 0.011)."),
+        (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "(p = 0.011)."),
+    ):
+        outcome = Diagnosis(fit, fit, (), (), change=True, risen=Risen(2.0, p, least))
         sentence = changes(outcome, [], None, suspects=[suspect])
         assert sentence.startswith(text) and sentence.endswith(ending) and "errors are 2.0 times" in sentence
     assert "not at hand" in changes(outcome._replace(risen=None), [], None)
@@ -172,7 +175,7 @@ def test_the_level_of_a_recording_is_the_log_of_its_rms_and_larger_ones_are_seen
     np.testing.assert_allclose(level(1e-3 * error, scale), np.log(1e-3 * np.array([1, 2, 4])), atol=0.05)
     assert np.isnan(level(np.full((1, 5, 1, 1), np.nan), scale)).all()
     now, before = np.log([3.0, 2.5, 4.0, 3.5]), np.log([1.0, 1.2, 0.9, 1.1])
-    assert risen(before, now).p_value == pytest.approx(1 / math.comb(8, 4))
+    assert risen(before, now).p_value == risen(before, now).least == pytest.approx(1 / math.comb(8, 4))
     assert risen(before, now).ratio == pytest.approx(math.exp(np.median(now) - np.median(before)))
 
 

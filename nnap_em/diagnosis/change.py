@@ -32,4 +32,8 @@ def changes(
     size = f"errors are {number(test.ratio, 2)} times those on its recordings left out (p = {number(test.p_value, 2)})"
     if test.p_value < RISEN:
         return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{suspected}"
+    if test.least >= RISEN:
+        return (
+            f"Nothing is certain to have changed since the fit, and so few recordings cannot show it by errors: {size}."
+        )
     return f"Nothing changed since the fit that these recordings could show: {size}."

@@ -1,5 +1,6 @@
 """Multi-step errors by recording, beside those that a fit has on recordings left out of it."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -85,10 +86,13 @@ class Risen(NamedTuple):
     """Root mean square of the new recordings over that of the others, by the medians of the recordings."""
     p_value: float
     """Chance of such ranks where nothing changed."""
+    least: float
+    """Smallest chance that so few recordings can show."""
 
 
 def risen(before: Float[np.ndarray, " recording"], now: Float[np.ndarray, " new"]) -> Risen:
     """One-sided rank test of levels [Mann & Whitney 1947, Ann. Math. Stat. 18, 50]."""
     before, now = before[np.isfinite(before)], now[np.isfinite(now)]
     test = scipy.stats.mannwhitneyu(now, before, alternative="greater")
-    return Risen(float(np.exp(np.median(now) - np.median(before))), float(test.pvalue))
+    ratio = float(np.exp(np.median(now) - np.median(before)))
+    return Risen(ratio, float(test.pvalue), 1 / math.comb(len(before) + len(now), len(now)))

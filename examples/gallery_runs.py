@@ -153,7 +153,7 @@ def throughput(out: Path) -> Arrays:
     names, whose, speeds = [], [], []
     for kind, head in (("extended", "Extended Kalman filter + RTS"), ("sigma points", "Sigma-point filter + RTS")):
         table = page.partition(f"## {head}\n")[2].partition("\n## ")[0]
-        rows = re.findall(r"(?m)^\| (nnap_em|dynamax) \| ([^|]+) \|[^|]+\|[^|]+\| ([\d.e+]+) \|", table)
+        rows = re.findall(r"(?m)^\| (nnap_em|dynamax) \| ([^|]+) \| ([\d.e+]+) \|", table)
         peer = max(float(speed) for who, _, speed in rows if who == "dynamax")  # with its transition or with ours
         for who, row, speed in (*(row for row in rows if row[0] == "nnap_em"), ("dynamax", "dynamax", peer)):
             names.append(f"{kind}, {SHORT.get(row, row)}")

@@ -172,7 +172,6 @@ def judged(record: dict[str, Any]) -> dict[str, Any]:
         "before": before,
         "after": after,
         "oracle": oracle,
-        "share": math.log(before / after) / math.log(before / oracle) if before > 1.05 * oracle else math.nan,
     }
 
 
@@ -214,18 +213,16 @@ def table(out: Path) -> tuple[str, str]:
         seconds, code = f"{record['seconds']:.0f}", record.get("code", "")
         writer.writerow([f"{group} {effect} {view}", effects, values, true, mark, error, seconds, code])
     summary = [
-        "| group | cases | named right | false or extra | parameters within 15 % | truth inside 2 std "
-        "| median log ratio | after / true: median, 90th | median s |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| group | named right | false or extra | parameters within 15 % | truth inside 2 std "
+        "| after / true: median, 90th | median s |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for group, scores in groups.items():
         near, inside = ([flag for s in scores for flag in s[k]] for k in ("near", "inside"))
         ratio = sorted(s["after"] / s["oracle"] for s in scores)
-        share = sorted(s["share"] for s in scores if math.isfinite(s["share"]))
         bad = sum(s["false"] or s["extras"] > 0 for s in scores)
         summary.append(
-            f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} "
-            f"| {_share(inside)} | {_middle(share):.2f} "
+            f"| {group} | {_share([s['right'] for s in scores])} | {bad} | {_share(near)} | {_share(inside)} "
             f"| {_middle(ratio):.2f}, {ratio[math.ceil(0.9 * len(ratio)) - 1]:.2f} | "
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
@@ -242,7 +239,7 @@ def _name(entry: dict[str, Any]) -> str:
 
 
 def _share(flags: list[bool]) -> str:
-    return f"{sum(flags)} of {len(flags)}"
+    return f"{sum(flags)} of {len(flags)}" if flags else "-"
 
 
 def _middle(values: list[float]) -> float:

@@ -47,7 +47,7 @@ head = (
     "omega2 [rad/s]",
     "lost",
 )
-shown = ("program", "row", "sequence-steps/s", "x best peer", "compile [s]", "peak memory [MB]", "theta2 [rad]")
+shown = ("program", "row", "sequence-steps/s", "x best peer", "theta2 [rad]")
 """Columns of the numbers, and those of them that the page has."""
 
 
@@ -222,12 +222,11 @@ starts, one relinearisation more) its Gaussian smoothers are slower than dynamax
 The acrobot with a 1-16-16-1 tanh network of friction in each joint, one Runge-Kutta step per 10 ms, 20 sequences of
 500 steps, 32 bits; angle and rate of joint 1 read with noise of 0.01 rad and 0.05 rad/s, process noise 2e-4 rad and
 0.01 rad/s per step. All rows have the model that made the logs and the same prior of the start, 0.05 rad and 0.05 rad/s
-about the arm held out level. Particle rows have 1000 particles ([other numbers of them, times, all
-errors](throughput_rows.csv)).
+about the arm held out level. Particle rows have 1000 particles ([other numbers of them, compile times,
+memory, all errors](throughput_rows.csv)).
 
-The rows of a table take turns on one core. Speed is by the median time of 3 to 7 runs after compilation (which includes
-tracing), memory the peak of one run beyond program and logs, theta2 the root mean square error of the smoothed
-(filters: filtered) states.
+The rows of a table take turns on one core. Speed is by the median time of 3 to 7 runs after compilation, theta2 the
+root mean square error of the smoothed (filters: filtered) states.
 
 Peers have the transition as their user would write it in jax.numpy, or ours in the rows marked so. dynamax takes the
 points of the cubature rule. All resample systematically below half the sample size. particles is NumPy in 64 bits; it

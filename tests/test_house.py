@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from prose import in_package, mistakes
+from prose import fractions, in_package, mistakes, on_pages
 from shell import ROOT
 
 import nnap_em
@@ -82,6 +82,16 @@ def test_no_test_imports_another():
 
 def test_docstrings_and_comments_speak_the_language_of_the_field():
     assert in_package() == {}
+
+
+def test_numbers_have_their_zero_on_every_page():
+    assert on_pages() == {}
+
+
+def test_the_check_of_numbers_sees_fractions_and_no_formats():
+    assert fractions("0.03 rad, {x:.2f}, .3g, %.1f, 1.5, a.0, 10.4121/12960104") == []
+    assert fractions("a grid of .02 Hz, [.5, 1]") == ["has '.02', not '0.02'", "has '.5', not '0.5'"]
+    assert mistakes('x = f"{y:.1f} of (.3)"  # -.4\n') == [(1, "has '.3', not '0.3'"), (1, "has '.4', not '0.4'")]
 
 
 def test_the_check_of_sentences_sees_starts_and_words():

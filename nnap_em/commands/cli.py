@@ -222,7 +222,7 @@ def parser() -> argparse.ArgumentParser:
     )
     importing.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
     importing.add_argument(
-        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (.2)"
+        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (0.2)"
     )
     importing.add_argument(
         "--shift",

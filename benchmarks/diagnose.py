@@ -180,8 +180,7 @@ Rigs are simulated by `examples/plant.py`, a NumPy program that shares no code w
 sequences of 5 s, noise 0.005 rad and 0.05 rad/s, joint 2 hidden or shown. "six" has six sequences, "untold" declares no
 noise, "missing" has a tenth of its readings empty. "True" is a cubature filter and an open-loop prediction by the
 simulator itself. Effects that a learned friction map holds (`torque_offset`, `motor_back_emf`) are right when nothing
-is named. Seconds are of one busy core. [Every case](diagnose_table.csv) but clean ones without an alarm; written by
-`benchmarks/diagnose.py`.
+is named. Seconds are of one busy core. [Every case](diagnose_table.csv) but clean ones without an alarm.
 """
 
 

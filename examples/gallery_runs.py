@@ -21,7 +21,7 @@ import plant
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
-from nnap_em.residual.interventions import WIDTHS, averaged
+from nnap_em.residual.interventions import WINDOWS, averaged
 from nnap_em.residual.residual import residual
 from nnap_em.residual.undisturbed import disturbance_free
 
@@ -114,7 +114,7 @@ def touch(out: Path) -> Arrays:
     pulses = [each for each in disturbances if each.sequence == number]
     joint = max((1, 2), key=lambda j: sum(each.joint == j for each in pulses))
     spans = [(each.from_s, each.to_s) for each in pulses if each.joint == joint]
-    mean = averaged(force, round(WIDTHS[0] / rig.dt))[number]
+    mean = averaged(force, round(WINDOWS[0] / rig.dt))[number]
     torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
     return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques
 

@@ -61,6 +61,15 @@ def test_the_package_does_not_grow():
     assert sum(len(_constants(source)) for source in sources) <= CONSTANTS
 
 
+def test_a_constant_has_one_meaning():
+    """Its name is that of one module."""
+    homes: dict[str, set[str]] = {}
+    for path in PACKAGE.rglob("*.py"):
+        for name in _constants(path.read_text()):
+            homes.setdefault(name, set()).add(str(path.relative_to(PACKAGE)))
+    assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
+
+
 def _constants(source: str) -> list[str]:
     """Names in capitals that a module sets."""
     sets = [node for node in ast.parse(source).body if isinstance(node, ast.Assign | ast.AnnAssign)]

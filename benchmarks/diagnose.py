@@ -172,7 +172,6 @@ def judged(record: dict[str, Any]) -> dict[str, Any]:
         "before": before,
         "after": after,
         "oracle": oracle,
-        "share": math.log(before / after) / math.log(before / oracle) if before > 1.05 * oracle else math.nan,
     }
 
 
@@ -181,8 +180,7 @@ Rigs are simulated by `examples/plant.py`, a NumPy program that shares no code w
 sequences of 5 s, noise 0.005 rad and 0.05 rad/s, joint 2 hidden or shown. "six" has six sequences, "untold" declares no
 noise, "missing" has a tenth of its readings empty. "True" is a cubature filter and an open-loop prediction by the
 simulator itself. Effects that a learned friction map holds (`torque_offset`, `motor_back_emf`) are right when nothing
-is named. Seconds are of one busy core. [Every case](diagnose_table.csv) but clean ones without an alarm; written by
-`benchmarks/diagnose.py`.
+is named. Seconds are of one busy core. [Every case](diagnose_table.csv) but clean ones without an alarm.
 """
 
 
@@ -214,18 +212,16 @@ def table(out: Path) -> tuple[str, str]:
         seconds, code = f"{record['seconds']:.0f}", record.get("code", "")
         writer.writerow([f"{group} {effect} {view}", effects, values, true, mark, error, seconds, code])
     summary = [
-        "| group | cases | named right | false or extra | parameters within 15 % | truth inside 2 std "
-        "| median log ratio | after / true: median, 90th | median s |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| group | named right | false or extra | parameters within 15 % | truth inside 2 std "
+        "| after / true: median, 90th | median s |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for group, scores in groups.items():
         near, inside = ([flag for s in scores for flag in s[k]] for k in ("near", "inside"))
         ratio = sorted(s["after"] / s["oracle"] for s in scores)
-        share = sorted(s["share"] for s in scores if math.isfinite(s["share"]))
         bad = sum(s["false"] or s["extras"] > 0 for s in scores)
         summary.append(
-            f"| {group} | {len(scores)} | {sum(s['right'] for s in scores)} | {bad} | {_share(near)} "
-            f"| {_share(inside)} | {_middle(share):.2f} "
+            f"| {group} | {_share([s['right'] for s in scores])} | {bad} | {_share(near)} | {_share(inside)} "
             f"| {_middle(ratio):.2f}, {ratio[math.ceil(0.9 * len(ratio)) - 1]:.2f} | "
             f"{_middle(sorted(s['seconds'] for s in scores)):.0f} |"
         )
@@ -242,7 +238,7 @@ def _name(entry: dict[str, Any]) -> str:
 
 
 def _share(flags: list[bool]) -> str:
-    return f"{sum(flags)} of {len(flags)}"
+    return f"{sum(flags)} of {len(flags)}" if flags else "-"
 
 
 def _middle(values: list[float]) -> float:

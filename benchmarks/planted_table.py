@@ -45,9 +45,7 @@ ANGLES = {"theta0": math.inf, "phase": 2 * math.pi, "center": math.pi}
 
 GROUP_COLUMNS = (
     "planted",
-    "cases",
     "named right",
-    "and nothing else",
     "with a false extra",
     "test error at 0.5 s not above before",
     "median log ratio at 0.5 s of those named right (number)",
@@ -249,9 +247,7 @@ def _group(scores: Sequence[Score], title: str) -> str:
     scored = [s for s in scores if s.before]
     cells = [
         title,
-        str(len(scores)),
         _of([s.right for s in scores]),
-        _of([s.right and not s.extras for s in scores]),
         _of([s.extras > 0 for s in scores]),
         _of([not s.worse for s in scored]),
         f"{statistics.median(ratios):.2f} ({len(ratios)})" if ratios else "-",

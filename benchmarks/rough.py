@@ -31,7 +31,7 @@ from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import Logs, read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.fit.identify import friction_table, identify
-from nnap_em.fit.predict import HORIZONS, horizon_errors, predict
+from nnap_em.fit.predict import REPORTED, horizon_errors, predict
 from nnap_em.systems import specs
 
 CASES = {
@@ -195,7 +195,7 @@ def study(case: plant.Case, kind: str, trust: bool) -> dict[str, float | list[fl
     )
     seconds = time.perf_counter() - began
     prediction = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-    error = horizon_errors(prediction, fitted, test.data, 1.0)[rig.measured[0]][HORIZONS.index(1.0)]
+    error = horizon_errors(prediction, fitted, test.data, 1.0)[rig.measured[0]][REPORTED.index(1.0)]
     return {
         "error": error,
         "friction": friction_error(fitted, case),

@@ -273,7 +273,7 @@ def main() -> None:
         f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
         f"jax {jax.__version__}, mujoco {mujoco.__version__}; `{' '.join(['python', *sys.argv])}`\n"
     )
-    heads = ["rig", "starts", "fitted by", "theta1 / theta2 at .25; .5; 1 s, root mean square [rad]", "median", "s"]
+    heads = ["rig", "starts", "fitted by", "theta1 / theta2 at 0.25; 0.5; 1 s, root mean square [rad]", "median", "s"]
     print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
     for name in args.rigs:
         for row in study(args.data / name, alone=args.alone):

@@ -31,6 +31,24 @@ titles = {
 }
 axes = {"particles": "particles", "steps": "steps of a sequence", "sequences": "sequences"}
 peers = ("dynamax", "cuthbert", "particles")
+head = (
+    "program",
+    "row",
+    "work",
+    "time [ms]",
+    "sequence-steps/s",
+    "particle-steps/s",
+    "x best peer",
+    "compile [s]",
+    "peak memory [MB]",
+    "theta1 [rad]",
+    "theta2 [rad]",
+    "omega1 [rad/s]",
+    "omega2 [rad/s]",
+    "lost",
+)
+shown = ("program", "row", "sequence-steps/s", "x best peer", "theta2 [rad]")
+"""Columns of the numbers, and those of them that the page has."""
 
 
 def child(order: dict, cpus: Sequence[int], cache: str, *, measure_memory: bool = False):
@@ -72,7 +90,7 @@ def pace(row: dict) -> float:
     return work(row) / float(np.median(row["times"]))
 
 
-def speed_table(rows: list[dict], memory: list[dict]) -> list[str]:
+def speed_rows(rows: list[dict], memory: list[dict]) -> list[list[str]]:
     """One group: time, throughput, ratio to the best peer of the same size, compile time, memory, errors."""
     peaks = {(m["who"], m["what"]): m["memory"] for m in memory}
     lines = []
@@ -96,18 +114,14 @@ def speed_table(rows: list[dict], memory: list[dict]) -> list[str]:
                 str(row.get("lost", "")),
             ]
         )
-    head = [
-        "",
-        "row",
-        "work",
-        "time [ms]",
-        "sequence-steps/s",
-        "particle-steps/s",
-        "x best peer",
-        "compile [s]",
-        "peak memory [MB]",
-    ]
-    return table([*head, "θ₁ [rad]", "θ₂ [rad]", "ω₁ [rad/s]", "ω₂ [rad/s]", "lost"], lines)
+    return lines
+
+
+def speed_table(rows: list[dict], lines: list[list[str]]) -> list[str]:
+    """The columns of the page, of the rows with the most particles."""
+    most = max(row["size"][2] for row in rows if row["who"] == "nnap_em")
+    kept = [line for row, line in zip(rows, lines, strict=True) if row["who"] != "limit" and row["size"][2] == most]
+    return table(shown, [[line[head.index(name)] for name in shown] for line in kept])
 
 
 def limit_lines(rows: list[dict]) -> list[str]:
@@ -208,17 +222,16 @@ starts, one relinearisation more) its Gaussian smoothers are slower than dynamax
 The acrobot with a 1-16-16-1 tanh network of friction in each joint, one Runge-Kutta step per 10 ms, 20 sequences of
 500 steps, 32 bits; angle and rate of joint 1 read with noise of 0.01 rad and 0.05 rad/s, process noise 2e-4 rad and
 0.01 rad/s per step. All rows have the model that made the logs and the same prior of the start, 0.05 rad and 0.05 rad/s
-about the arm held out level.
+about the arm held out level. Particle rows have 1000 particles ([other numbers of them, compile times,
+memory, all errors](throughput_rows.csv)).
 
-The rows of a table take turns in one process on one core. Time is the median of 3 to 7 runs after compilation (which
-includes tracing), memory the peak of one run beyond the loaded program and the logs, θ and ω the root mean square error
-against the simulated states: smoothed in the tables of smoothers, filtered in that of filters. Lost are sequences with
-θ₂ off by more than 0.3 rad.
+The rows of a table take turns on one core. Speed is by the median time of 3 to 7 runs after compilation, theta2 the
+root mean square error of the smoothed (filters: filtered) states.
 
-Peers have the transition as their user would write it in jax.numpy (closed form of the 2 x 2 mass matrix, one matrix
-product per layer), or ours in the rows marked so. dynamax takes the points of the cubature rule. All resample
-systematically below half the sample size. particles is NumPy in 64 bits; it and the exact backward samplers run on the
-first 2 sequences. Our particle rows include the extended smoother about whose path particles are stored.
+Peers have the transition as their user would write it in jax.numpy, or ours in the rows marked so. dynamax takes the
+points of the cubature rule. All resample systematically below half the sample size. particles is NumPy in 64 bits; it
+and the exact backward samplers run on the first 2 sequences. Our particle rows include the extended smoother about
+whose path particles are stored.
 """
 
 
@@ -236,13 +249,15 @@ def main() -> None:
     full = not args.quick and set(args.only) == set(kinds)
     out = args.out or (root / "docs" / "results" / "throughput.md" if full else None)
     began = time.perf_counter()
-    lines = [preface, machine() + "."]
+    lines, numbers = [preface, machine() + "."], [["group", *head]]
     with tempfile.TemporaryDirectory() as cache:
         for group in (g for g in titles if g in args.only):
             order = {"group": group, "size": size, "quick": args.quick}
             rows = child({"task": "speed", **order, "repeats": repeats, "budget": budget}, cpus[:1], cache)
             memory = child({"task": "memory", **order}, cpus[:1], cache, measure_memory=True)
-            section = ["", f"## {titles[group]}", "", *speed_table(rows, memory)]
+            cells = speed_rows(rows, memory)
+            numbers += [[group, *line] for line in cells]
+            section = ["", f"## {titles[group]}", "", *speed_table(rows, cells)]
             lines += [*section, *(limit_lines(rows) if group == "filter" else [])]
             print("\n".join(section), file=sys.stderr, flush=True)  # a later group that fails loses nothing
         if "growth" in args.only:
@@ -254,9 +269,8 @@ def main() -> None:
             two = cpus[:2]
             timings = child({"task": "epoch", "size": size, "repeats": 3}, two, cache)
             rows = [[name, f"{v['time']:.2f}", f"{v['compile']:.1f}"] for name, v in timings.items()]
-            head = ["smoother", "time [s]", "compile [s]"]
             title = f"## One EM epoch of `nnap-em identify` on {len(two)} cores, 64 bits"
-            lines += ["", title, "", *table(head, rows)]
+            lines += ["", title, "", *table(["smoother", "time [s]", "compile [s]"], rows)]
     if "import" in args.only:
         lines += ["", "## The first seconds", "", *start_up(1 if args.quick else 5)]
     lines += ["", f"The whole run took {(time.perf_counter() - began) / 60:.0f} min."]
@@ -264,6 +278,8 @@ def main() -> None:
     print(text)
     if out:
         out.write_text(text)
+        with out.with_name("throughput_rows.csv").open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(numbers)
 
 
 def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> list[str]:
@@ -286,7 +302,7 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
             rows += [
                 [smoother, f"{r['point']} {axes[axis]}", f"{r['time']:.3g}", f"{r['memory'] / 1e6:.0f}"] for r in runs
             ]
-    head = ["smoother", "work", "time [s]", "peak memory [MB]"]
+    titles = ["smoother", "work", "time [s]", "peak memory [MB]"]
     lines = ["", "## How time and memory grow", ""]
     lines.append(f"`e_step` as the library sets it, {base[0]} sequences x {base[1]} steps, {base[2]} particles and")
     lines += ["25 trajectories where nothing else is said; one core.", ""]
@@ -296,9 +312,9 @@ def growth(quick: bool, cpus: Sequence[int], cache: str, out: Path | None) -> li
         lines += [f"![Time and memory of the E-step](../figures/{picture.name})", ""]
         numbers = out.with_suffix(".csv")
         with numbers.open("w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([head, *rows])
+            csv.writer(file, lineterminator="\n").writerows([titles, *rows])
         return [*lines, f"[The numbers]({numbers.name})."]
-    return [*lines, *table(head, rows)]
+    return [*lines, *table(titles, rows)]
 
 
 def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
@@ -306,8 +322,8 @@ def cores(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:
     counts = [n for n in (1, 2, 4) if n <= len(cpus)]
     runs = {n: child({"task": "cores", "size": size, "repeats": 5}, cpus[:n], cache) for n in counts}
     rows = [[name, *(f"{runs[n][name]:.3g} ({runs[1][name] / runs[n][name]:.2f})" for n in counts)] for name in runs[1]]
-    head = ["smoother", *(f"{n} core{'s' * (n > 1)} [s] (speed-up)" for n in counts)]
-    return ["", f"## Cores: `e_step` on {size[0]} x {size[1]}, as the library sets it", "", *table(head, rows)]
+    columns = ["smoother", *(f"{n} core{'s' * (n > 1)} [s] (speed-up)" for n in counts)]
+    return ["", f"## Cores: `e_step` on {size[0]} x {size[1]}, as the library sets it", "", *table(columns, rows)]
 
 
 def large(size: Sequence[int], cpus: Sequence[int], cache: str) -> list[str]:

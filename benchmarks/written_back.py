@@ -62,7 +62,7 @@ def main() -> None:
     print(f"{date.today()}, {platform.machine()}, {jax.device_count()} devices, JAX {jax.__version__}, ", end="")
     print(f"load {os.getloadavg()[0]:.1f} before: {' '.join(['python', *sys.argv])}\n")
     print("| machine | seed | friction of joint 1 / 2, NRMSE | ", end="")
-    print("error at .25, .5, 1 s, joint 1 / 2: the file that came in | the written one | s |")
+    print("error at 0.25, 0.5, 1 s, joint 1 / 2: the file that came in | the written one | s |")
     print("| --- " * 6 + "|")
     for machine in args.machine:
         case, text = CASES[machine], (HERE / f"{machine}.xml").read_text()

@@ -15,7 +15,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
-from nnap_em.export.placement import PLACES, REASONS
+from nnap_em.export.placement import NO_PLACE, PLACES
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -82,7 +82,7 @@ def _place(name: str) -> str:
     """Place of a law in MuJoCo, or the reason why it has none."""
     if name in PLACES:
         return (PLACES[name].__doc__ or "").partition("\n")[0]
-    return f"None: {REASONS.get(name, 'no element of MuJoCo has this form')}."
+    return f"None: {NO_PLACE.get(name, 'no element of MuJoCo has this form')}."
 
 
 def verdict() -> str:

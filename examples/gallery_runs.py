@@ -21,7 +21,7 @@ import plant
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
-from nnap_em.residual.interventions import WIDTHS, averaged
+from nnap_em.residual.interventions import WINDOWS, averaged
 from nnap_em.residual.residual import residual
 from nnap_em.residual.undisturbed import disturbance_free
 
@@ -114,7 +114,7 @@ def touch(out: Path) -> Arrays:
     pulses = [each for each in disturbances if each.sequence == number]
     joint = max((1, 2), key=lambda j: sum(each.joint == j for each in pulses))
     spans = [(each.from_s, each.to_s) for each in pulses if each.joint == joint]
-    mean = averaged(force, round(WIDTHS[0] / rig.dt))[number]
+    mean = averaged(force, round(WINDOWS[0] / rig.dt))[number]
     torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
     return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques
 
@@ -153,7 +153,7 @@ def throughput(out: Path) -> Arrays:
     names, whose, speeds = [], [], []
     for kind, head in (("extended", "Extended Kalman filter + RTS"), ("sigma points", "Sigma-point filter + RTS")):
         table = page.partition(f"## {head}\n")[2].partition("\n## ")[0]
-        rows = re.findall(r"(?m)^\| (nnap_em|dynamax) \| ([^|]+) \|[^|]+\|[^|]+\| ([\d.e+]+) \|", table)
+        rows = re.findall(r"(?m)^\| (nnap_em|dynamax) \| ([^|]+) \| ([\d.e+]+) \|", table)
         peer = max(float(speed) for who, _, speed in rows if who == "dynamax")  # with its transition or with ours
         for who, row, speed in (*(row for row in rows if row[0] == "nnap_em"), ("dynamax", "dynamax", peer)):
             names.append(f"{kind}, {SHORT.get(row, row)}")

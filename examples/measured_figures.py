@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO, dotted, head, styled
+from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO_LINE, dotted, head, styled
 
 
 class MissingTorque(NamedTuple):
@@ -57,7 +57,7 @@ def _draw(ax: Axes, panel: MissingTorque) -> None:
     if panel.true is not None:
         dashes = (0, (4, 2))
         ax.plot(*_means(panel.angle, panel.true), color=TRUTH, ls=dashes, lw=1.4, label="law taken out", zorder=5)
-    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+    ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
 
 
 def _means(angle: Float[Any, " sample"], torque: Float[Any, " sample"]) -> tuple[list[float], list[float]]:

@@ -483,8 +483,8 @@ MUTANTS = (
     Mutant(
         "finish takes steps that raise the error",
         "prediction_error/multistep.py",
-        "trial_error, used) < 1 - FALLS:",
-        "trial_error, used) > 1 - FALLS:",
+        "trial_error, used) < 1 - LEAST_FALL:",
+        "trial_error, used) > 1 - LEAST_FALL:",
         "test_fit.py::test_a_gauss_newton_step_is_halved_until_the_errors_fall",
     ),
     Mutant(
@@ -609,7 +609,7 @@ MUTANTS = (
     Mutant(
         "noise of a refit not held",
         "diagnosis/refit.py",
-        "count >= HELD",
+        "count >= NOISE_HELD_PASSES",
         "count >= 0",
         "test_fit.py::test_a_refit_holds_the_noise_in_its_first_passes",
     ),
@@ -1177,8 +1177,8 @@ MUTANTS = (
     Mutant(
         "folds interleaved",
         "diagnosis/folds.py",
-        "(order * min(FOLDS, count) // count)",
-        "(order % min(FOLDS, count))",
+        "(order * min(MOTION_PARTS, count) // count)",
+        "(order % min(MOTION_PARTS, count))",
         "test_shares.py::test_folds_are_neighbours_and_pieces_where_there_are_few",
     ),
 )

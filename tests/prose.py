@@ -3,6 +3,7 @@
 A docstring starts with what it documents: a noun, or a verb in the imperative or the third person.  It does not start
 with a question word or a preposition ("Of every sequence").  Data, models and laws do not speak: words of `BANNED`
 stand in no docstring and no comment, except as names in backticks.  CONTRIBUTING.md has the terms to use instead.
+A number below one has its zero (0.03 rad), in every text of the package and on every page.
 """
 
 import ast
@@ -25,6 +26,9 @@ BANNED = re.compile(
     re.IGNORECASE,
 )
 """Words that describe data, models and laws as people, or that the vocabulary replaces."""
+FRACTION = re.compile(r"(?<![\w.:%)\]}/\\])\.\d+(?![\w%])")
+"""A number without its zero, and no format (`.3g`, `:.2f`, `%.1f`)."""
+PAGES = ("*.md", "docs/**/*.md", "nnap_em/**/*.md", "benchmarks/*.md")
 
 
 def docstrings(source: str) -> Iterator[tuple[int, str]]:
@@ -43,25 +47,49 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string
 
 
+def strings(source: str) -> Iterator[tuple[int, str]]:
+    """Line and text of every string, in messages and templates too."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+
+
+def fractions(text: str) -> list[str]:
+    """Reasons of the numbers without their zero."""
+    return [f"has {number!r}, not '0{number}'" for number in FRACTION.findall(text)]
+
+
 def mistakes(source: str) -> list[tuple[int, str]]:
     """Line and reason of every docstring and comment to be rewritten."""
     rows = [(line, f"starts with {m[1]!r}") for line, text in docstrings(source) if (m := START.match(text.lstrip()))]
     for line, text in (*docstrings(source), *comments(source)):
         words = BANNED.findall(re.sub(r"`[^`]*`", "", text))
         rows += [(line, f"has the word {word!r}") for word in words]
+    for line, text in (*strings(source), *comments(source)):
+        rows += [(line, reason) for reason in fractions(text)]
     return sorted(rows)
 
 
 def in_package() -> dict[str, list[tuple[int, str]]]:
     """Mistakes by file of the package."""
-    paths = {str(path.relative_to(ROOT / "nnap_em")): path for path in sorted((ROOT / "nnap_em").rglob("*.py"))}
+    paths = {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "nnap_em").rglob("*.py"))}
     rows = {name: mistakes(path.read_text()) for name, path in paths.items()}
     return {name: lines for name, lines in rows.items() if lines}
 
 
+def on_pages() -> dict[str, list[tuple[int, str]]]:
+    """Numbers without their zero by page."""
+    pages = {str(path.relative_to(ROOT)): path for pattern in PAGES for path in sorted(ROOT.glob(pattern))}
+    rows = {
+        name: [(at, reason) for at, line in enumerate(path.read_text().splitlines(), 1) for reason in fractions(line)]
+        for name, path in pages.items()
+    }
+    return {name: lines for name, lines in rows.items() if lines}
+
+
 if __name__ == "__main__":
-    wrong = in_package()
+    wrong = in_package() | on_pages()
     for name, lines in wrong.items():
         for line, reason in lines:
-            print(f"nnap_em/{name}:{line}: {reason}")
+            print(f"{name}:{line}: {reason}")
     sys.exit(bool(wrong))

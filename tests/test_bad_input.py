@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import LARGEST, read_csv
+from nnap_em.data.formats import LARGEST_FILE, read_csv
 from nnap_em.em.loop import FitError
 
 RIG = """\
@@ -102,7 +102,7 @@ def _swap(one: str, two: str) -> Callable[[str], str]:
 
 def _huge(folder: Path) -> None:
     with (folder / "train/01.csv").open("r+b") as file:
-        file.truncate(LARGEST + 2**20)  # sparse: it takes no place on the disk
+        file.truncate(LARGEST_FILE + 2**20)  # sparse: it takes no place on the disk
 
 
 def _everywhere(name: str, change) -> Callable[[Path], object]:

@@ -14,14 +14,24 @@ import scipy.stats
 from nnap_em import compare, diagnose, findings, identify, identify_from
 from nnap_em.commands import cli
 from nnap_em.comparison import cause
-from nnap_em.comparison.monitor import FALSE, MOST, SHIFT, Judged, Reference, cusum, standardised, threshold, trend
+from nnap_em.comparison.monitor import (
+    FALSE,
+    LARGEST_STEP,
+    SHIFT,
+    Judged,
+    Reference,
+    cusum,
+    standardised,
+    threshold,
+    trend,
+)
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
 from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.findings import SuspectReport
 from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.diagnosis.verdict import MISSING, RISEN, veto
+from nnap_em.diagnosis.verdict import MISSING_BEFORE, RISEN, veto
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
@@ -132,8 +142,8 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
     assert veto(**good) is None
-    assert veto(**good, before=MISSING - 0.01) is None
-    assert veto(**good, before=MISSING + 0.01).code == "before"
+    assert veto(**good, before=MISSING_BEFORE - 0.01) is None
+    assert veto(**good, before=MISSING_BEFORE + 0.01).code == "before"
 
 
 def test_where_nothing_explains_it_the_errors_decide(fit):
@@ -206,7 +216,7 @@ def test_a_chart_is_the_largest_sum_of_the_last_values():
 def test_values_beside_few_are_exactly_normal_whatever_their_scale():
     rng = np.random.default_rng(4)
     every = np.stack([standardised(v[:4], v[4:]) for v in rng.normal(size=(4000, 10))])
-    assert scipy.stats.kstest(every[:, 0][np.abs(every[:, 0]) < MOST], "norm").pvalue > 1e-3
+    assert scipy.stats.kstest(every[:, 0][np.abs(every[:, 0]) < LARGEST_STEP], "norm").pvalue > 1e-3
     assert np.mean(np.abs(every) > 1.96) == pytest.approx(0.05, abs=4 * math.sqrt(0.05 / every.size))
     np.testing.assert_allclose(np.corrcoef(every.T), np.eye(6), atol=4 / math.sqrt(4000))
     v = rng.normal(size=12)

@@ -12,7 +12,7 @@ import pytest
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import HELD, Logs, Masked
+from nnap_em.data.logs import REPEAT, Logs, Masked
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.identifiability import check as check_module
@@ -257,7 +257,9 @@ def test_a_held_reading_is_said_and_its_repeats_are_no_lost_samples(slide):
     """Each stands in 10 rows; 90 % of the samples missing would be an error."""
     row = np.arange(ROWS) % 10 == 0
     data = slide.data._replace(y=np.where(row[None, :, None], slide.data.y, np.nan))
-    masked = tuple(Masked(file, HELD, name, 2, 0.01, int(np.sum(~row))) for file in slide.files for name in ("x", "dx"))
+    masked = tuple(
+        Masked(file, REPEAT, name, 2, 0.01, int(np.sum(~row))) for file in slide.files for name in ("x", "dx")
+    )
     report = _report(replace(slide, data=data, masked=masked))
     assert report["missing"] == [("ok", f"{name}: 0 % of the samples are missing") for name in ("x", "dx")]
     assert [mark for mark, _ in report["held"]] == ["warning", "warning"]

@@ -278,8 +278,8 @@ def test_a_csv_file_in_blocks_is_the_same_and_of_any_size(tmp_path, monkeypatch,
     path.write_bytes(path.read_bytes().replace(b"\n", end.encode() if len(end) < 3 else b"\n") + end[2:].encode())
     whole = formats.read_csv(path, ("time",), ("theta1", "u"))
     np.testing.assert_array_equal(whole[:, 2], _columns(T)["u"])
-    monkeypatch.setattr(formats, "BLOCK", 100)
-    monkeypatch.setattr(formats, "LARGEST", 1000)
+    monkeypatch.setattr(formats, "TEXT_BYTES", 100)
+    monkeypatch.setattr(formats, "LARGEST_FILE", 1000)
     np.testing.assert_array_equal(formats.read_log(path, ("time",), ("theta1", "u")), whole)
     with pytest.raises(DataError, match="too much for one sequence"):
         formats.read_table(path, ("time",), ("u",))

@@ -40,7 +40,7 @@ from nnap_em.storage.journal import HERE, Journal, digest, keeping, step
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
 FOUND = {"identify": [], "diagnose": ["torsional_spring"]}
-DONE = (0, identify_command.MISFIT)
+DONE = (0, identify_command.MISFIT_STATUS)
 """A spring is missing: friction alone may not describe the motion."""
 IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
 
@@ -346,7 +346,7 @@ def test_steps_of_another_version_are_refused(rig, stopped, tmp_path, capsys, mo
         assert cli.main(_order(DIAGNOSE, rig, out, "--resume")) == 2
     reason = rf"{_first(out)}: made by nnap_em 0\S* and jax {jax.__version__}, this is nnap_em 9\.9 .*; leave --resume"
     assert re.search(reason, _last_line(capsys.readouterr().err))
-    monkeypatch.setattr(journal, "KIND", journal.KIND._replace(format=2))
+    monkeypatch.setattr(journal, "STEP_KIND", journal.STEP_KIND._replace(format=2))
     assert cli.main(_order(DIAGNOSE, rig, out, "--resume")) == 2
     assert re.search(rf"{_first(out)}: format 1 .*, this version reads format 2", _last_line(capsys.readouterr().err))
 

@@ -91,7 +91,7 @@ def test_a_horizon_is_held_and_grows():
 )
 def test_em_rests_where_nothing_moves(changes, rests):
     reason = loop._ended(_state([0.0], **changes), Schedule(first=9), 9, 0.05)
-    assert reason == ("" if not rests else loop.REFUSED if "stride" in changes else loop.RESTED)
+    assert reason == ("" if not rests else loop.STEP_REFUSED if "stride" in changes else loop.RESTED)
     assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
 
 

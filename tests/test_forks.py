@@ -124,7 +124,7 @@ def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
     candidates = [*_candidates(question, "torsional_spring", "cogging"), free]
     probes = sum(len(c.probes) for c in candidates)
     whole = MultiStep().linearise(q, candidates)
-    monkeypatch.setattr(columns_of, "BLOCK", 5)
+    monkeypatch.setattr(columns_of, "COLUMNS_AT_ONCE", 5)
     sizes = [part.force.shape[1] for part in columns_of.blocks(Columns(*2 * [np.zeros((1, probes, 3, 2))]))]
     assert len(sizes) > 2 and max(sizes) <= 5 and max(sizes) - min(sizes) == 1 and sum(sizes) == probes
     for one, other in zip(MultiStep().linearise(q, candidates), whole, strict=True):

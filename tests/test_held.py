@@ -5,7 +5,7 @@ import pytest
 from helpers import swing, swing_rig
 
 from nnap_em.data.formats import write_csv
-from nnap_em.data.held import HELD, hold, repeats
+from nnap_em.data.held import HELD_ROWS, hold, repeats
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.plausible import repeats as copies
 from nnap_em.data.rough import rough
@@ -44,8 +44,8 @@ def test_a_hold_is_found_whatever_its_length(signal, lengths):
 
 def test_one_hold_in_a_few_rows_is_left_alone():
     """The threshold of `HELD` rows, from both sides."""
-    assert hold([_held(ANGLE, [1, 2, 2])[0]]) == pytest.approx(5 / 3, rel=0.05) and HELD < 5 / 3
-    assert hold([_held(ANGLE, [1, 1, 2])[0]]) == 1.0 and HELD > 4 / 3
+    assert hold([_held(ANGLE, [1, 2, 2])[0]]) == pytest.approx(5 / 3, rel=0.05) and HELD_ROWS < 5 / 3
+    assert hold([_held(ANGLE, [1, 1, 2])[0]]) == 1.0 and HELD_ROWS > 4 / 3
 
 
 @pytest.mark.parametrize("step", (1e-4, 1e-2, 0.1, 0.5))

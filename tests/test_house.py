@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from prose import in_package, mistakes
+from prose import fractions, in_package, mistakes, on_pages
 from shell import ROOT
 
 import nnap_em
@@ -61,6 +61,15 @@ def test_the_package_does_not_grow():
     assert sum(len(_constants(source)) for source in sources) <= CONSTANTS
 
 
+def test_a_constant_has_one_meaning():
+    """Its name is that of one module."""
+    homes: dict[str, set[str]] = {}
+    for path in PACKAGE.rglob("*.py"):
+        for name in _constants(path.read_text()):
+            homes.setdefault(name, set()).add(str(path.relative_to(PACKAGE)))
+    assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
+
+
 def _constants(source: str) -> list[str]:
     """Names in capitals that a module sets."""
     sets = [node for node in ast.parse(source).body if isinstance(node, ast.Assign | ast.AnnAssign)]
@@ -82,6 +91,16 @@ def test_no_test_imports_another():
 
 def test_docstrings_and_comments_speak_the_language_of_the_field():
     assert in_package() == {}
+
+
+def test_numbers_have_their_zero_on_every_page():
+    assert on_pages() == {}
+
+
+def test_the_check_of_numbers_sees_fractions_and_no_formats():
+    assert fractions("0.03 rad, {x:.2f}, .3g, %.1f, 1.5, a.0, 10.4121/12960104") == []
+    assert fractions("a grid of .02 Hz, [.5, 1]") == ["has '.02', not '0.02'", "has '.5', not '0.5'"]
+    assert mistakes('x = f"{y:.1f} of (.3)"  # -.4\n') == [(1, "has '.3', not '0.3'"), (1, "has '.4', not '0.4'")]
 
 
 def test_the_check_of_sentences_sees_starts_and_words():

@@ -8,7 +8,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.em.loop import _replaced, e_step
-from nnap_em.fit.branches import APART, branches, modes
+from nnap_em.fit.branches import BRANCH_DISTANCE, branches, modes
 from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother
@@ -16,7 +16,7 @@ from nnap_em.smoother.kalman import CUBATURE
 from nnap_em.smoother.mixture import (
     DISTANCE,
     NARROW,
-    WIDE,
+    WIDE_STD,
     Components,
     MixtureSmoother,
     branch,
@@ -179,7 +179,7 @@ def test_the_likelier_side_is_the_one_of_the_grid():
     model, data = _model(), _logs([1, -1], ROWS - 4)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
     mixture = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
-    assert np.all(np.asarray(mixture.width) > WIDE)
+    assert np.all(np.asarray(mixture.width) > WIDE_STD)
     for i in range(2):
         x, posterior, loglik = _grid(model, jax.tree.map(lambda a, i=i: a[i], data))
         mean = posterior @ x
@@ -223,7 +223,7 @@ def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
     model, data = _model(), _logs([1, -1], 0)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
     posterior = e_step(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
-    assert np.all(np.asarray(posterior.width) < WIDE)
+    assert np.all(np.asarray(posterior.width) < WIDE_STD)
     for a, b in zip(
         jax.tree.leaves(first._replace(width=None)), jax.tree.leaves(posterior._replace(width=None)), strict=True
     ):
@@ -231,8 +231,8 @@ def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
 
 
 def test_paths_that_differ_by_whole_turns_are_one_branch():
-    near, far = np.full((5, 1), 0.2), np.full((5, 1), 0.3 + APART)
-    paths = np.stack([near, near + 2 * np.pi, far, near + 0.5 * APART, far])
+    near, far = np.full((5, 1), 0.2), np.full((5, 1), 0.3 + BRANCH_DISTANCE)
+    paths = np.stack([near, near + 2 * np.pi, far, near + 0.5 * BRANCH_DISTANCE, far])
     chosen, weight = modes(np.append(np.log([4.0, 3.0, 1.0, 2.0]), -np.inf), paths)
     assert chosen.tolist() == [0, 2]
     np.testing.assert_allclose(weight, [0.8, 0.2])

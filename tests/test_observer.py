@@ -145,7 +145,7 @@ def acrobot():
 def test_branches_are_those_of_the_mixture(acrobot, monkeypatch):
     """As long as none is so unlikely that the observer ends it."""
     model, _, start, step, data, _ = acrobot
-    monkeypatch.setattr(observing, "LEAST", 1e-300)
+    monkeypatch.setattr(observing, "BRANCH_END", 1e-300)
     monkeypatch.setattr(observing, "TWIN", 0.0)
     start, step = functions(model, (0, 1), restart_prior(model), 8, CUBATURE)
     states = _replay(start, step, data)

@@ -9,10 +9,10 @@ import pytest
 from nnap_em.diagnosis.keys import words
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
-from nnap_em.report.page import MOST, Picture, page, write_page
+from nnap_em.report.page import MOST_PICTURES, Picture, page, write_page
 from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, reached
-from nnap_em.residual.statistics import LEVEL
+from nnap_em.residual.statistics import FAILS
 
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
 SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'
@@ -46,7 +46,7 @@ WHOLE = {
     "friction_change": "Friction was bent.",
     "tests": {
         "before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}],
-        "after": [TEST | {"p_value": LEVEL}],
+        "after": [TEST | {"p_value": FAILS}],
     },
     "parameters": {
         "before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
@@ -130,7 +130,7 @@ def test_pictures_of_one_title_are_chosen_from_and_every_picture_is_enlarged_wit
     assert len({name for name, *_ in radios}) == 1 and all(own == of for _, own, _, of, _ in radios)
     assert [bool(checked) for _, _, checked, _, _ in radios] == [True, False, False]
     assert len(re.findall(r'<input type="checkbox"', html)) == 4
-    for place in range(1, MOST + 1):  # a picture that no rule shows would never be seen
+    for place in range(1, MOST_PICTURES + 1):  # a picture that no rule shows would never be seen
         assert f".choose>input:nth-of-type({place}):checked~div:nth-of-type({place})" in html
     assert html.count("<figure") == 2
 

@@ -23,7 +23,7 @@ from nnap_em.export.c99 import torques, write_c
 from nnap_em.export.draws import write_draws
 from nnap_em.export.mjcf import beside, write_mjcf
 from nnap_em.export.model import ExportError
-from nnap_em.export.placement import PLACES, REASONS
+from nnap_em.export.placement import NO_PLACE, PLACES
 from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.machines.mjcf import MachineError, read_machine
@@ -179,7 +179,7 @@ def test_a_force_of_time_and_sensors_of_the_module_are_those_of_the_library(tmp_
 
 def test_every_law_of_a_mechanism_has_a_home_or_a_reason():
     laws = {name for name, kind in catalogue.items() if not kind.__module__.endswith(".equations")}
-    assert set(PLACES) | set(REASONS) == laws and not set(PLACES) & set(REASONS)
+    assert set(PLACES) | set(NO_PLACE) == laws and not set(PLACES) & set(NO_PLACE)
 
 
 def test_a_law_without_a_home_is_refused_where_the_file_stands_alone(tmp_path):

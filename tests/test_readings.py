@@ -7,8 +7,8 @@ import pytest
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build
-from nnap_em.em.mstep import COARSE, RELEASES
-from nnap_em.em.readings import BEFORE, RESTS, at_rest, onset, reading_noise, resolution
+from nnap_em.em.mstep import RELEASES, RESTING_OFFSET
+from nnap_em.em.readings import RESTS, ROWS_BEFORE, at_rest, onset, reading_noise, resolution
 
 T = 0.01 * np.arange(600)
 
@@ -60,7 +60,7 @@ def test_a_horizon_begins_shortly_before_the_first_motion_of_any_sensor():
     y = np.stack([_motion(3.0), 0.0 * _motion(0.0)], axis=-1)
     y += 1e-4 * np.random.default_rng(0).standard_normal(y.shape)
     moving, still = onset(y), onset(y[..., 1:])
-    assert np.all(np.abs(moving - (300 - BEFORE)) <= 6)  # five rows ahead, and the first millimetres
+    assert np.all(np.abs(moving - (300 - ROWS_BEFORE)) <= 6)  # five rows ahead, and the first millimetres
     assert np.all(still == 0) and np.all(onset(_motion(0.0)[..., None]) == 0)
 
 
@@ -76,6 +76,6 @@ def test_a_fit_of_logs_that_rest_begins_coarse_and_one_of_logs_that_move_does_no
     moving, resting = rules
     assert moving.stages() == (moving,) and np.all(np.isinf(moving.reach))
     widths = [float(rule.departure) for rule in resting.stages()]
-    np.testing.assert_allclose(widths[:-1], COARSE * np.asarray(RELEASES))
+    np.testing.assert_allclose(widths[:-1], RESTING_OFFSET * np.asarray(RELEASES))
     assert np.isinf(widths[-1]) and 0 < float(resting.reach[0]) < 1.0  # a tenth of the drive, 1 N
     assert moving.reach.shape == resting.reach.shape == (1,)

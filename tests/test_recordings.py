@@ -97,7 +97,7 @@ def test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder(tm
     path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(0.01 * np.arange(200)), messages)})
     wanted = ("position[a]", "position[b]", "velocity[b]", "position[1]", "header.stamp.sec")
     fast = _read(path, js=wanted)["/js"].values
-    monkeypatch.setattr(codecs, "FORMS", 0)
+    monkeypatch.setattr(codecs, "MESSAGE_FORMS", 0)
     slow = _read(path, js=wanted)["/js"].values
     for name in wanted:
         np.testing.assert_array_equal(fast[name], slow[name])

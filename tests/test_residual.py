@@ -18,7 +18,7 @@ from nnap_em.fit.identify import begin
 from nnap_em.model.state_space import with_effects
 from nnap_em.residual.innovations import tests as run_tests
 from nnap_em.residual.residual import Names, Residual, names_of, residual
-from nnap_em.residual.statistics import LEVEL, bias, dependence, holm, normality, spread, whiteness
+from nnap_em.residual.statistics import FAILS, bias, dependence, holm, normality, spread, whiteness
 from nnap_em.smoother.particle import ParticleSmoother
 
 DT = 0.01
@@ -96,7 +96,7 @@ def test_unrelated_cause_fails_at_most_as_often_as_stated():
 
 
 def test_all_tests_together_seldom_accuse_a_right_model():
-    accused = [any(t.p_value < LEVEL for t in run_tests(_residual(seed), NAMES)) for seed in range(40)]
+    accused = [any(t.p_value < FAILS for t in run_tests(_residual(seed), NAMES)) for seed in range(40)]
     assert np.mean(accused) < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 40)
 
 
@@ -136,9 +136,9 @@ def test_a_dependence_is_found_and_placed():
     e[:, 1:, 1] += 0.5 * whole.u[:, :-1, 0]
     results = run_tests(whole._replace(innovation=e), NAMES)
     by = {(t.channel, t.name): t for t in results}
-    assert by["theta1", "correlation with cos(theta1)"].p_value < LEVEL
-    assert by["dx", "correlation with u"].p_value < LEVEL
-    assert by["dx", "correlation with cos(theta1)"].p_value > LEVEL
+    assert by["theta1", "correlation with cos(theta1)"].p_value < FAILS
+    assert by["dx", "correlation with u"].p_value < FAILS
+    assert by["dx", "correlation with cos(theta1)"].p_value > FAILS
     assert "no link" in by["dx", "correlation with cos(theta1)"].meaning
     assert 0.1 < by["dx", "correlation with u"].size < 0.6
     assert not by["dx", "correlation with u"].slight
@@ -149,7 +149,7 @@ def test_a_slight_but_certain_misfit_is_called_so():
     e = whole.innovation.copy()
     e[..., 0] *= 1.07
     test = next(t for t in run_tests(whole._replace(innovation=e), NAMES) if t[:2] == ("spread", "theta1"))
-    assert test.p_value < LEVEL and test.slight and "small" in test.meaning
+    assert test.p_value < FAILS and test.slight and "small" in test.meaning
 
 
 def test_lost_sequences_take_no_part():
@@ -158,7 +158,7 @@ def test_lost_sequences_take_no_part():
     broken[0] = 1e3
     used = np.arange(10) > 0
     results = run_tests(whole._replace(innovation=broken, used=used), NAMES)
-    assert all(t.p_value > LEVEL for t in results)
+    assert all(t.p_value > FAILS for t in results)
     assert run_tests(whole._replace(used=np.zeros(10, bool)), NAMES) == []
 
 

@@ -11,7 +11,7 @@ from helpers import slide
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis import rounds, trial
-from nnap_em.diagnosis.context import EFFORT, SearchContext
+from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext
 from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.diagnosis.keys import contains, elsewhere, key_of
 from nnap_em.diagnosis.losses import MultiStep, OneStep
@@ -76,7 +76,7 @@ def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MU
     monkeypatch.setattr(rounds, "with_candidate", refit)
     fit = SmoothedFit(BARE, hypothesis, None, DATA, np.ones(6, bool), 9)
     before = SimpleNamespace(rig=RIG)
-    context = SearchContext(before, {}, DATA, loss, EFFORT._replace(shortlist=shortlist), lambda text: None)
+    context = SearchContext(before, {}, DATA, loss, SEARCH_EFFORT._replace(shortlist=shortlist), lambda text: None)
     return screening_round(fit, context), tried
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.numerics.gaussian import WIDE, Gaussian
-from nnap_em.numerics.rows import BLOCK, rows
+from nnap_em.numerics.gaussian import MOST_UNROLLED, Gaussian
+from nnap_em.numerics.rows import ROWS_AT_ONCE, rows
 
 
 def _path(mean):
@@ -21,8 +21,8 @@ def _all(function, *trees):
     return jax.vmap(function)(*trees)
 
 
-@pytest.mark.parametrize("states", [3, WIDE + 1])
-@pytest.mark.parametrize("length", [1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5])
+@pytest.mark.parametrize("states", [3, MOST_UNROLLED + 1])
+@pytest.mark.parametrize("length", [1, ROWS_AT_ONCE - 1, ROWS_AT_ONCE, ROWS_AT_ONCE + 1, 3 * ROWS_AT_ONCE + 5])
 def test_rows_in_blocks_are_the_rows_all_at_once(length, states):
     rng = np.random.default_rng(length)
     x, scale = jnp.asarray(rng.normal(size=(length, states))), jnp.asarray(rng.normal(size=length))
@@ -30,7 +30,7 @@ def test_rows_in_blocks_are_the_rows_all_at_once(length, states):
     jax.tree.map(same, rows(_one, _path(x), scale), _all(_one, _path(x), scale))
 
 
-@pytest.mark.parametrize(("states", "loops"), [(WIDE, 1), (WIDE + 1, 0)])
+@pytest.mark.parametrize(("states", "loops"), [(MOST_UNROLLED, 1), (MOST_UNROLLED + 1, 0)])
 def test_only_few_states_are_cut_in_blocks(states, loops):
     """Programs of many states in blocks take gigabytes to compile."""
     x, scale = jnp.ones((70, states)), jnp.ones(70)

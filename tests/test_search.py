@@ -15,7 +15,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis import backward, search
 from nnap_em.diagnosis import context as context_of
-from nnap_em.diagnosis.context import EFFORT, SearchContext, ahead
+from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, ahead
 from nnap_em.diagnosis.hypothesis import Found, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
@@ -184,7 +184,9 @@ def _emstate(model, top: float) -> EMState:
 
 def _context(loss=MULTI, stages=None) -> SearchContext:
     before = Identified(RIG, _emstate(MODEL, 0.0), RULE, StartBank((1, 1), (0,)), None)
-    return SearchContext(before, stages or {9: (before.state, np.ones(6, bool))}, DATA, loss, EFFORT, lambda text: None)
+    return SearchContext(
+        before, stages or {9: (before.state, np.ones(6, bool))}, DATA, loss, SEARCH_EFFORT, lambda text: None
+    )
 
 
 @pytest.mark.parametrize(("worse", "loss", "kept"), [(0.9, MULTI, 7.0), (1.1, MULTI, 0.0), (1.1, OneStep(), 7.0)])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.em.build import FEW, MOST, MOVED, build, measure_scales, read_at_start
+from nnap_em.em.build import ALL_STARTS, MOVED, RATE_STARTS, build, measure_scales, read_at_start
 from nnap_em.em.loop import e_step
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.smoother.gaussian import CubatureSmoother
@@ -54,7 +54,7 @@ def test_hypotheses_of_a_machine_whose_sensors_are_all_late_are_bounded():
     """Without rates two angles have 13 x 13; with no limit they would have 25 times as many."""
     _, rig, _, data = _case("acrobot", LATE, (0, 1))
     counts = _counts(rig, data)
-    assert np.prod(counts) <= MOST and np.prod(counts[2:]) <= FEW and counts[:2].tolist() == [13, 13]
+    assert np.prod(counts) <= ALL_STARTS and np.prod(counts[2:]) <= RATE_STARTS and counts[:2].tolist() == [13, 13]
 
 
 def test_a_double_pendulum_is_followed_from_before_its_first_reading():

@@ -140,7 +140,7 @@ Uses the readings up to the given time after a sequence's first row, and all inp
 time, all states, and their standard deviations without measurement noise.  The file of --mcap gets the topics /log and
 /predicted, for Foxglove and other viewers.
 """
-_SMOOTH = """\
+_SMOOTH_EXAMPLES = """\
 examples:
   nnap-em smooth fit bench/test --out smoothed
   nnap-em smooth fit bench/test --out smoothed --mcap smoothed.mcap
@@ -222,7 +222,7 @@ def parser() -> argparse.ArgumentParser:
     )
     importing.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
     importing.add_argument(
-        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (.2)"
+        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (0.2)"
     )
     importing.add_argument(
         "--shift",
@@ -287,7 +287,7 @@ def parser() -> argparse.ArgumentParser:
     )
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
-    smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH)
+    smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH_EXAMPLES)
     for use in (predict, smooth):
         use.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
         use.add_argument("folder", metavar="FOLDER", type=Path, help="the logs, such as bench/test")

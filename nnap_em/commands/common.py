@@ -53,7 +53,7 @@ UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
 TRACED = "traced"
 """Folder of the programs before they were compiled, in that of the compiled ones."""
-MOST = 64
+MOST_DEVICES = 64
 """Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("start", "smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
@@ -65,7 +65,7 @@ def set_up() -> None:
     if not jax.distributed.is_initialized():  # or they are dealt out
         if "JAX_NUM_CPU_DEVICES" not in os.environ:
             with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
-                jax.config.update("jax_num_cpu_devices", min(MOST, cores()))
+                jax.config.update("jax_num_cpu_devices", min(MOST_DEVICES, cores()))
         use_every_device()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if chosen:

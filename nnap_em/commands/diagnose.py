@@ -8,12 +8,12 @@ import jax
 
 from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
-from ..fit.store import AFTER, fingerprint, save
+from ..fit.store import AFTER_FILE, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
 from .common import go_on, origin, read_bench, resumable, warn_of_torques
 
-SHARE = 0.8
+SEARCH_SHARE = 0.8
 """Share of the minutes given after which the search begins no new step.
 
 The fit of the last law over the whole length and the page come after it: 17 of 105 s on a real double pendulum.
@@ -23,11 +23,11 @@ The fit of the last law over the whole length and the page come after it: 17 of 
 def run(args: argparse.Namespace, log: Log) -> None:
     """Find it, and report; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
-    seconds = SHARE * 60.0 * args.minutes if args.minutes else math.inf
+    seconds = SEARCH_SHARE * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
     start, own = origin(args, bench, log)
-    if (args.out / AFTER).exists():
+    if (args.out / AFTER_FILE).exists():
         log(f"the diagnosis in {args.out} will be replaced")
     with resumable(args, bench, log) as journal:
 
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         ):  # older ones are not of the models that are written now
             (args.out / name).unlink(missing_ok=True)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
-        for name, fitted in (("before.npz", diagnosis.before), (AFTER, diagnosis.after)):
+        for name, fitted in (("before.npz", diagnosis.before), (AFTER_FILE, diagnosis.after)):
             save(args.out / name, fitted, fingerprint=mark, notes=notes)
         write_diagnosis(args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
     if journal.open:

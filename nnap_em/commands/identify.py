@@ -15,13 +15,13 @@ from ..data.rig import Rig
 from ..em.loop import EMState
 from ..fit.identify import MakeSmoother, Watch, identify
 from ..fit.known import identify_from
-from ..fit.store import MODEL, fingerprint, save
+from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
 from .common import origin, read_bench, resumable, warn_of_torques
 
-MISFIT = 3
+MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
 
 
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
-    if (args.out / MODEL).exists():
+    if (args.out / MODEL_FILE).exists():
         log(f"the fit in {args.out} will be replaced")
     data, epochs = bench.train.data, []
     fit, _ = origin(args, bench, log)
@@ -47,12 +47,12 @@ def run(args: argparse.Namespace, log: Log) -> int:
             (args.out / name).unlink(missing_ok=True)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}
-        save(args.out / MODEL, fitted, fingerprint=fingerprint(data), notes=notes)
+        save(args.out / MODEL_FILE, fitted, fingerprint=fingerprint(data), notes=notes)
         described = write_identification(
             args.out, fitted, bench.train, bench.test, epochs,
             smoother=args.smoother, seed=args.seed, began=began, log=log,
         )  # fmt: skip
-    return 0 if described else MISFIT
+    return 0 if described else MISFIT_STATUS
 
 
 def smoother(args: argparse.Namespace) -> MakeSmoother:

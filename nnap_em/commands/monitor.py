@@ -27,9 +27,9 @@ from ..report.monitored import write_monitor
 from ..storage.log import Log
 from .common import logs_of, require_joints
 
-CHANGED = 4
+CHANGED_STATUS = 4
 """Exit status of a machine that changed."""
-LEAST = 0.5
+READINGS_LEFT = 0.5
 """Share of the readings of a column that must be left for a recording to be judged."""
 STATE = "monitor.json"
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
         accepted = findings(diagnosis)
         document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted, None)}
     write_monitor(args.out, fitted, beside, seen, document, log)
-    return CHANGED if seen.alarm is not None else 0
+    return CHANGED_STATUS if seen.alarm is not None else 0
 
 
 def _row(fitted: Identified, beside: Reference, candidates, rig: Rig, path: Path, trust: bool) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _broken(rig: Rig, logs: Logs) -> str:
     """Reason against the sensors or inputs of a recording, as `check` has it; empty where there is none."""
     y, read = np.asarray(logs.data.y)[0], np.asarray(logs.as_read.y)[0]
     for name, used, all_ in zip(rig.measured, y.T, read.T, strict=True):
-        if np.isfinite(used).sum() < LEAST * np.isfinite(all_).sum():
+        if np.isfinite(used).sum() < READINGS_LEFT * np.isfinite(all_).sum():
             kinds = ", ".join(dict.fromkeys(m.kind for m in logs.masked if m.column == name))
             return f"most readings of {name} are not used: {kinds}"
     system = build_system(rig)

@@ -18,7 +18,7 @@ from ..diagnosis.keys import Key, key_of, listed, words
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
-from ..model.law import CALLED, UNITS, fit_law
+from ..model.law import CALLED, LAW_UNITS, fit_law
 from ..numerics.digits import counted
 from ..residual.statistics import holm
 from .pooling import JointTest, Pooled, joint_test, pool
@@ -39,7 +39,7 @@ SEVERAL = 2
 the supply bends every curve."""
 SEEN, GONE = 5.0, 2.0
 """Standard deviations from 0 of a viscous number in one fit, and in the other, from which on it cannot have gone so."""
-NODES = 41
+COMPARED_VELOCITIES = 41
 """Velocities of a friction curve: as many as the M-step has."""
 PERIODIC = ("phase",)
 """Parameters of effects that are the same after a whole turn [rad]."""
@@ -358,7 +358,7 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
     ranges = np.stack([fits[i].velocity for i in places])
     low, high = ranges[:, :, 0].max(axis=0), ranges[:, :, 1].min(axis=0)
     common = low < high
-    nodes = nodes_between(np.where(common, low, -1.0), np.where(common, high, 1.0), NODES)
+    nodes = nodes_between(np.where(common, low, -1.0), np.where(common, high, 1.0), COMPARED_VELOCITIES)
     tables = [friction_table(fits[i].fitted, jnp.asarray(nodes)) for i in places]
     for j in np.flatnonzero(common):
         torque, cov = (
@@ -378,7 +378,7 @@ def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) 
     value[list(places)], std[list(places)] = law_fit.value, law_fit.std
     rows = [
         number(name, unit, value[:, i], std[:, i])
-        for i, (name, unit) in enumerate(zip(CALLED, UNITS[angle], strict=True))
+        for i, (name, unit) in enumerate(zip(CALLED, LAW_UNITS[angle], strict=True))
     ]
     tests = corrected_tests([row.test for row in rows if row.test is not None])
     return tuple(row._replace(test=test) for row, test in zip(rows, tests, strict=True))

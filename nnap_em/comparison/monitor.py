@@ -22,18 +22,18 @@ from ..effects.position import TorqueOffset
 from ..em.build import build_system, measure_scales, start_prior
 from ..fit.identify import Identified
 from ..numerics.gaussian import Gaussian
-from ..prediction_error.multistep import HORIZONS, HUBER, Grid, grid_of, huber
+from ..prediction_error.multistep import HORIZONS, HUBER_STD, Grid, grid_of, huber
 from ..prediction_error.recorded import errors_of, left_out, level, levels
 
 SHIFT = 0.5
 """Half of the shift that a chart finds soonest [standard deviations of a recording]; smaller ones take longer."""
-MOST = 3.0
+LARGEST_STEP = 3.0
 """Largest step of a chart [standard deviations]: one odd recording is no changed machine."""
 FALSE = 1e-3
 """False alarms a recording where nothing changes, of all charts together."""
 MEMORY = 0.9
 """Weight of what is known of a number after one more recording: a band is that of the last ten or so."""
-ROWS = 64
+ROW_MULTIPLE = 64
 """Recordings are padded to a multiple of so many rows, so that they share their programs."""
 
 
@@ -94,7 +94,7 @@ def _estimate(linearised: Linearised, i: int, candidates: Sequence[Candidate], s
     keep, sizes = linearised.weight[i] > 0, np.array([_probe(candidate) for candidate in candidates])
     columns = linearised.columns[i][..., -len(candidates) :][keep].astype(float) / sizes[:, 0]
     error, size = linearised.error[i][keep], np.broadcast_to(scale.ravel(), keep.shape)[keep]
-    weight = np.minimum(1.0, HUBER * size / np.abs(error).clip(1e-300)) / size**2 / linearised.overlap
+    weight = np.minimum(1.0, HUBER_STD * size / np.abs(error).clip(1e-300)) / size**2 / linearised.overlap
     information = columns.T @ (weight[:, None] * columns) + np.diag(sizes[:, 1] ** -2.0)
     cov = np.linalg.inv(information)
     return cov @ (columns.T @ (weight * error)), cov
@@ -111,7 +111,7 @@ def judge(fitted: Identified, reference: Reference, candidates: Sequence[Candida
     grid = grid_of(fitted.rig.dt, int(np.sum(data.valid)), HORIZONS, fitted.model.pace)
     if grid.ages != reference.grid.ages:
         return f"too short to be compared: {3 * reference.grid.ages[-1] * fitted.rig.dt:.3g} s are needed"
-    rows = ROWS * math.ceil(max(reference.rows, data.t.shape[1]) / ROWS)
+    rows = ROW_MULTIPLE * math.ceil(max(reference.rows, data.t.shape[1]) / ROW_MULTIPLE)
     fills = ("edge", 0.0, np.nan, False)
     data = Dataset(*(_longer(np.asarray(part), rows, fill) for part, fill in zip(data, fills, strict=True)))
     fit = along(_starting(fitted, data), data, fitted.smoother)
@@ -163,7 +163,7 @@ def standardised(own: Float[np.ndarray, " own"], values: Float[np.ndarray, " new
             out.append(np.nan)
             continue
         far = (value - np.mean(before)) / (np.std(before, ddof=1) * math.sqrt(1 + 1 / n) + 1e-300)
-        out.append(float(np.clip(scipy.stats.norm.isf(scipy.stats.t.sf(far, n - 1)), -MOST, MOST)))
+        out.append(float(np.clip(scipy.stats.norm.isf(scipy.stats.t.sf(far, n - 1)), -LARGEST_STEP, LARGEST_STEP)))
         before.append(value)
     return np.asarray(out)
 

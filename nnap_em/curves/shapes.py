@@ -15,7 +15,7 @@ EXPLAINS = 0.85
 """Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square."""
 FLOOR = 0.05
 """Smallest difference that counts, in rms of the curve: curves bend with all else that the model lacks."""
-KNOWN = 0.5
+KNOWN_STD = 0.5
 """Largest standard deviation, in rms of the curve, at which the curve counts as known."""
 INDISTINGUISHABLE = 2.0
 """Largest difference in the Schwarz criterion that is no evidence, so the simpler shape wins [Kass & Raftery 1995]."""
@@ -99,7 +99,7 @@ def _known(curve: Curve) -> np.ndarray | None:
     weight = 1 / np.maximum(curve.std, 1e-3 * np.ptp(curve.mean) + 1e-300) ** 2
     level = np.average(curve.mean, weights=weight)
     rms = np.sqrt(np.average((curve.mean - level) ** 2, weights=weight))
-    known = curve.std < KNOWN * rms
+    known = curve.std < KNOWN_STD * rms
     return known if rms > 0 and known.mean() > 0.25 else None
 
 

@@ -16,13 +16,13 @@ from .spikes import noise
 
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
-_SIDE = 10  # rows before and after a run that show its motion: fewer vanish in noise, more are no parabola
-_AHEAD = 3  # rows that a parabola through `_SIDE` rows is trusted beyond its end
+_PARABOLA_ROWS = 10  # rows before and after a run that show its motion: fewer vanish in noise, more are no parabola
+_AHEAD = 3  # rows that a parabola through `_PARABOLA_ROWS` rows is trusted beyond its end
 _SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
 _MORE = 4.0  # times a usual step, or a usual disagreement of two columns, that one must be to contradict a sensor
 _DELAY = 5  # rows by which a filtered rate may be late
-_SHORT = 0.002  # runs of two to four rows, per row, above which a column is coarse
-_SAME = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
+_SHORT_RUNS = 0.002  # runs of two to four rows, per row, above which a column is coarse
+_NEAR_NEIGHBOUR = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
 _REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise 0.2 % of the runs have as many
 _USUAL = 95  # percentile of the steps of a column
 
@@ -51,7 +51,7 @@ def constant_readings(
         return
     others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
     usual = float(np.median(np.repeat(others, others)))
-    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= _SHORT * y.size
+    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= _SHORT_RUNS * y.size
     both = [_disagreement(name, columns, dt) for columns in (readings, as_read)]
     apart = [each for each in both if each is not None]
     full = np.zeros(y.size, bool)
@@ -181,7 +181,7 @@ def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
     A joint that rests on both sides slips, and a filtered rate returns.
     """
     step = np.abs(np.diff(y[np.isfinite(y)]))
-    before, after = (side[np.isfinite(side)][: _SIDE + 1] for side in (y[: run.first + 1][::-1], y[run.end :]))
+    before, after = (side[np.isfinite(side)][: _PARABOLA_ROWS + 1] for side in (y[: run.first + 1][::-1], y[run.end :]))
     near = np.abs(np.concatenate([np.diff(before), np.diff(after)]))
     if not after.size or near.size < STILL or np.median(near) == 0:
         return False
@@ -196,9 +196,9 @@ def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
     """
     usual = noise(y)
     around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
-    if usual < 3 * quantum(y) or np.sum(around < _SAME * usual) >= _REPEATS:
+    if usual < 3 * quantum(y) or np.sum(around < _NEAR_NEIGHBOUR * usual) >= _REPEATS:
         return False
-    sides = [part[np.isfinite(part)][:_SIDE] for part in (y[: run.first][::-1], y[run.end :])]
+    sides = [part[np.isfinite(part)][:_PARABOLA_ROWS] for part in (y[: run.first][::-1], y[run.end :])]
     sides = [side for side in sides if side.size >= 8]
     bend, turn = (np.array([np.std(np.diff(side, n)) for side in sides]) for n in (2, 3))
     return len(sides) > 0 and bool(np.all((bend > usual / 3) & (turn > bend)))
@@ -206,7 +206,7 @@ def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
 
 def _steps(side: Float[np.ndarray, " row"]) -> Float[np.ndarray, " step"]:
     """Sizes of the first steps of a side."""
-    return np.abs(np.diff(side[np.isfinite(side)][: _SIDE + 1]))
+    return np.abs(np.diff(side[np.isfinite(side)][: _PARABOLA_ROWS + 1]))
 
 
 def quantum(y: Float[np.ndarray, " time"]) -> float:
@@ -229,7 +229,7 @@ def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apa
 
     A rate decides against the motion of its coordinate: a machine at a stop comes and goes as fast.
     """
-    before, after = y[max(run.first - _SIDE, 0) : run.first], y[run.end : run.end + _SIDE]
+    before, after = y[max(run.first - _PARABOLA_ROWS, 0) : run.first], y[run.end : run.end + _PARABOLA_ROWS]
     if np.isfinite(before).sum() < 5 or np.isfinite(after).sum() < 5:
         return False
     if apart:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .spikes import LONGEST, noise
+from .spikes import LONGEST_SPIKE, noise
 
 _JUMP = 0.4  # share of the range of the readings: sign and magnitude jump by half of theirs
-_WHOLE = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
+_FULL_JUMP = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
 _SMOOTH = 0.2  # of the size: steps that deviate by less from those around, once unwrapped
 _FEW = 0.01  # share of the steps that may deviate by more: impacts, spikes
 _SPANS = (5, 20, 80)  # readings on either side of a jump that show the motion: slow ones need many
@@ -23,7 +23,7 @@ _MOST = 0.5  # share of the jumps that must look so: about the others the motion
 _LEVELS = 32  # steps of the sensor that a counter has at least: an encoder at rest may go to and fro between two
 _TURNS = (2 * math.pi, 360.0)
 _TURN = 0.15  # of a turn, by which a jump may miss it where the readings have left its range
-_PARTS = 400  # of a turn, one of which a counter behind a gear may cover
+_TURN_PARTS = 400  # of a turn, one of which a counter behind a gear may cover
 _FIT = 4  # readings on either side of a jump through which a cubic is laid to measure its size
 
 
@@ -86,7 +86,7 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
     """A counter that goes on at the other end of its range."""
     miss = np.abs(_miss(x, t))
     size = float(np.median(miss[jumps])) if (jumps := miss > _JUMP * reach).any() else 0.0
-    if size < _WHOLE * reach:
+    if size < _FULL_JUMP * reach:
         return None
     size = max(size, reach)
     size = _measured(x, t, _turns(x, t, size), size)
@@ -97,7 +97,7 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
     if rate and (np.mean(_near_zero(x, z, at)) < _MOST or np.ptp(z) > size or not _sure(at.size, size, x)):
         return None
     up, least = np.diff(turns)[at - 1], _MOVES * noise(z)
-    back = (np.diff(at) <= LONGEST) & (up[1:] == -up[:-1])  # of a spike, or where the motion turns round
+    back = (np.diff(at) <= LONGEST_SPIKE) & (up[1:] == -up[:-1])  # of a spike, or where the motion turns round
     alone = ~(np.append(back, False) | np.append(False, back))
     ways = [[np.sign(up) * way > least for way in _travel(z, at, span)] for span in _SPANS]
     runs_on = alone.any() and any(np.mean((before & after)[alone]) >= _MOST for before, after in ways)
@@ -182,7 +182,7 @@ def _measured(
 ) -> float:
     """Size of the jumps, by a cubic and jumps through the readings around each: the median."""
     sizes = []
-    for i in (np.flatnonzero(np.diff(turns)) + 1)[:_PARTS]:
+    for i in (np.flatnonzero(np.diff(turns)) + 1)[:_TURN_PARTS]:
         rows = slice(max(i - _FIT, 0), i + _FIT)
         base = np.vander((t[rows] - t[i]) / (t[rows][-1] - t[rows][0]), 4)
         sizes.append(-np.linalg.lstsq(np.column_stack([base, turns[rows]]), x[rows], rcond=None)[0][-1])
@@ -194,7 +194,7 @@ def _measured(
 def _simplest(size: float, error: float, x: Float[np.ndarray, " seen"]) -> float:
     """The power of two of the sensor's steps, the part of a turn or the number of steps within the error of a size."""
     step = _quantum(x)
-    parts = [turn / max(min(round(turn / size), _PARTS), 1) for turn in _TURNS]
+    parts = [turn / max(min(round(turn / size), _TURN_PARTS), 1) for turn in _TURNS]
     for exact in (step * 2.0 ** round(math.log2(size / step)), *parts, step * round(size / step)):
         if abs(exact - size) <= error:
             return exact

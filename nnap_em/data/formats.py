@@ -21,8 +21,8 @@ from .mat_structs import mat_columns
 from .rig import nearest
 from .units import is_time
 
-LARGEST = 256 * 2**20  # bytes of the file of one sequence: some million rows
-BLOCK = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
+LARGEST_FILE = 256 * 2**20  # bytes of the file of one sequence: some million rows
+TEXT_BYTES = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
 Table = Float[np.ndarray, "time column"]
 
 
@@ -257,8 +257,8 @@ def check_size(path: Path) -> None:
         size = path.stat().st_size
     except OSError as error:
         raise _unreadable(path, error) from None
-    if size > LARGEST:
-        hint = f"cut it into sequences of some seconds, at most {LARGEST // 2**20} MB a file"
+    if size > LARGEST_FILE:
+        hint = f"cut it into sequences of some seconds, at most {LARGEST_FILE // 2**20} MB a file"
         raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {hint}")
 
 
@@ -299,7 +299,7 @@ def _first_line(path: Path) -> str:
 def _ends(path: Path) -> tuple[str, str]:
     """The first and the last line of a text file."""
     with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - BLOCK, 0))
+        file.seek(max(path.stat().st_size - TEXT_BYTES, 0))
         return _first_line(path), file.read().decode(errors="replace").strip().splitlines()[-1]
 
 
@@ -332,7 +332,7 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
     count, lines = 0, []
     with _opened(path) as file:
         file.readline()
-        while block := file.readlines(BLOCK):
+        while block := file.readlines(TEXT_BYTES):
             lines += block
             blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
             lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]

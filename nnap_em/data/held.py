@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from .constant import runs
 
-HELD = 1.5
+HELD_ROWS = 1.5
 """Mean rows of a reading from which on the repeats are taken as missing: below, most rows hold one of their own."""
 _QUANTA = 3.5  # steps of the sensor: a reading that has moved on by more would have changed every row
 _CHANGES = 8  # of a moving signal, from which on the rows between them show a hold
@@ -32,7 +32,7 @@ def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
     typical = float(np.median(rows))
     usual = np.abs(rows - typical) <= max(_JITTER * typical, 1.0)
     mean = float(np.mean(rows[usual]))
-    return mean if typical > 1 and np.mean(usual) >= _REGULAR and mean >= HELD else 1.0
+    return mean if typical > 1 and np.mean(usual) >= _REGULAR and mean >= HELD_ROWS else 1.0
 
 
 def repeats(y: Float[np.ndarray, " time"], rows: float) -> Int[np.ndarray, " row"]:

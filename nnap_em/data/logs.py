@@ -26,9 +26,9 @@ TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 0.25  # share of the rows of a file that may be lost in gaps
 INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
-HELD, RANGE = "held", "range"
+REPEAT, RANGE = "held", "range"
 _REASONS = {
-    HELD: "equal to the one before, until the sensor takes its next",
+    REPEAT: "equal to the one before, until the sensor takes its next",
     RANGE: "at the end of the declared range of the sensor",
     "spike": "far from what the readings before and after say",
     "stuck": "one value over again while the machine moves",
@@ -231,7 +231,7 @@ def _once(source: _Table, held: Mapping[str, float], rig: Rig) -> _Table:
         column = table[:, 1 + len(rig.logged_inputs) + rig.measured.index(name)]
         if (again := held_rows(column, rows)).size:
             column[again] = np.nan
-            masked.append(_masked(source, HELD, name, again))
+            masked.append(_masked(source, REPEAT, name, again))
     return source._replace(table=table, masked=masked)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 SPIKE = 6.0  # standard deviations of a reading from the value of its neighbours
-LONGEST = 3  # rows of a spike
+LONGEST_SPIKE = 3  # rows of a spike
 MOVING = 0.1  # share of the rows of a column that show its noise by themselves: 1 % of spikes spoils 5 % of them
 _SIDE, _NEAR = 5, 3  # rows on either side of a spike that are compared, and where the signal is too quick for these
 _MARGIN = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
@@ -91,7 +91,7 @@ def _candidates(y: Float[np.ndarray, " time"], sigma: float) -> Iterator[Int[np.
     k = np.flatnonzero(np.isfinite(y))
     if k.size > 4 * _SIDE:
         yield from k[[0, 1, -2, -1], None]
-    for length in range(1, LONGEST + 1):
+    for length in range(1, LONGEST_SPIKE + 1):
         left = _left(k, y, length)
         far = (np.abs(left.miss) > 0.9 * SPIKE * sigma * left.factor).all(axis=1)
         yield from left.rows[far]

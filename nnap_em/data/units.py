@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-_UNITS = {  # of parameters and states, by their names
+_UNIT_OF = {  # of parameters and states, by their names
     r"g": "m/s^2", r"gr": "-", r"x": "m", r"dx": "m/s", r"theta\w*": "rad", r"dtheta\w*": "rad/s",
     r"mc?\d*": "kg", r"lc?\d*": "m", r"I[cr]?\d*": "kg m^2",
 }  # fmt: skip
@@ -20,7 +20,7 @@ SIZES = {  # units at the end of a name: the SI unit, and how many of it
     "nm": ("N m", 1.0), "n m": ("N m", 1.0), "n": ("N", 1.0), "m": ("m", 1.0),
     **{unit: ("s", size) for unit, size in UNITS.items()},
 }  # fmt: skip
-_TIME = re.compile(r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|zeit|zeitstempel)", re.IGNORECASE)
+_TIME_NAMES = re.compile(r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|zeit|zeitstempel)", re.IGNORECASE)
 """Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""
 _UNIT = re.compile(rf"(.+?)(?:[ _,]*[\[(]|[ _,]+)({'|'.join(SIZES)})[\])]?$", re.IGNORECASE)
 
@@ -34,12 +34,12 @@ def named_unit(name: str, *, brackets: bool = False) -> tuple[str, str]:
 def is_time(name: str) -> bool:
     """True for the name of a column of times, which may end in a unit of times."""
     word, unit = named_unit(name)
-    return bool(_TIME.fullmatch(word)) and (not unit or unit in UNITS)
+    return bool(_TIME_NAMES.fullmatch(word)) and (not unit or unit in UNITS)
 
 
 def parameter_unit(name: str) -> str:
     """The SI unit of a parameter or state that is called as in the machines here; "SI" where it is not."""
-    return next((unit for names, unit in _UNITS.items() if re.fullmatch(names, name)), "SI")
+    return next((unit for names, unit in _UNIT_OF.items() if re.fullmatch(names, name)), "SI")
 
 
 def quantities(values: Mapping[str, object], unit: Callable[[str], str] = parameter_unit) -> str:

@@ -87,7 +87,7 @@ def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
     return numbers._replace(system=base.system, map=base.unknown)
 
 
-BLOCK = 1024
+COLUMNS_AT_ONCE = 1024
 """Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm; machines of two joints
 have fewer in all."""
 BUNCH = 4
@@ -143,7 +143,7 @@ def _groups(stacks: Sequence[Stack]) -> list[list[Stack]]:
     for stack in stacks:
         last = groups[-1] if groups else []
         same = bool(last) and type(last[0].probes) is type(stack.probes)
-        if same and sum(len(other.places) for other in last) + len(stack.places) <= BLOCK:
+        if same and sum(len(other.places) for other in last) + len(stack.places) <= COLUMNS_AT_ONCE:
             last.append(stack)
         else:
             groups.append([stack])
@@ -180,6 +180,6 @@ def candidate_columns(
 
 def blocks(columns: Columns) -> Iterator[Columns]:
     """The columns in blocks of at most BLOCK, whose sizes differ by one: two programs at most."""
-    count = max(1, -(-columns.force.shape[1] // BLOCK))
+    count = max(1, -(-columns.force.shape[1] // COLUMNS_AT_ONCE))
     for parts in zip(*(np.array_split(np.asarray(a), count, axis=1) for a in columns), strict=True):
         yield Columns(*parts)

@@ -17,7 +17,7 @@ from ..em.mstep import kept
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
-from ..prediction_error.multistep import FALLS, JUDGED, errors, followed, ratio
+from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
 from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss
@@ -49,7 +49,7 @@ class Effort(NamedTuple):
     """Rows after that which still count; the fewer where the many are too much."""
 
 
-EFFORT = Effort()
+SEARCH_EFFORT = Effort()
 
 
 class SearchContext(NamedTuple):
@@ -203,7 +203,7 @@ def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState
         after = errors(followed(other.model, other.m_step.prior, other.path, context.data), JUDGED)
         left.append(ratio(before, after, both) if both.any() else 1.0)
     if min(left) <= 1:
-        near = [one for one, share in zip(fits, left, strict=True) if share <= min(left) + FALLS]
+        near = [one for one, share in zip(fits, left, strict=True) if share <= min(left) + LEAST_FALL]
         return functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, near)
     begun = later_state(hypothesis.model, hypothesis.m_step, key=state.key)
     schedule = Schedule(first=context.longest)

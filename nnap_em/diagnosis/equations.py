@@ -37,19 +37,19 @@ SHARE = MULTI_STEP.share
 """Share of the squared error on parts left out that a law must remove, over its prior odds."""
 PAIR = 0.5
 """Prior odds of a pair of laws to a single one: 120 pairs of the best sixteen laws are tried."""
-SUSPECT = 0.08
+SUSPECT_SHARE = 0.08
 """Share from which on a law is listed as a suspect."""
 FOLDS, BLOCKS = 4, 8
 """Parts that are left out in turn, each of every fourth block of the rows."""
-SHORTLIST, FREE, PARTNERS, JUDGED = 4, 2, 16, 8
+SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 16, 8
 """Laws of one, of two and of three numbers, and free functions, that are judged on parts left out; laws of which pairs
 are tried, and pairs judged."""
-MOST = 3
+MOST_LAWS = 3
 """Laws at most, or one more where the last were a pair."""
 MEASURE = "share of the squared error"
 GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
-QUICK, STEPS = 30, 30
+SCREEN_STEPS, JUDGED_STEPS = 30, 30
 """Steps of a fit in a screen, and of one that is judged."""
 
 
@@ -135,7 +135,7 @@ class Search(NamedTuple):
 
     def screened(self, hypothesis: Hypothesis, candidates: Sequence[Candidate]) -> list[Case]:
         """The hypothesis with each candidate, fitted; the best case of every law, best first."""
-        cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=QUICK)
+        cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=SCREEN_STEPS)
         best: dict[tuple[Key, ...], Case] = {}
         for case in sorted(cases, key=lambda case: case.loss):
             best.setdefault(case.keys, case)
@@ -164,7 +164,7 @@ class Search(NamedTuple):
         """Squared errors of every case on every part by the fit to the others."""
         every, out = [(case.laws, case.effects) for case in cases], [[] for _ in cases]
         for counts in folds(simulated.windows(self.before.model, self.data), len(self.data.t)) if cases else ():
-            for errors, case in zip(out, self.fit(hypothesis, every, counts=~counts, steps=STEPS), strict=True):
+            for errors, case in zip(out, self.fit(hypothesis, every, counts=~counts, steps=JUDGED_STEPS), strict=True):
                 errors.append(self.loss(case.of, counts))
         return out
 
@@ -224,7 +224,7 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
     kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     free = free_functions(before, around, data)
-    while len(hypothesis.model.effects) - declared < MOST:
+    while len(hypothesis.model.effects) - declared < MOST_LAWS:
         if time.monotonic() > until:
             complete = False
             break
@@ -284,9 +284,9 @@ def _round(
     if room > most and time.monotonic() < search.until:  # else no pair and no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        pairs = sorted(search.fit(lean, joined, steps=QUICK), key=lambda case: case.loss)
+        pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS), key=lambda case: case.loss)
         functions = search.screened(lean, [c for c in free if key_of(c.start) not in present])
-        best = [*[case for case in pairs if _sound(case)][:JUDGED], *functions[:FREE]]
+        best = [*[case for case in pairs if _sound(case)][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(lean, best, base)
         passing = [case for case in tried if _passes(case)]
     for case in tried:
@@ -296,7 +296,7 @@ def _round(
     best, alike = _chosen(passing)
     suspects = ()
     if best is None:
-        near = sorted((c for c in judged if c.share > SUSPECT and _sound(c)), key=lambda c: -c.share)
+        near = sorted((c for c in judged if c.share > SUSPECT_SHARE and _sound(c)), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, 0.0) for case in near[:4])
     accepted = best.keys[0] if best else None
     step = Step(rows, listed, refitted, accepted, len(fresh), MEASURE, suspects=suspects)

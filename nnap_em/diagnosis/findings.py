@@ -301,7 +301,7 @@ def advice(
 ) -> list[str]:
     """Sentences on the next measurement."""
     out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
-    out += [MORE] if suspects else []
+    out += [RECORD_MORE] if suspects else []
     out += [
         f"To see {with_article(suspect.law)} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm
     ]
@@ -318,7 +318,7 @@ def advice(
     return out
 
 
-MORE = "To be sure of a suspect, record as many different motions again and diagnose all together."
+RECORD_MORE = "To be sure of a suspect, record as many different motions again and diagnose all together."
 """Advice for every suspect: what three recordings of a real arm left open, eleven decided."""
 
 

@@ -10,9 +10,9 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from .verdict import REPEATS
 
-FOLDS = 5
+MOTION_PARTS = 5
 """Parts of motions, as far as there are recordings."""
-BLOCKS = 5
+TIME_PARTS = 5
 """Parts of time: what happens at one moment of every recording is no law."""
 QUARTERS = 4
 """Parts of each motion, where there are fewer than three motions."""
@@ -58,7 +58,7 @@ def fold_of(
         order[motion == different[i]] = rank
     count = different.size
     if count >= 3:
-        return np.repeat((order * min(FOLDS, count) // count)[:, None], quarter.shape[1], axis=1)
+        return np.repeat((order * min(MOTION_PARTS, count) // count)[:, None], quarter.shape[1], axis=1)
     return order[:, None] * QUARTERS + quarter
 
 
@@ -74,7 +74,7 @@ def parts(
     state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
     motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
     clock = np.asarray(data.t)[:, rows]
-    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, BLOCKS)
+    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, TIME_PARTS)
 
 
 def members(fold: Int[np.ndarray, "seq time"], counts: Bool[np.ndarray, "seq time"]) -> Bool[np.ndarray, "fold seq"]:

@@ -24,7 +24,7 @@ from ..smoother.kalman import CUBATURE, kalman_filter, rts
 from ..smoother.posterior import Posterior
 from ..storage.journal import HERE, step
 
-HELD = 3
+NOISE_HELD_PASSES = 3
 """Passes with the noise as it is."""
 
 
@@ -80,7 +80,7 @@ def refit(
 
     best, stride, base, goal = None, 1.0, core, core
     for count in range(passes):
-        rule = brief if count >= HELD else still
+        rule = brief if count >= NOISE_HELD_PASSES else still
         proposal, smoothed, loglik, hessian = program(rule, core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:

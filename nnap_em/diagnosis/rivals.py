@@ -10,7 +10,7 @@ from ..effects import AbstractEffect
 from ..fit.identify import Identified
 from ..fit.memory import extended
 from ..storage.log import silent
-from .context import EFFORT, SearchContext, smooth
+from .context import SEARCH_EFFORT, SearchContext, smooth
 from .losses import OneStep
 from .propose import proposals, seeded, surroundings
 from .refit import Refit, refit
@@ -50,7 +50,7 @@ def instead(
 
 
 def _context(fitted: Identified, data: Dataset) -> SearchContext:
-    return SearchContext(fitted, {}, jax.device_put(data), OneStep(), EFFORT, silent)
+    return SearchContext(fitted, {}, jax.device_put(data), OneStep(), SEARCH_EFFORT, silent)
 
 
 def _smoothed(fitted: Identified, data: Dataset, place: int | None) -> SmoothedFit:

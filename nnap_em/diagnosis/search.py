@@ -33,7 +33,7 @@ from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, silent
 from .backward import backward
-from .context import EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
+from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Found, Hypothesis, covariances
 from .keys import Key, key_of, remainder_of, replaced, words
@@ -233,7 +233,7 @@ def diagnose(
     data: Dataset | Logs,
     *,
     key: PRNGKeyArray,
-    effort: Effort = EFFORT,
+    effort: Effort = SEARCH_EFFORT,
     log: Log = silent,
     seconds: float = math.inf,
     start: Identified | None = None,

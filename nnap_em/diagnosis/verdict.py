@@ -59,7 +59,7 @@ FOLLOWED = 0.5
 REPEATS = 0.2
 """Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
 differ by up to 0.13, others by 0.25 and more."""
-MISSING = 0.0
+MISSING_BEFORE = 0.0
 """Share of the squared error of an earlier fit's recordings above which a law was missing there: one that came since
 adds to it what it removes now, one that was always there removes the same, and 0 lies in the middle."""
 RISEN = 0.01
@@ -191,7 +191,7 @@ def veto(
         return Rejection("undetermined", amplitude)
     if not needed(removed, required(floor, complexity)):
         return Rejection("small", removed)
-    return Rejection("before", before) if before > MISSING else None
+    return Rejection("before", before) if before > MISSING_BEFORE else None
 
 
 def needed(share: float, floor: float) -> bool:

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from ..data.rig import toml_text
 from ..data.units import is_time, named_unit
 from ..em.readings import reading_noise, resolution
-from .from_log import HEAD, Draft, meaning, numbers, sampling
+from .from_log import DRAFT_HEAD, Draft, meaning, numbers, sampling
 
-STEPS = 0.5
+EQUAL_SHARE = 0.5
 """Share of equal neighbours from which on a column is taken for an input: that of a reading changes in every row."""
 
 
@@ -45,7 +45,7 @@ def draft_equations(path: Path) -> Draft:
         "[start]    # the state in the first row, where it is known but not measured",
         *(f"# {state} = {{ mean = 0.0, std = 0.5 }}" for state in names.values()),
     ]
-    head = HEAD.replace("# SI units: s, kg, m, rad, N m.  Fill", "# Units are yours; time is in s.  Fill")
+    head = DRAFT_HEAD.replace("# SI units: s, kg, m, rad, N m.  Fill", "# Units are yours; time is in s.  Fill")
     units = [f"column {name!r}: its name ends in the unit {unit}" for name in columns if (unit := named_unit(name)[1])]
     title = toml_text(path.resolve().parent.name or "rig")
     return Draft("\n".join([head.format(name=title), *lines]) + "\n", tuple(units))
@@ -54,7 +54,7 @@ def draft_equations(path: Path) -> Draft:
 def _input(name: str, values: Float[np.ndarray, " time"]) -> bool:
     """True for a column that is called as an input, or that stands still most of the time."""
     still = float(np.mean(np.diff(values) == 0)) if len(values) > 1 else 0.0
-    return meaning(name).kind == "input" or (still > STEPS and resolution(values[None]) == 0.0)
+    return meaning(name).kind == "input" or (still > EQUAL_SHARE and resolution(values[None]) == 0.0)
 
 
 def _ranges(columns: dict[str, Float[np.ndarray, " time"]]) -> list[str]:

@@ -33,9 +33,9 @@ _PARAMETERS = {
     "Ir": "rotor inertia of the drives",
     "gr": "gear ratio of the drives",
 }
-SLOW = 0.5
+SECONDS_ROW = 0.5
 """Interval of the rows [s] above which the clock may be in ms."""
-HEAD = """\
+DRAFT_HEAD = """\
 format = 1
 name = {name}
 
@@ -97,7 +97,7 @@ def drafted(
         *measurement(table, measured, spec),
     ]
     notes = (*_notes(columns, spec), *_clock_notes(path, table, columns))
-    return Draft("\n".join([HEAD.format(name=name), *lines]) + "\n", notes)
+    return Draft("\n".join([DRAFT_HEAD.format(name=name), *lines]) + "\n", notes)
 
 
 def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
@@ -193,7 +193,7 @@ def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Ite
     steps = np.diff(t)
     dt = float(f"{np.median(steps):.6g}")
     if dt > 0 and np.max(np.abs(steps - dt)) <= 0.01 * dt:
-        yield f"dt = {dt!r}    # s" + ("; is the clock in ms?" if dt > SLOW else "")
+        yield f"dt = {dt!r}    # s" + ("; is the clock in ms?" if dt > SECONDS_ROW else "")
     else:
         between = f"{np.min(steps):.3g} to {np.max(steps):.3g} s" if time else "no time"
         yield f"# dt = ...    # s; the rows of this log are {between} apart: resample it to uniform rows"
@@ -251,5 +251,5 @@ def _clock_notes(path: Path, table: Mapping[str, np.ndarray], columns: Sequence[
     steps = np.diff(table[time.name])
     if (stands := np.flatnonzero(steps <= 0)).size:
         yield f"{place(path, time.name, int(stands[0]) + 1)}: time does not run on: remove or correct the row"
-    if not time.unit and (dt := np.median(steps)) > SLOW:
+    if not time.unit and (dt := np.median(steps)) > SECONDS_ROW:
         yield f"column {time.name!r}: rows are {dt:.6g} s apart: is the clock in ms? write s"

@@ -19,7 +19,7 @@ from ..machines.urdf import stuck
 from ..recordings.files import reader
 from ..recordings.recording import Address, Topic, places
 from ..recordings.text_file import foreign
-from .from_log import HEAD, Draft, from_one, meaning, measurement, numbers, sampling
+from .from_log import DRAFT_HEAD, Draft, from_one, meaning, measurement, numbers, sampling
 from .from_topics import COMMAND, columns_table, commands, others
 
 
@@ -50,7 +50,7 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         *measurement(table, named, spec, lambda name: machine_unit(text, name)),
         *_addresses(topics, everything),
     ]
-    return Draft("\n".join([HEAD.format(name=toml_text(model.stem)), *lines]) + "\n", ())
+    return Draft("\n".join([DRAFT_HEAD.format(name=toml_text(model.stem)), *lines]) + "\n", ())
 
 
 def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:

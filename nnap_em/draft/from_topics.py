@@ -14,7 +14,7 @@ from ..recordings.files import read, reader
 from ..recordings.recording import UNTIMED, Address, Topic, last_word, places
 from .from_log import Draft, drafted, meaning
 
-ROWS = 100_000
+EXAMINED_ROWS = 100_000
 """Rows of the log from which its interval and noise are estimated."""
 QUANTITY = re.compile(r"(position|velocity|effort)\[")
 COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
@@ -98,7 +98,7 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     origin = max(int(track.t[0]) for track in tracks.values())
     dt = min(float(f"{np.median(np.diff(track.t)) * 1e-9:.3g}") for track in tracks.values() if track.t.size > 1)
     end = min(int(track.t[-1]) for track in tracks.values())
-    at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), ROWS))
+    at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), EXAMINED_ROWS))
     if at.size < 2:
         raise DataError(f"{path}: its topics have no time in common; name others in [import.columns] by hand")
     timed = all(track.clock != UNTIMED for track in tracks.values())

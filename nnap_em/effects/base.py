@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
-CHANNEL = "unit of the channel"
+CHANNEL_UNIT = "unit of the channel"
 
 
 class Scene(NamedTuple):
@@ -224,7 +224,7 @@ class AbstractEffect(eqx.Module):
     def units_on(self, system: Any) -> dict[str, str]:
         """Units of the reported parameters on this machine and channel."""
         if self.channel in system.readable:
-            return {name: unit.replace(CHANNEL, system.unit(self.channel)) for name, unit in self.units.items()}
+            return {name: unit.replace(CHANNEL_UNIT, system.unit(self.channel)) for name, unit in self.units.items()}
         if self.joint is None:
             return self.units | self.units_free
         force, angle = system.force_unit(self.joint), system.unit(system.coordinates[self.joint - 1])

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 
 from .base import AbstractEffect, JointEffect, Scalar, known, one
 
-SIZE, SPREAD = 0.05, 0.5
+PROBED, PRIOR_STD = 0.05, 0.5
 """Torque of a probe, and standard deviation of a change, in the typical torque of the joint."""
-KNEE = 0.01
+SIGN_BEND = 0.01
 """Rate over which Coulomb friction changes its sign, in the largest rate of the joint: as `Weights` has it."""
 
 
@@ -31,7 +31,7 @@ class CoulombChange(JointEffect):
     def candidates(cls, around):
         sizes = zip(around.joints, map(float, around.torque), map(float, around.speed), strict=True)
         return [
-            one(partial(cls, knee=jnp.asarray(KNEE * speed), joint=j), 0.0, SIZE * torque, SPREAD * torque)
+            one(partial(cls, knee=jnp.asarray(SIGN_BEND * speed), joint=j), 0.0, PROBED * torque, PRIOR_STD * torque)
             for j, torque, speed in sizes
             if around.moved is not None and around.learned
         ]
@@ -58,7 +58,7 @@ class ViscousChange(JointEffect):
     def candidates(cls, around):
         slopes = zip(around.joints, map(float, around.torque / around.speed), strict=True)
         learned = around.moved is not None and around.learned
-        return [one(partial(cls, joint=j), 0.0, SIZE * slope, SPREAD * slope) for j, slope in slopes if learned]
+        return [one(partial(cls, joint=j), 0.0, PROBED * slope, PRIOR_STD * slope) for j, slope in slopes if learned]
 
     def phrase(self, sizes):
         return f"the viscous friction of joint {self.joint} by {sizes['change']}"
@@ -83,7 +83,7 @@ class NumberChange(AbstractEffect):
     @classmethod
     def candidates(cls, around):
         numbers = around.moved or ()
-        return [one(partial(cls, number=name, unit=unit), 0.0, SIZE * size, size) for name, unit, size in numbers]
+        return [one(partial(cls, number=name, unit=unit), 0.0, PROBED * size, size) for name, unit, size in numbers]
 
     def inputs_named(self):
         return (self.number,)

@@ -34,7 +34,7 @@ FORMS = (
     " of {1}",
 )
 """Words of the forms of a flow, with the names of its signals."""
-KINDS = 7
+FLOW_FORMS = 7
 """Forms of a flow."""
 
 
@@ -95,7 +95,7 @@ class PortEffect(AbstractEffect):
         first, second = (one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
         source = (-1.0 if self.leaves else 1.0) * one_of(ports, self.channel)
         target = (1.0 if self.leaves else -1.0) * one_of(ports, self.to)
-        kind = np.eye(KINDS)[self.kind]
+        kind = np.eye(FLOW_FORMS)[self.kind]
         kind, first, second, source, target = (jnp.asarray(a, float) for a in (kind, first, second, source, target))
         return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
 

@@ -17,7 +17,7 @@ from ..numerics.gaussian import Gaussian
 from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
 from .equations import build_equations
-from .mstep import COARSE, STEP, ScoringMStep
+from .mstep import RESTING_OFFSET, RESTING_STEP, ScoringMStep
 from .prior import ParameterPrior
 from .readings import RESTS, at_rest, reading_noise
 from .servos import LAG, build_servos, steps_of_sample, torque_along
@@ -198,8 +198,8 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
     y = np.asarray(data.y)
     rests = max((at_rest(y[..., i]) for i, name in enumerate(rig.measured) if name in system.coordinates), default=0.0)
-    coarse = COARSE if rests > RESTS else math.inf
-    reach = np.where(rests > RESTS, STEP * _driven(system, scales), math.inf)
+    coarse = RESTING_OFFSET if rests > RESTS else math.inf
+    reach = np.where(rests > RESTS, RESTING_STEP * _driven(system, scales), math.inf)
     mstep = ScoringMStep(
         prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, shape=model.log_q, least=least
     )
@@ -234,7 +234,7 @@ def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
 MOVED = 0.1
 """Standard deviation of an angle at the start, and its motion before its first reading, from which on one hypothesis
 is not enough [rad]."""
-FEW, MOST = 25, 325
+RATE_STARTS, ALL_STARTS = 25, 325
 """Hypotheses of the rates of joints that are read, and of all states, at most: two rows of readings determine such a
 rate as well, and n joints would have 5^n of them."""
 
@@ -257,8 +257,8 @@ def start_bank(
 ) -> StartBank:
     """Hypotheses for each state that is not `read` at the start and that the prior leaves wide.
 
-    None for the rates of joints that are measured, where they would be more than `FEW`, or all more than `MOST`; then
-    none for what is measured.
+    One for each rate of a measured joint where these would be more than `RATE_STARTS`, or all more than `ALL_STARTS`;
+    then one for every measured state.
     """
     spread = np.sqrt(np.diag(np.asarray(model.start.cov)))
     dof = len(system.coordinates)
@@ -269,12 +269,12 @@ def start_bank(
         for i, name in enumerate(states):
             wide = spread[i] * (0.2 if i >= dof else 1.0) > MOVED
             counts.append((5 if i >= dof else 13) if wide and name not in known and system.angles[i % dof] else 1)
-        if math.prod(counts[i] for i in measured) > FEW or math.prod(counts) > MOST:
+        if math.prod(counts[i] for i in measured) > RATE_STARTS or math.prod(counts) > ALL_STARTS:
             counts = [1 if i in measured else count for i, count in enumerate(counts)]
         return counts
 
     counts = hypotheses(read)
-    if math.prod(counts) > MOST:
+    if math.prod(counts) > ALL_STARTS:
         counts = hypotheses(rig.measured)
     angles = tuple(j for j, is_angle in enumerate(system.angles) if is_angle)
     unread = any(system.coordinates[j] not in rig.measured for j in angles)

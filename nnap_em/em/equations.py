@@ -22,9 +22,9 @@ from .readings import reading_noise
 PACE = 8.0
 """Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more, and
 errors are those of a free simulation."""
-SHARE = 1 / 3
+HORIZON_SHARE = 1 / 3
 """Longest such time, as a share of a recording: a prediction needs a start before it."""
-STIFF = 0.5
+EQUATION_STEP = 0.5
 """Integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8."""
 HIDDEN = 0.5
 """Standard deviation of the start of a state that nobody declares or reads, in its size where the equations rest."""
@@ -134,7 +134,7 @@ def pace_of(rig: Rig, slowest: float, rows: int) -> float:
     """The declared horizon, or some time constants, as far as the recordings are long [s]; of two digits: programs are
     shared.
     """
-    pace = rig.horizon or min(PACE * slowest, SHARE * rows * rig.dt)
+    pace = rig.horizon or min(PACE * slowest, HORIZON_SHARE * rows * rig.dt)
     return float(f"{max(pace, 8 * rig.dt):.2g}")
 
 
@@ -233,7 +233,7 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
         log_r=model.log_r,
         measured=model.measured,
         dt=rig.dt,
-        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / STIFF, 1.0)))), MOST_STEPS),
+        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / EQUATION_STEP, 1.0)))), MOST_STEPS),
         pace=pace_of(rig, seen.slowest, rows),
     )
     terms = unknown_terms(system, seen, free)

@@ -51,10 +51,10 @@ class EMState(NamedTuple):
     since: int = 0
     """Epoch from which on it is."""
     stop: str = ""
-    """Reason of the end of the last fit: `RESTED`, `REFUSED` or `SPENT`; empty before one has ended."""
+    """Reason of the end of the last fit: `RESTED`, `STEP_REFUSED` or `SPENT`; empty before one has ended."""
 
 
-RESTED, REFUSED, SPENT = "at rest", "no step raises the likelihood", "epochs spent"
+RESTED, STEP_REFUSED, SPENT = "at rest", "no step raises the likelihood", "epochs spent"
 
 
 class FitError(RuntimeError):
@@ -197,7 +197,7 @@ EPOCHS = 40
 """Epochs of a fit at most."""
 REST = 0.05
 """Change of the log-likelihood, twice running, at which EM is at rest [nat a sequence]."""
-COARSE = 0.5
+HELD_REST = 0.5
 """The same before the M-step is released: likelihoods are compared no more exactly."""
 
 
@@ -228,7 +228,7 @@ def fit(
         state = state._replace(model=model, best=model)
     while state.epoch < epochs:
         seen = schedule.horizon(state.epoch, longest)
-        ended = _ended(state, schedule, longest, tolerance if state.stage == last else COARSE)
+        ended = _ended(state, schedule, longest, tolerance if state.stage == last else HELD_REST)
         if ended and state.stage == last:
             return state._replace(stop=ended)
         if ended:
@@ -265,7 +265,7 @@ def _released(state: EMState) -> EMState:
     return _afresh(state._replace(best=best, proposal=best, stage=state.stage + 1))
 
 
-RISE = 2 * REST
+LEAST_RISE = 2 * REST
 """Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]."""
 
 
@@ -277,7 +277,7 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
     whole = [value for epoch, value in enumerate(state.loglik) if schedule.horizon(epoch, longest) == longest]
     if len(whole) < 3:
         return math.inf
-    least = RISE if math.isinf(state.ess) else max(RISE, float(np.max(-np.diff(whole))))
+    least = LEAST_RISE if math.isinf(state.ess) else max(LEAST_RISE, float(np.max(-np.diff(whole))))
     rise = float(max(whole[-2:]) - max(whole[:-2]))
     return rise if rise >= least else 0.0
 
@@ -316,5 +316,5 @@ def _ended(state: EMState, schedule: Schedule, longest: int, tolerance: float) -
     if state.epoch - state.since < 3 or schedule.horizon(state.epoch - 3, longest) < longest:
         return ""
     if state.stride < 0.2 and math.isinf(state.ess):  # a sampled likelihood may fall by chance
-        return REFUSED
+        return STEP_REFUSED
     return RESTED if np.all(np.abs(np.diff(state.loglik[-3:])) < tolerance) else ""

@@ -96,7 +96,7 @@ def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
     return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
 
 
-BLOCK = 8
+PARAMETER_MULTIPLE = 8
 """The number of parameters is padded to a multiple of this, and to one at least: one program for most models."""
 
 
@@ -157,13 +157,13 @@ def _definite(precision: Float[Array, "phi phi"]) -> Float[Array, "phi phi"]:
     return precision + 100 * jnp.finfo(precision.dtype).eps * jnp.diag(jnp.diag(precision))
 
 
-STEP = 0.1
+RESTING_STEP = 0.1
 """Standard deviation of the change of a node's torque in one M-step on logs that rest, in the torque of the drive.
 
 There only the slope of the map is determined, and a step by it alone would make friction a peak of many times its size,
 which no later step leaves. No fixed point moves.
 """
-COARSE = 0.1
+RESTING_OFFSET = 0.1
 """`ScoringMStep.coarse` of logs that rest [standard deviations of an offset of friction]."""
 RELEASES = (1.0, 10.0, 100.0)
 """Widths while the horizon grows, and then until the likelihood rests with each, in `ScoringMStep.coarse`."""
@@ -262,7 +262,7 @@ class ScoringMStep(AbstractMStep):
 
         With it the posterior precision where it began, and which of the sequences `used` could be.
         """
-        pad = BLOCK * max(1, -(-self.prior.size // BLOCK)) - self.prior.size
+        pad = PARAMETER_MULTIPLE * max(1, -(-self.prior.size // PARAMETER_MULTIPLE)) - self.prior.size
         prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
         rule = eqx.tree_at(lambda r: (r.prior, r.least), self, (prior, bounds(self.least, prior.size)))
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)

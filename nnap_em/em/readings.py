@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-REPEATS, CODE = 0.02, 0.02
+EQUAL_NEIGHBOURS, CODE = 0.02, 0.02
 """Share of equal neighbours from which on readings are counted as codes, and the quantile of the other changes that is
 the step between two codes: the smallest, but for a share of rounding."""
 MULTIPLE = 0.05
@@ -16,7 +16,7 @@ def resolution(signal: Float[np.ndarray, "seq time"]) -> float:
     """Step between the codes of a reading that repeats them; 0 where neighbours hardly ever are equal."""
     change = np.abs(np.concatenate([np.diff(y[np.isfinite(y)]) for y in signal]))
     moved = change[change > 0]
-    if not 0 < moved.size < (1 - REPEATS) * change.size:
+    if not 0 < moved.size < (1 - EQUAL_NEIGHBOURS) * change.size:
         return 0.0
     step = float(np.quantile(moved, CODE))
     return step if np.median(np.abs(moved / step - np.round(moved / step))) < MULTIPLE else 0.0
@@ -39,7 +39,7 @@ def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:
     return max(smooth, resolution(signal) / math.sqrt(12))
 
 
-OVER, MOVES, BEFORE = 5, 6.0, 30
+OVER, MOVES, ROWS_BEFORE = 5, 6.0, 30
 """Rows over which a change counts as motion, from how many standard deviations of the noise on, and the rows at rest
 before the first motion that are kept: as many as show where the machine rests."""
 RESTS = 0.35
@@ -64,6 +64,6 @@ def at_rest(signal: Float[np.ndarray, "seq time"]) -> float:
 
 
 def onset(y: Float[np.ndarray, "seq time obs"]) -> Int[np.ndarray, " seq"]:
-    """Rows of every sequence before its first motion, less `BEFORE`; 0 where it moves at once or never."""
+    """Rows of every sequence before its first motion, less `ROWS_BEFORE`; 0 where it moves at once or never."""
     moved = np.any([_moves(signal) for signal in np.moveaxis(y, -1, 0)], axis=0)
-    return np.where(moved.any(axis=1), np.maximum(moved.argmax(axis=1) - BEFORE, 0), 0)
+    return np.where(moved.any(axis=1), np.maximum(moved.argmax(axis=1) - ROWS_BEFORE, 0), 0)

@@ -10,7 +10,7 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..data.rig import Declared, Rig
 
-EXACT = 1e-4
+SCALE_ROUNDING = 1e-4
 """Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too."""
 
 
@@ -37,7 +37,7 @@ def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     while left:
         columns = np.stack([rig.parameters[names[i]].std * slopes[i] for i in left], axis=1)
         steps = np.linalg.lstsq(columns, whole, rcond=1e-9)[0]
-        if np.linalg.norm(columns @ steps - whole) > EXACT * np.linalg.norm(whole):
+        if np.linalg.norm(columns @ steps - whole) > SCALE_ROUNDING * np.linalg.norm(whole):
             break
         held.append(left.pop(int(np.argmax(np.abs(steps)))))
     return tuple(names[i] for i in held)

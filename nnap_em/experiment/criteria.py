@@ -105,7 +105,7 @@ class Parameters(AbstractCriterion):
         return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
 
 
-SURE = 9.0
+ENOUGH_DISTANCE = 9.0
 """Distance of two models [standard deviations of their log-likelihood ratio] beyond which more adds nothing.
 
 At 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md)."""
@@ -132,8 +132,8 @@ class Discrimination(AbstractCriterion):
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """Half the distance still to go."""
-        far = np.minimum(self.distance(expected), SURE)
-        return np.asarray(0.5 * np.mean(SURE - far, axis=-1) + 0.5 * np.max(SURE - far, axis=-1))
+        far = np.minimum(self.distance(expected), ENOUGH_DISTANCE)
+        return np.asarray(0.5 * np.mean(ENOUGH_DISTANCE - far, axis=-1) + 0.5 * np.max(ENOUGH_DISTANCE - far, axis=-1))
 
 
 class Several(AbstractCriterion):

@@ -19,14 +19,14 @@ from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
 from .rivals import Rivals
-from .search import EFFORT, Effort, Plan, Setup, evaluated, expected_information, search
+from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
-DRAWN = 32
+TRIAL_MODELS = 32
 """Models from the posterior by which every proposal is tried."""
 CHECKED, DRAWN_IN = 500, 200
 """Models by which the chosen ones are tried, and how many of these are drawn in a figure."""
-SLOW = 20
+SLOW_PERCENT = 20
 """Percent of the rows that are near rest."""
 NEAR_REST = 0.05
 """Share of the largest velocity: below it velocities count alike, above it the less the denser they would be."""
@@ -75,7 +75,7 @@ def design(
     rivals: Sequence[Rivals] = (),
     seconds: float = 30.0,
     sequences: int = 6,
-    effort: Effort = EFFORT,
+    effort: Effort = DESIGN_EFFORT,
     log: Log = silent,
 ) -> Design:
     """Inputs to play next, so that their logs determine best what a fit leaves open: found by a seeded search.
@@ -119,7 +119,7 @@ def design(
             f"{counted(sequences, 'sequence')} in {seconds:g} s: {counted(rows, 'row')} each; give more --seconds"
         )
     t = fitted.rig.dt * np.arange(rows + 1)
-    setup = Setup(fit, pairs, drawn_paths(fitted, DRAWN, key=key_paths), limits, t, key_noise)
+    setup = Setup(fit, pairs, drawn_paths(fitted, TRIAL_MODELS, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
     count = float(np.sum(np.asarray(data.valid)[used]))
     setup = setup._replace(share=share(fit, count * row.information))
@@ -191,7 +191,7 @@ def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, 
 
 def _slow(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, " dof"]:
     """Speeds near rest; where the machine mostly stood still, as far as the map has its first nodes."""
-    return np.maximum(np.percentile(np.abs(visited), SLOW, axis=0), np.sort(np.abs(fit.nodes), axis=1)[:, 2])
+    return np.maximum(np.percentile(np.abs(visited), SLOW_PERCENT, axis=0), np.sort(np.abs(fit.nodes), axis=1)[:, 2])
 
 
 def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:
@@ -208,7 +208,7 @@ def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.nd
     return Friction(fit, np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight)
 
 
-SHRINKS, LAST = 0.85, 12
+LIMIT_FACTOR, LAST = 0.85, 12
 """Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
 
 
@@ -222,7 +222,7 @@ def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log)
         if ok.all():
             break
         log(f"too near a limit in {CHECKED} trials: {counted(np.sum(~ok), 'sequence')} made smaller")
-        proposal.shape[~ok, :, -1] *= SHRINKS
+        proposal.shape[~ok, :, -1] *= LIMIT_FACTOR
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
     _, each = evaluated(setup, _padded(proposal, effort.batch), effort.few)

@@ -36,10 +36,10 @@ class Effort(NamedTuple):
     """Motions along which information is taken."""
 
 
-EFFORT = Effort()
+DESIGN_EFFORT = Effort()
 SHRINKS = 0.7
 """Factor on the size of a proposal that breaks a limit."""
-REACH = (0.3, 0.05)
+PROPOSAL_CHANGE = (0.3, 0.05)
 """Change of the numbers of a proposal in the first round and in the last."""
 
 
@@ -89,7 +89,7 @@ def search(
     count: int,
     *,
     rng: np.random.Generator,
-    effort: Effort = EFFORT,
+    effort: Effort = DESIGN_EFFORT,
     log: Log = silent,
 ) -> Plan:
     """The `count` sequences that answer best together.
@@ -108,7 +108,7 @@ def search(
     for number in range(effort.rounds):
         if float(criterion.cost(plan.expected.sum())) <= criterion.least:
             break
-        reach = REACH[0] * (REACH[1] / REACH[0]) ** (number / max(effort.rounds - 1, 1))
+        reach = PROPOSAL_CHANGE[0] * (PROPOSAL_CHANGE[1] / PROPOSAL_CHANGE[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(setup, criterion, plan, rng, reach, effort)
         cost = float(criterion.cost(plan.expected.sum()))
         log(

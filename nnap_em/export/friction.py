@@ -12,17 +12,17 @@ from ..fit.identify import Identified, friction_table
 from ..systems import AbstractSystem
 from ..systems.tree import KNEE, Tree
 
-SHARE = 0.1
+REPORTED_MISS = 0.1
 """Share of a learned curve beyond which the part that its form misses is reported [1]."""
 SIMPLER = 0.005
 """Least share of a learned curve that a dip or a constant must explain to be written [1]."""
-NOISE = 0.3
+EXPLAINED_PER_STD = 0.3
 """Least share that it must explain, over the standard deviation of the curve relative to the curve [1]."""
 SMOOTH = (0.0, 0.003, 0.01, 0.02, 0.04, 0.08)
 """Widths of the sign at zero velocity that are tried, as shares of the largest velocity."""
 DIPS = tuple(np.geomspace(0.01, 0.5, 12))
 """Stribeck velocities that are tried, as shares of the largest velocity."""
-NODES = 160
+CURVE_VELOCITIES = 160
 """Velocities at which a learned curve is read."""
 
 
@@ -76,7 +76,7 @@ def friction_form(
             fits[kind] = form
     fits = {kind: _finer(v, torque, weight, form, *kind) for kind, form in fits.items()}
     least = min(form.missed for form in fits.values())
-    bar = max(SIMPLER, NOISE * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
+    bar = max(SIMPLER, EXPLAINED_PER_STD * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
     order = sorted(fits, key=sum)  # fewer terms first
     return next(fits[kind] for kind in order if fits[kind].missed <= least + bar)
 
@@ -102,7 +102,7 @@ def declared_friction(system: AbstractSystem) -> list[FrictionForm]:
 def even_nodes(fitted: Identified) -> Float[np.ndarray, "dof node"]:
     """Velocities over the visited range of every joint, evenly apart; the nodes of a fit crowd about rest [rad/s]."""
     nodes = np.asarray(fitted.m_step.weights(fitted.model).nodes)
-    return np.linspace(-1.0, 1.0, NODES)[None] * np.max(np.abs(nodes), axis=1)[:, None]
+    return np.linspace(-1.0, 1.0, CURVE_VELOCITIES)[None] * np.max(np.abs(nodes), axis=1)[:, None]
 
 
 def _sign(v: Float[np.ndarray, " node"], smooth: float) -> Float[np.ndarray, " node"]:

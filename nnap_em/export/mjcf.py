@@ -19,15 +19,15 @@ from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .actuator import actuator
 from .content import Bristle, Contact, Content, Drive, JointContent, SensorContent
-from .friction import SHARE, FrictionForm, friction_forms
+from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .model import ExportError
 from .placement import file_springs, placed
 
-STEP = 5e-4
+LONGEST_STEP = 5e-4
 """Longest time step of a written file [s]."""
 SHORTEST = 5e-5
 """Shortest time step of a written file [s]."""
-STIFF = 1.5
+LARGEST_RELAXATION = 1.5
 """Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
 SOFT = 1e-4
 """Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
@@ -90,7 +90,7 @@ def write_variant(
     left = [
         f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve"
         for name, form in zip(system.coordinates, forms, strict=True)
-        if form.missed > SHARE
+        if form.missed > REPORTED_MISS
     ]
     acting = actuator(fitted, model, unplaced, motors_of(fitted, system)) if unplaced else None
     left += [
@@ -143,7 +143,7 @@ def with_dips(content: Content) -> Content:
         form = joint.form
         if joint.bristle is None and form.breakaway > form.coulomb:
             soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * content.dt)
-            stiffness = min(soft, STIFF * _level(form) / (form.fastest * STEP))
+            stiffness = min(soft, LARGEST_RELAXATION * _level(form) / (form.fastest * LONGEST_STEP))
             bristle = Bristle(stiffness, float(np.sqrt(stiffness * inertia[number - 1])))
             content = content.with_joint(number, bristle=bristle)
     return content
@@ -203,7 +203,7 @@ def _longest_step(content: Content) -> float:
         for laws in content.joints
         if laws.bristle is not None and _bristled(laws)
     ]
-    return max(min([STEP, *(STIFF / rate for rate in rates)]), SHORTEST)
+    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), SHORTEST)
 
 
 def _level(form: FrictionForm) -> float:

@@ -24,7 +24,7 @@ from . import program as portable
 from .placement import of_command
 from .unroll import Source, UnrollError, unroll
 
-PARAMETERS, PREDICTOR, STEP = "parameters.json", "predictor.py", "model.stablehlo"
+PARAMETERS_FILE, PREDICTOR_FILE, STABLEHLO_FILE = "parameters.json", "predictor.py", "model.stablehlo"
 
 
 class ExportError(ValueError):
@@ -58,12 +58,12 @@ def write_model(fitted: Identified, out: Path | str) -> str:
     except ExportError as error:
         code, reason = "", str(error)
     step = stablehlo(fitted.model)
-    write_json(out / PARAMETERS, parameters(fitted))
-    replace_bytes(out / STEP, step)
+    write_json(out / PARAMETERS_FILE, parameters(fitted))
+    replace_bytes(out / STABLEHLO_FILE, step)
     if code:
-        replace_text(out / PREDICTOR, code)
+        replace_text(out / PREDICTOR_FILE, code)
     else:
-        (out / PREDICTOR).unlink(missing_ok=True)  # of another fit
+        (out / PREDICTOR_FILE).unlink(missing_ok=True)  # of another fit
     return reason
 
 
@@ -129,7 +129,7 @@ def predictor(fitted: Identified) -> str:
     for effect in model.effects:
         if of_command(effect):
             raise ExportError(
-                f"{effect.name!r} acts on the command; use {STEP}, whose inputs are what reaches the joints"
+                f"{effect.name!r} acts on the command; use {STABLEHLO_FILE}, whose inputs are what reaches the joints"
             )
     x, u, z = jnp.zeros(len(_states(model))), jnp.zeros(_width(model)), prior.read(model)
     force = jnp.zeros(len(model.system.coordinates))
@@ -203,7 +203,7 @@ def unrolled(
     try:
         source = unroll(name, function, **arguments)
     except UnrollError as error:
-        raise ExportError(f"{error}; use {STEP}") from None
+        raise ExportError(f"{error}; use {STABLEHLO_FILE}") from None
     rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
@@ -216,7 +216,7 @@ def unrolled(
         computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1) if mine else flat
         bound = math.sqrt(jnp.finfo(theirs.dtype).eps)
         if not np.allclose(computed, flat, rtol=bound, atol=bound, equal_nan=True):
-            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STEP}")
+            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STABLEHLO_FILE}")
     return source
 
 

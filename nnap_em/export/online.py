@@ -18,7 +18,7 @@ from ..fit.identify import Identified
 from ..model import hooks
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
-from ..smoother.mixture import WIDE
+from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_text
 from .c99 import WHOLE, Dialect, function
 from .model import ExportError, unrolled
@@ -235,7 +235,7 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
     }  # fmt: skip
     reals = {
         "GATE": observing.GATE, "FORGET": observing.FORGET, "DIVERGED": observing.DIVERGED, "TWIN": observing.TWIN,
-        "FAR_AWAY": observing.FAR, "LOG_LEAST": np.log(observing.LEAST), "WIDE": WIDE,
+        "FAR_AWAY": observing.LARGEST_STATE, "LOG_LEAST": np.log(observing.BRANCH_END), "WIDE": WIDE_STD,
     }  # fmt: skip
     root = lambda cov: np.linalg.cholesky(np.asarray(cov, float))  # noqa: E731
     arrays = {

@@ -45,7 +45,7 @@ def placed(content: Content, effects: Sequence[AbstractEffect]) -> Placed:
 
 def _place(effect: AbstractEffect) -> Place:
     if effect.name not in PLACES:
-        raise NoPlace(REASONS.get(effect.name, "no element of MuJoCo has this form"))
+        raise NoPlace(NO_PLACE.get(effect.name, "no element of MuJoCo has this form"))
     return PLACES[effect.name]
 
 
@@ -231,7 +231,7 @@ PLACES: Mapping[str, Place] = {
 }
 """Functions that add a law to the content, by its name in the catalogue; first lines are the places in a table."""
 
-REASONS: Mapping[str, str] = {
+NO_PLACE: Mapping[str, str] = {
     "dead_zone": "an actuator is linear between its limits",
     "one_sided_loss": "an actuator has one gain for both directions",
     "position_dependent_friction": "friction of a joint does not depend on its position",

@@ -27,7 +27,7 @@ _ELEMENTWISE = {  # primitive to NumPy
     "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil"
 )}  # fmt: skip
 _REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
-_SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
+_IDENTITIES = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
 _STEERED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}
 """Operands that are moved, where others give the destination."""
 _MOVERS = (
@@ -193,7 +193,7 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return _constant(equation, operands)
     if refused := _refused(equation):
         raise UnrollError(f"JAX's {name!r} {refused} has no plain NumPy form here")
-    if name in _SAME:
+    if name in _IDENTITIES:
         return operands
     if name == "convert_element_type":
         return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]

@@ -13,13 +13,13 @@ from ..model.servo import Servo
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .content import Content, Drive, JointContent
-from .friction import SHARE, friction_forms
+from .friction import REPORTED_MISS, friction_forms
 from .mjcf import MASSLESS, as_it_is, content_of, named
 from .placement import placed
 
-HELD = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
+URDF_LAWS = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
 """Laws that URDF holds, by name: in the numbers of the bodies and in the damping."""
-FAR = 1e9
+NO_LIMIT = 1e9
 """Limit of a slide without stops, of an effort or a rate without limit: URDF requires one."""
 
 
@@ -41,9 +41,9 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
     forms = friction_forms(fitted)
     content, _ = placed(content_of(fitted, fitted.model, system, forms), fitted.model.effects)
     left = [_of_servo(servo) for servo in fitted.model.servos or () if servo.feeds_back]
-    left += [named(effect) for effect in fitted.model.effects if effect.name not in HELD]
+    left += [named(effect) for effect in fitted.model.effects if effect.name not in URDF_LAWS]
     for joint, form in zip(system.machine.joints, forms, strict=True):
-        form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > SHARE
+        form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > REPORTED_MISS
         left += [f"friction of {joint.name} beside Coulomb and viscous"] if form_misses else []
         left += [f"the spring of {joint.name}"] if joint.stiffness else []
         left += [f"the armature of {joint.name}"] if _armature(system, joint) else []
@@ -115,9 +115,9 @@ def _kind(joint: Joint) -> str:
 def _limits(element: ET.Element, joint: Joint, drive: Drive) -> None:
     if not (joint.range or joint.slide):
         return
-    low, high = joint.range or (-FAR, FAR)
-    effort = drive.before if math.isfinite(drive.before) else FAR
-    ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(FAR))
+    low, high = joint.range or (-NO_LIMIT, NO_LIMIT)
+    effort = drive.before if math.isfinite(drive.before) else NO_LIMIT
+    ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(NO_LIMIT))
 
 
 def _dynamics(element: ET.Element, laws: JointContent) -> None:

@@ -12,13 +12,13 @@ from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 
-APART = 1.0
+BRANCH_DISTANCE = 1.0
 """Largest distance of two paths in an angle beyond which they are two branches [rad].
 
 Paths of one branch, linearised about different starts, differ by up to 0.5 rad on machines; those of an arm that is
 folded and one that is stretched by 3.
 """
-LEAST = 0.01
+REPORTED_PROBABILITY = 0.01
 """Probability of a branch that is reported."""
 
 
@@ -33,7 +33,7 @@ class Branch(NamedTuple):
     angle: int
     """Place of the angle in which it differs most."""
     rows: tuple[int, int]
-    """First and last row in which that angle differs by more than half of `APART`."""
+    """First and last row in which that angle differs by more than half of `BRANCH_DISTANCE`."""
 
 
 def branches(
@@ -68,8 +68,8 @@ def branches(
         for i, share in zip(*modes(loglik, angles), strict=True):
             gap = distance(angles[i], smoothed)
             most = int(np.argmax(gap.max(axis=0)))
-            rows = np.flatnonzero(gap[:, most] > APART / 2)
-            if share >= LEAST and gap.max() > APART:
+            rows = np.flatnonzero(gap[:, most] > BRANCH_DISTANCE / 2)
+            if share >= REPORTED_PROBABILITY and gap.max() > BRANCH_DISTANCE:
                 span = int(rows[0]), int(rows[-1])
                 out.append(Branch(int(sequence), float(share), mean[i], second.angles[most], span))
     return tuple(out)
@@ -81,7 +81,7 @@ def modes(
     """The likeliest path of each branch, in the order of likelihood, and the probabilities of the branches."""
     chosen: list[int] = []
     for i in np.argsort(-loglik, kind="stable"):
-        if np.isfinite(loglik[i]) and all(np.max(distance(angles[i], angles[j])) > APART for j in chosen):
+        if np.isfinite(loglik[i]) and all(np.max(distance(angles[i], angles[j])) > BRANCH_DISTANCE for j in chosen):
             chosen.append(int(i))
     weight = np.exp(loglik[chosen] - np.max(loglik[chosen]))
     return np.asarray(chosen), weight / weight.sum()

@@ -35,7 +35,7 @@ from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
 from ..prediction_error import simulated
-from ..prediction_error.multistep import FALLS, JUDGED, errors, finish, followed, ratio
+from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..prediction_error.noise import white_readings
 from ..prediction_error.stated import widened
 from ..smoother.gaussian import CubatureSmoother
@@ -184,7 +184,7 @@ def identify(
     return finished(fitted._replace(rise=rise), data)
 
 
-PARTS = 2
+PARTS_LEFT_OUT = 2
 """Parts of the sequences that are left out in turn to see whether multi-step errors should be fitted."""
 
 
@@ -199,14 +199,14 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
         return _simulating(fitted, data)
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(kept(posterior, data))
-    if used.sum() < PARTS:
+    if used.sum() < PARTS_LEFT_OUT:
         return fitted
-    part = np.where(used, np.cumsum(used) % PARTS, -1)
+    part = np.where(used, np.cumsum(used) % PARTS_LEFT_OUT, -1)
     before, falls = errors(followed(fitted.model, fitted.m_step.prior, path, data), JUDGED), []
-    for out in range(PARTS):
+    for out in range(PARTS_LEFT_OUT):
         trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out), shaped=True)
         falls.append(ratio(before, errors(trial, JUDGED), part == out))
-    if np.mean(falls) < 1 - FALLS:
+    if np.mean(falls) < 1 - LEAST_FALL:
         model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken

@@ -19,7 +19,7 @@ from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian, symmetric
 from ..smoother.kalman import CUBATURE, Cubature, Tangent, absorbed, linear_reading, moved
-from ..smoother.mixture import WIDE, Components, merged, split
+from ..smoother.mixture import WIDE_STD, Components, merged, split
 from .identify import Identified
 
 GATE = 6.0
@@ -31,11 +31,11 @@ FORGET = 0.02
 DIVERGED = 9.0
 """Mean of squared innovations from which on the estimate starts anew: three standard deviations, where one is right;
 fourteen rows in a row beyond the gate."""
-LEAST = 1e-7
+BRANCH_END = 1e-7
 """Probability of a branch below which it ends."""
 TWIN = 0.1
 """Distance in every state [standard deviations] below which a branch is the likeliest one."""
-FAR = 1e6
+LARGEST_STATE = 1e6
 """Largest size of a state: beyond is no number of a machine, and sines have no digits."""
 
 MISSING, OUTLIER, NO_INPUT, RESTARTED, AMBIGUOUS = 1, 2, 4, 8, 16
@@ -216,7 +216,7 @@ def functions(
         count = jnp.sum(row.read) + jnp.sum(jnp.isfinite(state.late))
         square = jnp.sum(jnp.minimum(innovation[best] ** 2, GATE**2)) / jnp.maximum(count, 1).astype(dtype)
         misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (square - state.misfit)
-        known = jnp.all(jnp.abs(every.mean[best]) < FAR) & jnp.all(jnp.isfinite(every.cov[best]))
+        known = jnp.all(jnp.abs(every.mean[best]) < LARGEST_STATE) & jnp.all(jnp.isfinite(every.cov[best]))
         sane = (misfit < DIVERGED) & known & jnp.isfinite(log_weight[best])
         innovation = jnp.where(sane, innovation[best], 0.0)
 
@@ -261,15 +261,15 @@ def _branched(
     width = jnp.max(jnp.diagonal(every.cov, axis1=1, axis2=2)[:, jnp.asarray(angles)], axis=1)
 
     def parted(parts: Components) -> Components:
-        return merged(merged(split(parts, angles, WIDE)))
+        return merged(merged(split(parts, angles, WIDE_STD)))
 
     whole = Components(every, log_weight, places)
-    whole = jax.lax.cond(jnp.any((width > WIDE**2) & jnp.isfinite(log_weight)), parted, lambda parts: parts, whole)
+    whole = jax.lax.cond(jnp.any((width > WIDE_STD**2) & jnp.isfinite(log_weight)), parted, lambda parts: parts, whole)
     (mean, cov), log_weight, _ = whole
     best = jnp.argmax(log_weight)
     std = jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2))
     near = jnp.all(jnp.abs(mean - mean[best][None]) < TWIN * std[best][None], axis=1)
     twin = near & jnp.all(jnp.abs(std - std[best][None]) < TWIN * std[best][None], axis=1) & (places != best)
     share = jnp.where(twin, jnp.exp(log_weight - log_weight[best]), 0.0)
-    log_weight = jnp.where(twin | (log_weight < log_weight[best] + math.log(LEAST)), -jnp.inf, log_weight)
+    log_weight = jnp.where(twin | (log_weight < log_weight[best] + math.log(BRANCH_END)), -jnp.inf, log_weight)
     return Gaussian(mean, symmetric(cov)), log_weight.at[best].add(jnp.log1p(jnp.sum(share)))

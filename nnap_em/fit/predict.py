@@ -21,7 +21,7 @@ from ..systems.plant import AbstractPlant
 from .identify import Identified, phi_samples
 
 GIVEN = AbstractPlant.given  # s of readings before a reported error of a machine
-HORIZONS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+REPORTED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons [s] of the reported errors."""
 
 
@@ -32,7 +32,7 @@ def given_of(fitted: Identified) -> float:
 
 def horizons_of(fitted: Identified) -> tuple[float, ...]:
     """Horizons of the reported errors [s]: those of a machine with joints, or as many in the pace of equations."""
-    return tuple(float(f"{h * fitted.model.pace:.3g}") for h in HORIZONS)
+    return tuple(float(f"{h * fitted.model.pace:.3g}") for h in REPORTED)
 
 
 class Prediction(NamedTuple):
@@ -213,7 +213,7 @@ def predict(
 
 
 def horizon_errors(
-    prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = HORIZONS
+    prediction: Prediction, fitted: Identified, data: Dataset, given: float, horizons: tuple[float, ...] = REPORTED
 ) -> dict[str, list[float]]:
     """Root mean square of prediction minus reading over some horizons.
 

@@ -28,7 +28,7 @@ from ..systems import systems
 from .identify import Identified, begin
 
 _GIVE = "give the model.npz that `nnap-em identify` wrote"
-KIND = Kind(
+MODEL_KIND = Kind(
     "nnap_em fitted model",
     2,  # 1 had the precision of the network's weights in place of that of torques
     "model",
@@ -39,7 +39,7 @@ KIND = Kind(
 )
 
 
-MODEL, AFTER = "model.npz", "after.npz"
+MODEL_FILE, AFTER_FILE = "model.npz", "after.npz"
 """Files of an identification and of a diagnosis."""
 
 
@@ -57,7 +57,7 @@ def model_file(path: Path) -> Path:
     """The model that is meant by a file, or by the folder of an identification or of a diagnosis."""
     if not path.is_dir():
         return path
-    return path / AFTER if not (path / MODEL).exists() and (path / AFTER).exists() else path / MODEL
+    return path / AFTER_FILE if not (path / MODEL_FILE).exists() and (path / AFTER_FILE).exists() else path / MODEL_FILE
 
 
 def fingerprint(data: Dataset) -> str:
@@ -117,7 +117,7 @@ def save(
         "notes": dict(notes or {}),
     }
     _assemble(path, {"version": __version__, **header}, arrays)
-    write_arrays(path, KIND, header, arrays)
+    write_arrays(path, MODEL_KIND, header, arrays)
 
 
 def load(path: Path | str) -> Identified:
@@ -145,7 +145,7 @@ def read(path: Path) -> Stored:
 
     Raises StoreError if the file is damaged, foreign, or of another version.
     """
-    header, arrays = read_arrays(path, KIND)
+    header, arrays = read_arrays(path, MODEL_KIND)
     try:
         return Stored(_assemble(path, header, arrays), header["fingerprint"], header["notes"])
     except (KeyError, TypeError, AttributeError) as error:

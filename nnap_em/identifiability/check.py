@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset
-from ..data.logs import HELD, Logs, logs_of_arrays
+from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
@@ -31,12 +31,12 @@ from .inverse_dynamics import UNEXPLAINED, explanations, gains, mistakes, regres
 from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
-SEQUENCES, SECONDS, LEAST = 6, 1.0, 10
+SEQUENCES, SECONDS, FEWEST_SAMPLES = 6, 1.0, 10
 """Number of the sequences smoothed with the first model, and their length, which must determine the state [s, and rows
 where samples are that slow]: a wrong model loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
-RECORDED, WINDOW = 10.0, 0.25
+RECORDED, DETERMINED_WITHIN = 10.0, 0.25
 """Length of a recording in slowest time constants, and of the part that must determine the state, in the pace of the
 model."""
 REVERSALS = 20
@@ -121,7 +121,7 @@ def check(
 
 def _window(dt: float, seconds: float = SECONDS) -> int:
     """Rows that are smoothed with the first model."""
-    return max(round(seconds / dt), LEAST)
+    return max(round(seconds / dt), FEWEST_SAMPLES)
 
 
 def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
@@ -139,7 +139,7 @@ def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckRe
     text = f"{constants}, rows {rig.dt:g} s apart; predictions are judged up to {model.pace:g} s ahead"
     yield CheckResult(_mark(remarks, hints[0][0]), "sampling", "; ".join([text, *remarks]))
     yield from _noise(rig, model, data)
-    rows = min(data.valid.shape[1], _window(rig.dt, WINDOW * model.pace) + 1)
+    rows = min(data.valid.shape[1], _window(rig.dt, DETERMINED_WITHIN * model.pace) + 1)
     head = _first(data, rows)
     along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
     yield from _observability(model, along, np.asarray(head.valid), rows - 1)
@@ -201,7 +201,7 @@ def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
 
 def _repeats(train: Logs, name: str) -> Int[np.ndarray, " seq"]:
     """Rows of each file that hold a reading over again."""
-    amounts = {entry.file: entry.amount for entry in train.masked if (entry.kind, entry.column) == (HELD, name)}
+    amounts = {entry.file: entry.amount for entry in train.masked if (entry.kind, entry.column) == (REPEAT, name)}
     return np.array([amounts.get(file, 0) for file in train.files])
 
 
@@ -219,7 +219,7 @@ def _held(train: Logs, rig: Rig) -> Iterator[CheckResult]:
 def _rough(train: Logs) -> Iterator[CheckResult]:
     """Readings masked on reading, and their share of each column."""
     total = int(np.asarray(train.data.valid).sum())
-    masked = [entry for entry in train.masked if entry.kind != HELD]
+    masked = [entry for entry in train.masked if entry.kind != REPEAT]
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in masked):
         entries = [entry for entry in masked if (entry.kind, entry.column) == (kind, column)]
         count, what = sum(entry.amount for entry in entries), f"{column}: " if column else ""

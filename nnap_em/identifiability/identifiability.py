@@ -12,7 +12,7 @@ from ..model import hooks
 from ..model.servo import Servo, unlimited
 from ..systems import AbstractSystem
 
-LEAST = 1e-6
+SHARE_LEFT = 1e-6
 """Share of a parameter's own column that must be left when those of the others are taken out of it."""
 _MOMENTS = ("delay", "limit")
 """Numbers of a servo that the slopes of its torque do not know."""
@@ -48,20 +48,20 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
     if servos and rig.friction:
         columns = columns - friction @ np.linalg.lstsq(friction, columns, rcond=None)[0]
         rubbed = [
-            i for i, left in enumerate(np.linalg.norm(columns, axis=0)) if left <= LEAST * size[i] and size[i] > 0
+            i for i, left in enumerate(np.linalg.norm(columns, axis=0)) if left <= SHARE_LEFT * size[i] and size[i] > 0
         ]
         size = np.where(np.isin(np.arange(len(names)), rubbed), 0.0, size)
-    gone = [i for i in range(len(names)) if size[i] <= LEAST * size.max(initial=0.0)]
+    gone = [i for i in range(len(names)) if size[i] <= SHARE_LEFT * size.max(initial=0.0)]
     never = [i for i in gone if i not in rubbed]
     left = [i for i in range(len(names)) if i not in gone]
     if not left:
         return Identifiability(tuple(names[i] for i in never), (), tuple(names[i] for i in rubbed))
     _, values, rows = np.linalg.svd(columns[:, left] / size[left], full_matrices=True)
-    rank = int(np.sum(values > LEAST * values.max(initial=1e-300)))
+    rank = int(np.sum(values > SHARE_LEFT * values.max(initial=1e-300)))
     shared = np.abs(rows[rank:].T @ rows[rank:])
     groups: list[set[int]] = []
-    for i in np.flatnonzero(np.diag(shared) > LEAST):
-        group = {int(i), *map(int, np.flatnonzero(shared[i] > LEAST))}
+    for i in np.flatnonzero(np.diag(shared) > SHARE_LEFT):
+        group = {int(i), *map(int, np.flatnonzero(shared[i] > SHARE_LEFT))}
         for other in [g for g in groups if g & group]:
             groups.remove(other)
             group |= other

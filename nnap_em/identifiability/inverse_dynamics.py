@@ -28,21 +28,21 @@ from ..systems import AbstractSystem
 
 WIDTH, ORDER = 7, 4
 """Rows and degree of the polynomials that differentiate: a short window hardly bends a fast motion."""
-PASSES = (9, 15, 25, 41, 61)
-"""Rows of the low-pass: the first that leaves accelerations no more noise than `NOISE`, else the last that fits."""
-NOISE = 3e-3
+FILTER_LENGTHS = (9, 15, 25, 41, 61)
+"""Rows of the low-pass: the first that leaves accelerations a noise below `ACCEL_NOISE`, else the last that fits."""
+ACCEL_NOISE = 3e-3
 """Noise of a filtered acceleration as a share of its size: half of the smallest misfit that counts."""
-BLOCK, BLOCKS = 300, 15
+PIECE_ROWS, PIECES = 300, 15
 """Rows of a piece of the logs, and number of pieces, evenly over them."""
-NODES = 13
+KNOTS = 13
 """Velocities between which the friction map of a joint is straight."""
-ROWS = 5 * NODES
+FILTERED_ROWS = 5 * KNOTS
 """Filtered rows below which nothing is concluded."""
 WITHIN = 3.0
 """Standard deviations within which an uncertain number may move."""
-MISFIT = 5e-5
+UNEXPLAINED = 5e-5
 """Share of the squared torque that may stay unexplained: 0.7 % of the torque, as a zero off by 0.4 degrees leaves."""
-FALLS = 0.25
+LARGEST_REMAINDER = 0.25
 """Largest ratio of the unexplained with a named mistake corrected to that without.
 
 On logs of seven double pendulums and a servo as recorded no correction leaves less than 0.6; where the mistake was made
@@ -52,9 +52,9 @@ ranks before that and explains too little.
 """
 UNEXPLAINED = 0.2
 """Largest share of the squared torque that a named mistake leaves unexplained."""
-SAME = 1.1
+TIED_RATIO = 1.1
 """Ratio of the unexplained of two corrections up to which both mistakes are named."""
-GAIN = 1.5
+UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
 CARRIED = 0.3
 """Share of the declared gravity below which a torque holds none of it."""
@@ -173,13 +173,13 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
         sources.append((noise, taps, window))
     q, v, a = (np.stack(part, axis=-1) for part in zip(*joints, strict=True))
     low = None
-    for bell in (_bell(size) for size in PASSES if 2 * size < a.shape[1]):
+    for bell in (_bell(size) for size in FILTER_LENGTHS if 2 * size < a.shape[1]):
         passed = filtered(a, bell)
         passed = passed[np.isfinite(passed).all(axis=-1)]
-        if len(passed) < ROWS:
+        if len(passed) < FILTERED_ROWS:
             break
         low, size = bell, np.sqrt(np.mean(passed**2, axis=0))
-        if np.all([n * np.linalg.norm(np.convolve(taps, low)) for n, taps, _ in sources] <= NOISE * size):
+        if np.all([n * np.linalg.norm(np.convolve(taps, low)) for n, taps, _ in sources] <= ACCEL_NOISE * size):
             break
     if low is None:
         return None
@@ -204,7 +204,7 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
     )
     plain = problem.parts().reshape(3, *full.shape, -1)
     rows = np.all([np.isfinite(part).all(axis=-1) for part in (*plain, inputs, *maps)], axis=0)
-    if rows.sum() < ROWS:
+    if rows.sum() < FILTERED_ROWS:
         return None
     return problem._replace(
         rows=rows, inputs=inputs[rows], friction=[_directions(one[rows]) for one in maps], plain=plain[:, rows]
@@ -235,7 +235,7 @@ def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     slopes, texts = gains(problem), []
     for name, joint, gain in zip(rig.input_columns, problem.system.joints, slopes, strict=True):
         factor, unit = abs(gain), problem.system.force_unit(joint)
-        same = 1 / GAIN < factor < GAIN
+        same = 1 / UNIT_FACTOR < factor < UNIT_FACTOR
         if same and gain < 0:
             texts.append(f"{name} has the wrong sign (its motor gain is {gain:.3g}): multiply it by -1")
         elif not same and factor > 0:
@@ -306,12 +306,12 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
 
     None where the best correction explains no joint much better, or where it explains little.
     """
-    total = lambda one: float(np.sum(np.log(np.maximum(one.left, MISFIT / 10))))  # noqa: E731
+    total = lambda one: float(np.sum(np.log(np.maximum(one.left, UNEXPLAINED / 10))))  # noqa: E731
     ranked = sorted([Explanation(plain), *found], key=total)
-    best, explained = ranked[0], (ranked[0].left <= FALLS * plain) & (ranked[0].left <= UNEXPLAINED)
-    if not np.any(explained & (plain > MISFIT)):
+    best, explained = ranked[0], (ranked[0].left <= LARGEST_REMAINDER * plain) & (ranked[0].left <= UNEXPLAINED)
+    if not np.any(explained & (plain > UNEXPLAINED)):
         return []
-    return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(SAME)]
+    return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(TIED_RATIO)]
 
 
 @eqx.filter_jit
@@ -350,10 +350,10 @@ def _bell(size: int) -> Float[np.ndarray, " tap"]:
 
 
 def _pieces(values: Float[np.ndarray, "seq time column"], valid: Bool[np.ndarray, "seq time"]) -> np.ndarray:
-    """Pieces, at most `BLOCKS`, of about `BLOCK` rows, evenly over all sequences; NaN behind the end of a short one."""
-    count = np.maximum(1, np.round(valid.sum(axis=1) / BLOCK).astype(int))
+    """Pieces of about `PIECE_ROWS` rows, evenly over all sequences, `PIECES` at most; a short one ends in NaN."""
+    count = np.maximum(1, np.round(valid.sum(axis=1) / PIECE_ROWS).astype(int))
     parts = [part for rows, ok, n in zip(values, valid, count, strict=True) for part in np.array_split(rows[ok], n)]
-    parts = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, BLOCKS).astype(int))]
+    parts = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, PIECES).astype(int))]
     out = np.full((len(parts), max(map(len, parts)), values.shape[-1]), np.nan)
     for place, part in zip(out, parts, strict=True):
         place[: len(part)] = part
@@ -364,8 +364,8 @@ def _hats(v: Float[np.ndarray, "piece time"]) -> Float[np.ndarray, "piece time n
     """Shares of the nodes of a friction map, which are dense near rest, where friction bends."""
     low, high = np.nanpercentile(v, [0.5, 99.5])
     knee = 0.01 * max(-low, high, 1e-12)
-    nodes = knee * np.sinh(np.linspace(np.arcsinh(min(low / knee, -1)), np.arcsinh(max(high / knee, 1)), NODES))
-    return np.stack([np.interp(v, nodes, one) for one in np.eye(NODES)], axis=-1)
+    nodes = knee * np.sinh(np.linspace(np.arcsinh(min(low / knee, -1)), np.arcsinh(max(high / knee, 1)), KNOTS))
+    return np.stack([np.interp(v, nodes, one) for one in np.eye(KNOTS)], axis=-1)
 
 
 def _directions(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row direction"]:

@@ -9,7 +9,7 @@ from ..data.machine import unpacked
 from ..data.rig import Rig
 from ..numerics.digits import counted
 
-NEAR = 0.005
+NEAR_END = 0.005
 """Share of the range within which a reading counts as at its end."""
 
 
@@ -23,7 +23,7 @@ def at_stops(rig: Rig, data: Dataset) -> Iterator[str]:
             continue
         y = np.asarray(data.y)[..., rig.measured.index(name)]
         low, high = joint.range
-        margin = NEAR * (high - low)
+        margin = NEAR_END * (high - low)
         touched = np.isfinite(y) & ((y < low + margin) | (y > high - margin))
         if touched.any():
             unit = rig.unit(name)

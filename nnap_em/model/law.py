@@ -42,7 +42,7 @@ PARAMETERS = ("coulomb", "breakaway", "stribeck", "viscous", "smooth", "offset")
 CALLED = ("Coulomb", "breakaway", "Stribeck velocity", "viscous", "sign smoothed over", "constant")
 """Words for PARAMETERS."""
 
-UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: ("N", "N", "m/s", "N s/m", "m/s", "N")}
+LAW_UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: ("N", "N", "m/s", "N s/m", "m/s", "N")}
 """Units of PARAMETERS, by whether the coordinate is an angle."""
 
 
@@ -147,9 +147,9 @@ def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> l
     """One sentence per joint: the numbers of the law, what the curve leaves open, and where it is another curve."""
     return [
         f"{name}: "
-        + ", ".join(_terms(np.asarray(fit.value[j]), np.asarray(fit.std[j]), UNITS[angle]))
+        + ", ".join(_terms(np.asarray(fit.value[j]), np.asarray(fit.std[j]), LAW_UNITS[angle]))
         + "; "
-        + _where(fit, j, UNITS[angle][2])
+        + _where(fit, j, LAW_UNITS[angle][2])
         for j, (name, angle) in enumerate(zip(names, angles, strict=True))
     ]
 

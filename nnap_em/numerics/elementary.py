@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 TERMS = {jnp.dtype(jnp.float32): 5, jnp.dtype(jnp.float64): 8}
 """Terms of the Taylor series on [-pi/4, pi/4] that leave less than the rounding error."""
 
-PARTS = {
+HALF_PI = {
     jnp.dtype(jnp.float32): (1.5703125, 0.00048382679),
     jnp.dtype(jnp.float64): (1.5707963267341256, 6.077100506506192e-11),
 }
@@ -36,7 +36,7 @@ def sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Arr
 def _pair(x):
     far = jnp.abs(x) > FARTHEST[x.dtype]
     quarter = jnp.round(x * (2 / math.pi))
-    for part in PARTS[x.dtype]:
+    for part in HALF_PI[x.dtype]:
         x = x - quarter * part
     square = jnp.where(far, jnp.nan, x * x)
     sine, cosine = jnp.zeros_like(x), jnp.zeros_like(x)

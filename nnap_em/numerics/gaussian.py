@@ -20,16 +20,16 @@ class Gaussian(NamedTuple):
     cov: Float[Array, "*batch dim dim"]
 
 
-WIDE = 8
+MOST_UNROLLED = 8
 """States beyond which nothing is unrolled: a loop over the columns compiles in seconds, not in minutes."""
 Factor = list[list[Float[Array, ""]]] | Float[Array, "dim dim"]
-"""Rows of scalars, or beyond `WIDE` states a matrix."""
+"""Rows of scalars, or beyond `MOST_UNROLLED` states a matrix."""
 
 
 def cholesky(a: Float[Array, "dim dim"]) -> Factor:
     """Lower factor L of a = L L' (`dim` is static)."""
     n = a.shape[0]
-    if n > WIDE:
+    if n > MOST_UNROLLED:
         return _factor(a)
     rows: list[list[Float[Array, ""]]] = []
     for i in range(n):
@@ -55,7 +55,7 @@ def product(a: Float[Array, "row inner"], b: Float[Array, "inner *column"]) -> F
     """a @ b as a sum over the inner axis: it fuses with what stands around it, a small batched matrix product does not
     and takes some 5 times as long on a CPU.
     """
-    if b.shape[0] > WIDE:
+    if b.shape[0] > MOST_UNROLLED:
         return a @ b
     out = a[:, 0, None] * b[0][None] if b.ndim == 2 else a[:, 0] * b[0]
     for k in range(1, b.shape[0]):
@@ -83,7 +83,7 @@ def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Fl
     By a = L D L' with ones on the diagonal of L: one reciprocal a row and no root [Golub & Van Loan 2013, sec. 4.1].
     """
     n = a.shape[0]
-    if n > WIDE:
+    if n > MOST_UNROLLED:
         return _eliminated(a, b)
     factor: list[list] = []  # L D by rows
     inverse: list = []  # of D

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import jax
 
-MOST = 40_000
+MOST_MAPS = 40_000
 """Maps beyond which programs are released; a large one holds some hundred."""
 
 
@@ -16,7 +16,7 @@ def maps() -> int:
         return 0
 
 
-def release_programs(most: int = MOST) -> bool:
+def release_programs(most: int = MOST_MAPS) -> bool:
     """Drop all compiled programs where they hold more than `most` maps; what is needed again is compiled again."""
     if maps() <= most:
         return False

@@ -6,22 +6,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .gaussian import WIDE, Gaussian
+from .gaussian import MOST_UNROLLED, Gaussian
 
-BLOCK = 32
+ROWS_AT_ONCE = 32
 """Rows at a time; with the sequences beside them some thousand points."""
 
 
 def rows(function: Callable, path: Gaussian, *trees: Any) -> Any:
-    """`jax.vmap(function)(path, *trees)` along the first axis, in blocks of nearly `BLOCK`.
+    """`jax.vmap(function)(path, *trees)` along the first axis, in blocks of nearly `ROWS_AT_ONCE`.
 
     All at once beyond `WIDE` states, where little is gained: at six joints with a body on top a program in blocks took
     22 GB and a quarter of an hour to compile.
     """
     length, states = path.mean.shape
-    if states > WIDE:
+    if states > MOST_UNROLLED:
         return jax.vmap(function)(path, *trees)
-    count = -(-length // BLOCK)
+    count = -(-length // ROWS_AT_ONCE)
     size = -(-length // count)
 
     def cut(a):

@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 from jax.core import Tracer
 
-KNOWN = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
+KEY_PACKAGES = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
 """Packages whose text a key stands for, by its own hash or by their version."""
 STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
 
@@ -139,7 +139,7 @@ class _Telling(pickle.Pickler):
         if obj in (str, repr) or not (isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__"))):
             return NotImplemented
         package, code = str(obj.__module__).partition(".")[0], getattr(obj, "__code__", None)
-        if package not in KNOWN or ("<" in obj.__qualname__ and getattr(obj, "__closure__", ()) is not None):
+        if package not in KEY_PACKAGES or ("<" in obj.__qualname__ and getattr(obj, "__closure__", ()) is not None):
             raise pickle.PicklingError(f"it holds {obj.__module__}.{obj.__qualname__}")
         return str, (f"{obj.__module__}.{obj.__qualname__} {code and code.co_firstlineno}",)
 

@@ -34,9 +34,9 @@ SHORT_HORIZONS = (0.05, 0.1)
 """Horizons [s] over which even a fast machine remains predictable."""
 SPACING = 0.05
 """Time [s] between starts."""
-WIDE = 0.1
+SLOPE_WIDTH = 0.1
 """Spread over which slopes are taken, in rms speeds: as wide as predictions err."""
-HUBER = 2.0
+HUBER_STD = 2.0
 """Errors of more robust standard deviations weigh less."""
 
 
@@ -157,9 +157,9 @@ def _wide(
     rates = jnp.where(data.valid[..., None], path.mean[..., dof:states], jnp.nan)
     if dof:
         rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
-        spread = [WIDE * HORIZONS[0] * rms, WIDE * rms]
+        spread = [SLOPE_WIDTH * HORIZONS[0] * rms, SLOPE_WIDTH * rms]
     else:
-        spread = [WIDE * jnp.nanstd(rates, axis=(0, 1)) + 1e-9]
+        spread = [SLOPE_WIDTH * jnp.nanstd(rates, axis=(0, 1)) + 1e-9]
     spread = jnp.concatenate([*spread, jnp.full(path.mean.shape[-1] - states, 1e-6)])
     wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
     linear = locals_along(model, prior, wide, data, CUBATURE)
@@ -260,7 +260,7 @@ def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.
 def huber(error, scale):
     """Squared error in scales, beyond HUBER of them a straight line [Huber 1964]; what runs away counts as 30."""
     size = np.minimum(np.abs(error) / scale, 30.0)
-    return np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER))
+    return np.where(size < HUBER_STD, size**2, HUBER_STD * (2 * size - HUBER_STD))
 
 
 def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
@@ -283,7 +283,7 @@ def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.n
     error = np.where(used[:, None, None, None], predictions.error, np.nan)
     scale = robust_scale(error)
     with np.errstate(invalid="ignore", divide="ignore"):
-        size = np.minimum(1.0, HUBER * scale / np.abs(error))
+        size = np.minimum(1.0, HUBER_STD * scale / np.abs(error))
     sound = np.isfinite(error) & np.isfinite(predictions.columns).all(axis=-1)
     return np.where(sound, size / scale**2 / predictions.overlap[:, None], 0.0)
 
@@ -291,9 +291,9 @@ def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.n
 # --- a fit to them
 
 
-STEPS = 3
+GAUSS_NEWTON_STEPS = 3
 """Gauss-Newton steps at most."""
-FALLS = 0.01
+LEAST_FALL = 0.01
 """Share by which a step must lower the error to be taken."""
 
 
@@ -314,7 +314,7 @@ def finish(
     """
     best = followed(model, m_step.prior, path, data)
     error = errors(best, JUDGED)
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         model = best.model
         weights = m_step.weights(model)
         predictions = open_loop(best, weights)
@@ -331,7 +331,7 @@ def finish(
         for share in (1.0, 0.5, 0.25):
             trial = followed(weights.write(model, start + share * (goal - start)), m_step.prior, path, data)
             trial_error = errors(trial, JUDGED)
-            if ratio(error, trial_error, used) < 1 - FALLS:
+            if ratio(error, trial_error, used) < 1 - LEAST_FALL:
                 best, error = trial, trial_error
                 break
         else:

@@ -24,7 +24,7 @@ from .multistep import Columns, OpenLoop, followed, open_loop, sensitivities, we
 
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""
-SMALLEST, LARGEST, SIZES = 1e-3, 1e5, 49
+SMALLEST_FORCE, LARGEST_FORCE, FORCE_SIZES = 1e-3, 1e5, 49
 """Sizes of such forces that are tried: variance of what they add over that of the rest, where it is known best."""
 
 
@@ -172,7 +172,7 @@ def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> flo
     strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
     if whole == 0.0 or not strength.any():
         return 0.0
-    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST, LARGEST, SIZES)])[:, None] / strength[-1]
+    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST_FORCE, LARGEST_FORCE, FORCE_SIZES)])[:, None] / strength[-1]
     noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / errors.rows
     best = np.argmin(0.5 * errors.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
     return math.sqrt(float(ratios[best, 0] * noise[best]))

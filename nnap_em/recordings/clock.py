@@ -15,7 +15,7 @@ APART = 10.0
 """Seconds between stamp and log time from which on they are those of two clocks."""
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
-FAR = 30 * 86400.0
+LONGEST_SILENCE = 30 * 86400.0
 """Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set."""
 FEW = 0.05
 """Largest share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log."""
@@ -23,7 +23,7 @@ LITTLE = 50
 """Wrong times beyond a silence at most: as many rows as a sequence needs."""
 RUNS = 4096
 """Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
-PARTS = 20
+TOPIC_PARTS = 20
 """Parts of a topic for each of which its stamps are compared with the log times."""
 PART = 50
 """Messages of such a part at least, so that its median is no chance."""
@@ -121,7 +121,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     """Messages whose times [ns] are of one clock that goes on; None where it was set in the middle of the log.
 
     Times are wrong if they go back by more than `BACK` from, or on to, those of the most messages, or if they are few
-    and lie `FAR` from the others: zeros before a clock was set, a wild stamp.
+    and lie `LONGEST_SILENCE` from the others: zeros before a clock was set, a wild stamp.
     """
     steps = np.diff(t)
     first = np.append(0, np.flatnonzero((steps > BACK * SECOND) | (steps < -BACK * SECOND)) + 1)
@@ -136,7 +136,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     budget = max(FEW * weight.sum(), 1)
     if weight.sum() - weight[chain].sum() > budget:
         return None
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > FAR * SECOND))
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > LONGEST_SILENCE * SECOND))
     size = np.bincount(groups, weight[chain])
     few = (size < LITTLE) & (size <= budget)
     if few.any() and not few.all() and size[few].sum() <= budget:
@@ -149,7 +149,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
 
 def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:
     """Median of stamp minus log time in parts of a topic, at the median stamp of each [ns]."""
-    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // PART, 1), PARTS))
+    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // PART, 1), TOPIC_PARTS))
     return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
 
 

@@ -102,7 +102,7 @@ class Ros2:
 
     def _form(self, message: bytes, paths: Sequence[str]) -> Layout | None:
         """Places of the numbers of this message; None where they are unknown, or forms are too many."""
-        if len(self.known) >= FORMS or not self.types:
+        if len(self.known) >= MESSAGE_FORMS or not self.types:
             return None
         try:
             form = layout(self.types, self.name, message)
@@ -114,7 +114,7 @@ class Ros2:
         return form if np.array_equal(values, decoded, equal_nan=True) else None
 
 
-FORMS = 64
+MESSAGE_FORMS = 64
 """Forms of the messages of a channel that are laid out: of frames, joints and lengths of lists there are few."""
 
 

@@ -12,10 +12,10 @@ from ..data.dataset import DataError
 from ..data.formats import dated
 from ..data.units import UNITS, is_time, named_unit
 from .clock import nanoseconds, rising
-from .objects import MOST
+from .objects import LISTED_ENTRIES
 from .recording import EXTRA, Recording, Topic, Track, refuse
 
-MARKS = ("axis", "kind", "role", "standard_name")
+TIME_ATTRIBUTES = ("axis", "kind", "role", "standard_name")
 """Attributes that mark a data set as the time."""
 _BLOCK = 2**18
 """Rows of a wide data set that are read at once."""
@@ -80,7 +80,7 @@ def _axis(group: Any) -> Any | None:
     """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
     inside = [(name, data) for name, data in _numeric(group, "iufOS")]
     for _, data in inside:
-        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in MARKS):
+        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in TIME_ATTRIBUTES):
             return data
     named = [(name, data) for name, data in inside if data.ndim == 1 and is_time(name)]
     if named:  # the stamp of a sensor may be of another clock than the times of other groups
@@ -93,7 +93,7 @@ def _numeric(group: Any, kinds: str = "iuf") -> Iterator[tuple[str, Any]]:
     """Data sets of one number or one row of numbers per time; dates are texts."""
     for name, data in group.items():
         if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in kinds and data.shape[0] > 1:
-            if data.ndim == 2 and data.shape[1] > MOST:
+            if data.ndim == 2 and data.shape[1] > LISTED_ENTRIES:
                 continue
             yield name, data
 

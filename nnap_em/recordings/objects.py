@@ -8,7 +8,7 @@ from .recording import steps
 
 NAMES = ("name", "names", "joint_names")
 """Fields that name the entries of the arrays beside them."""
-MOST = 256
+LISTED_ENTRIES = 256
 """Entries of an array that are listed."""
 
 
@@ -37,7 +37,7 @@ def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:
     if isinstance(at, bool | int | float):
         yield path, float(at)
     elif _is_list(at):
-        for i, item in enumerate(at[:MOST]):
+        for i, item in enumerate(at[:LISTED_ENTRIES]):
             yield from _numbers(item, f"{path}[{i}]")
     elif not isinstance(at, str | bytes | None):
         names = _names(at)

@@ -21,7 +21,7 @@ from .files import read, reader
 from .readings import as_taken
 from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
 from .segments import (
-    LEAST,
+    FEWEST_ROWS,
     Gap,
     Segment,
     Spans,
@@ -37,7 +37,7 @@ from .segments import (
 )
 from .signals import SLOW, Signal, averaged, held, interpolated
 
-COARSE = 4.0
+FINEST_GRID = 4.0
 """Rows from one reading to the next of the fastest topic from which on the grid is refused as too fine."""
 SPARSE = 50.0
 """Rows for each reading of the fastest topic from which on they are refused: without a declared gap there are 20."""
@@ -182,8 +182,8 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
     spans = covered([*watched.values()], 1)
     _sparse(path, spans, fastest, dt)
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
-    shortest = LEAST if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
-    longest = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * LEAST)
+    shortest = FEWEST_ROWS if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
+    longest = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * FEWEST_ROWS)
     sequences = [_sequence(segment, rig, plan, signals) for segment in cut(pieces, dt, shortest, longest)]
     if all(stretch.why for stretch, _ in sequences):
         most = max((piece.rows for piece in pieces), default=0)
@@ -221,7 +221,7 @@ def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:
 def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
-    if best.interval > COARSE * dt:
+    if best.interval > FINEST_GRID * dt:
         place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
         problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
         other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"

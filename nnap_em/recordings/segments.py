@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .signals import SAME, Signal
+from .signals import SAME_TIME, Signal
 
 INTERVALS = 5
 """Silence of so many of its own intervals, and of so many rows, is a gap of a topic where none is declared."""
-NEAR = 2.5
+WIDEST_GAP = 2.5
 """Intervals of a topic between neighbours that are interpolated at most: one message may be lost."""
-LEAST = 50
+FEWEST_ROWS = 50
 """Rows of a sequence, where no shortest one is declared."""
-FEW = 10
+FEWEST_INTERVALS = 10
 """Intervals between commands from which on they may have a rate."""
 SET_POINT = 0.5
 """Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream."""
@@ -24,7 +24,7 @@ REGULAR = 0.45
 
 With half the messages lost it is 0.5 or more, for times by chance 0.35.
 """
-CHANCE = 0.01
+STILL_CHANCE = 0.01
 """Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
 stood still in them."""
 
@@ -51,7 +51,7 @@ class Segment(NamedTuple):
 
 def reach(signal: Signal, dt: float) -> float:
     """Largest distance of neighbours between which values are interpolated [s]."""
-    return max(NEAR * signal.interval, dt)
+    return max(WIDEST_GAP * signal.interval, dt)
 
 
 def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
@@ -65,7 +65,7 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     They are a few, set points, or irregular; or they go on after each silence as if there had been none.
     """
     steps = np.diff(signal.t)
-    if steps.size < FEW or signal.interval >= SET_POINT:
+    if steps.size < FEWEST_INTERVALS or signal.interval >= SET_POINT:
         return True
     usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
     alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes
@@ -79,7 +79,7 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     if step == 0 or jumps[silent].max() > 2 * step:  # sent without change, too; or not where it was
         return False
     near = 4 * step / float(np.ptp(np.quantile(signal.y, (0.05, 0.95))))
-    return near ** int(np.count_nonzero(silent)) < CHANCE
+    return near ** int(np.count_nonzero(silent)) < STILL_CHANCE
 
 
 def gaps(signal: Signal) -> list[Gap]:
@@ -97,7 +97,7 @@ def present(signal: Signal, hold: float = 0.0) -> Spans:
 
 def hold(signal: Signal, dt: float) -> float:
     """Time for which a command is known after its last value [s]."""
-    return max(signal.interval, dt) - 2 * SAME * dt
+    return max(signal.interval, dt) - 2 * SAME_TIME * dt
 
 
 def covered(parts: Sequence[Spans], least: int) -> Spans:
@@ -118,9 +118,9 @@ def runs(spans: Spans, fastest: Signal, dt: float) -> list[Segment]:
     """
     apart = np.flatnonzero(spans[1:, 0] - spans[:-1, 1] > dt)
     start, end = spans[:, 0][np.append(0, apart + 1)[: len(spans)]], spans[:, 1][np.append(apart, -1)[: len(spans)]]
-    reading = np.append(fastest.t, np.inf)[np.searchsorted(fastest.t, start - SAME * dt)]
+    reading = np.append(fastest.t, np.inf)[np.searchsorted(fastest.t, start - SAME_TIME * dt)]
     start = np.where(reading < start + max(fastest.interval, dt), reading, start)
-    rows = np.floor((end - start) / dt + SAME).astype(int) + 1
+    rows = np.floor((end - start) / dt + SAME_TIME).astype(int) + 1
     return [Segment(first, n) for first, n in zip(start.tolist(), rows.tolist(), strict=True) if n > 0]
 
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-SAME = 1e-3
+SAME_TIME = 1e-3
 """Share of a row by which times may differ and still be one: clocks count in ns, and rows are rounded."""
 SLOW = 1.5
 """Rows from one reading to the next from which on readings stand in their nearest row, with empty rows between."""
@@ -32,7 +32,7 @@ class Signal:
 
 def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
     """The value given last, at the row or before it."""
-    return signal.y[_before(signal, at + SAME * dt)]
+    return signal.y[_before(signal, at + SAME_TIME * dt)]
 
 
 def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
@@ -55,7 +55,7 @@ def interpolated(
     slower than rows, in rows that are nearest to no reading.  Between readings of noise sigma a value has less: from
     sigma / sqrt(2) on.
     """
-    t, slack = signal.t, SAME * dt
+    t, slack = signal.t, SAME_TIME * dt
     right = np.clip(np.searchsorted(t, at), 1, max(t.size - 1, 1))
     width = t[right] - t[right - 1]
     x = np.clip(at, t[0], t[-1])

@@ -18,7 +18,7 @@ from ..numerics.digits import with_std
 from ..residual.residual import Names
 from .style import AFTER, band, head, panels, styled, symbol
 
-WORDS = {
+CONTACT_WORDS = {
     "coulomb": "Coulomb",
     "breakaway": "breakaway",
     "stribeck_velocity": "Stribeck velocity",
@@ -42,7 +42,7 @@ class Contact(NamedTuple):
     @property
     def text(self) -> str:
         """The numbers in words."""
-        words = (f"{WORDS[name]} {with_std(e.value, e.std)} {e.unit}" for name, e in self.parameters.items())
+        words = (f"{CONTACT_WORDS[name]} {with_std(e.value, e.std)} {e.unit}" for name, e in self.parameters.items())
         return f"joint {self.joint}, contact: {', '.join(words)}"
 
     def document(self) -> dict[str, Any]:

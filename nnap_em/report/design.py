@@ -20,11 +20,11 @@ from .document import versions
 from .page import Picture, picture, rendered
 from .tables import write_json
 
-INPUTS, MOTIONS = "inputs", "motion"
+INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
 NOTED = 1.1
 """Factor of certainty from which on a parameter is named in the verdict."""
-ACROSS = 3
+SEQUENCES_ACROSS = 3
 """Sequences in one figure."""
 
 
@@ -33,8 +33,8 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     files = _write_sequences(out, design)
     document = describe(design) | {
         "question": question,
-        "inputs": [f"{INPUTS}/{file}" for file in files],
-        "motion": [f"{MOTIONS}/{file}" for file in files],
+        "inputs": [f"{INPUT_DIR}/{file}" for file in files],
+        "motion": [f"{MOTION_DIR}/{file}" for file in files],
         "seed": seed,
         "seconds": time.perf_counter() - began,
         "versions": versions(),
@@ -44,7 +44,7 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
     replace_text(out / "design.html", named(text))
     log(document["verdict"])
-    log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUTS}")
+    log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUT_DIR}")
 
 
 def _write_sequences(out: Path, design: Design) -> list[str]:
@@ -52,16 +52,16 @@ def _write_sequences(out: Path, design: Design) -> list[str]:
     fitted, states = design.fitted, design.fitted.model.system.coordinates + design.fitted.model.system.rates
     count = len(design.u)
     files = [f"{i + 1:0{len(str(count))}d}.csv" for i in range(count)]
-    for folder in (INPUTS, MOTIONS):
+    for folder in (INPUT_DIR, MOTION_DIR):
         for old in (out / folder).glob("*.csv"):
             old.unlink()
     for i, file in enumerate(files):
         write_csv(
-            out / INPUTS / file, {"time": design.t} | dict(zip(fitted.rig.input_columns, design.u[i].T, strict=True))
+            out / INPUT_DIR / file, {"time": design.t} | dict(zip(fitted.rig.input_columns, design.u[i].T, strict=True))
         )
         bands = {"": design.middle, "_low": design.low, "_high": design.high}
         columns = {f"{name}{end}": band[i, :, s] for s, name in enumerate(states) for end, band in bands.items()}
-        write_csv(out / MOTIONS / file, {"time": design.t} | columns)
+        write_csv(out / MOTION_DIR / file, {"time": design.t} | columns)
     return files
 
 
@@ -207,8 +207,8 @@ def _pictures(design: Design, document: dict[str, Any]) -> list[Picture]:
     if document["friction"]:
         caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
         out.append(picture("found", "Friction bands", caption, bands_figure(document["friction"], names)))
-    for first in range(0, len(design.u), ACROSS):
-        which = range(first, min(first + ACROSS, len(design.u)))
+    for first in range(0, len(design.u), SEQUENCES_ACROSS):
+        which = range(first, min(first + SEQUENCES_ACROSS, len(design.u)))
         caption = (
             "Above what is to be played, below what the machine should do: the central 98 % of motions by models from "
             "the posterior. Dashed: limits."

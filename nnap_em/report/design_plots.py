@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from ..experiment.experiment import Design
 from ..residual.residual import Names
-from .style import AFTER, BEFORE, READING, ZERO, head, limits, panels, styled, symbol
+from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styled, symbol
 
 
 @styled
@@ -48,7 +48,7 @@ def motion_figure(design: Design, names: Names, which: Sequence[int]) -> Figure:
     grid = figure.subplots(rows, len(which), sharex=True, sharey="row", squeeze=False)
     for column, i in enumerate(which):
         for k, ax in enumerate(grid[: len(inputs), column]):
-            ax.step(design.t, design.u[i, :, k], where="post", color=ZERO, label="to be played")
+            ax.step(design.t, design.u[i, :, k], where="post", color=ZERO_LINE, label="to be played")
             _fence(ax, design.limits.low[k], design.limits.high[k], [design.u[..., k]])
         for s, ax in enumerate(grid[len(inputs) :, column]):
             low, middle, high = (band[i, :, s] for band in (design.low, design.middle, design.high))

@@ -25,7 +25,7 @@ from .document import errors, noise, parameters, predictions, shared, visited
 from .effect_plots import effect_figure, screen_figure
 from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
-from .page import MOST, ROOM, Picture, picture, write_page
+from .page import MOST_PICTURES, PICTURE_BYTES, Picture, picture, write_page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
 
@@ -121,9 +121,9 @@ def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test
     """Test sequences to choose from, the longest ones first; as many as there is room for."""
     rows = np.sum(np.asarray(test.data.valid), axis=1)
     out: list[Picture] = []
-    for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST]:
+    for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST_PICTURES]:
         out.append(_prediction_picture(predicted, names, test, i, given))
-        if sum(len(picture.image) for picture in out) > ROOM and len(out) > 1:
+        if sum(len(picture.image) for picture in out) > PICTURE_BYTES and len(out) > 1:
             out.pop()
             break
     return out if len(out) > 1 else [picture._replace(choice="") for picture in out]

@@ -16,7 +16,7 @@ from ..data.servo import TORQUE
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
 from ..identifiability.identifiability import identifiability, sentences
-from ..model.law import PARAMETERS, UNITS, describe, fit_law
+from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law
 from .tables import INNER
 
 NO_TEST = "no test sequences (FOLDER/test/*.csv), so no prediction error"
@@ -112,7 +112,7 @@ def friction_law(fitted: Identified, table: FrictionTable) -> list[dict[str, Any
     system, law = fitted.model.system, fit_law(table.velocity, table.torque, table.cov)
     out = []
     for j, text in enumerate(describe(law, system.coordinates, system.angles)):
-        numbers = zip(PARAMETERS, law.value[j].tolist(), law.std[j].tolist(), UNITS[system.angles[j]], strict=True)
+        numbers = zip(PARAMETERS, law.value[j].tolist(), law.std[j].tolist(), LAW_UNITS[system.angles[j]], strict=True)
         terms = {name: {"value": value, "std": std, "unit": unit} for name, value, std, unit in numbers}
         out.append({"joint": j + 1, "parameters": terms, "text": text})
     return out

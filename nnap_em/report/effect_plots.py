@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from ..effects.base import Curve
-from .style import AFTER, READING, ZERO, band, head, styled, symbol
+from .style import AFTER, READING, ZERO_LINE, band, head, styled, symbol
 
 
 @styled
@@ -14,7 +14,7 @@ def effect_figure(curve: Curve) -> Figure:
     figure = Figure(figsize=(5.4, 3.4), layout="constrained")
     ax = figure.subplots()
     band(ax, curve.x, curve.mean, curve.std, AFTER, "learned")
-    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+    ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
     signal = " + ".join(symbol(name) for name in curve.signal.split(" + "))
     ax.set(xlim=(curve.x[0], curve.x[-1]), xlabel=f"{signal} [{curve.signal_unit}]")
     ax.set_ylabel(f"force at joint {curve.joint} [{curve.unit}]")
@@ -37,7 +37,7 @@ def screen_figure(
     ax.barh([label for label, _ in top], [gain for _, gain in top], color=colours, height=0.7)
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
-    ax.axvline(0, color=ZERO, lw=0.7)
+    ax.axvline(0, color=ZERO_LINE, lw=0.7)
     ax.set_xlabel(measure)
     head(figure, "Screening scores", [ax])
     return figure

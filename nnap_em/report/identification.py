@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ..data.logs import Logs
 from ..diagnosis.keys import listed
 from ..em.build import build_system
-from ..em.loop import REFUSED
+from ..em.loop import STEP_REFUSED
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import misfits, moved
 from ..fit.predict import posterior_of
@@ -105,7 +105,7 @@ def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
     early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
-    rested += f", until {fitted.state.stop}" * (fitted.state.stop == REFUSED)
+    rested += f", until {fitted.state.stop}" * (fitted.state.stop == STEP_REFUSED)
     text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
     first = [f"The fit does not describe the motion, do not use it: {'; '.join(misfit)}."] * bool(misfit)
     notes = [sentence(fitted.horizon_note)] * bool(fitted.horizon_note)

@@ -5,19 +5,19 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from .style import BLUE, GREEN, READING, TRUTH, VERMILION, ZERO, head, styled
+from .style import BLUE, GREEN, READING, TRUTH, VERMILION, ZERO_LINE, head, styled
 
-MOST = 6
+DRAWN_LOGS = 6
 """Logs that are drawn."""
-WIDE = 10.0
+LOG_AXIS_RATIO = 10.0
 """Times the shortest interval from which on intervals are drawn on a logarithmic axis."""
-_PARTS = {"train": ("training", BLUE), "test": ("test", GREEN), None: ("dropped", READING)}
+_SPLITS = {"train": ("training", BLUE), "test": ("test", GREEN), None: ("dropped", READING)}
 
 
 @styled
 def timeline(document: Mapping[str, Any]) -> Figure:
     """A row for each topic that is used and one for the sequences, and the intervals of the messages beside them."""
-    logs = document["logs"][:MOST]
+    logs = document["logs"][:DRAWN_LOGS]
     used = [[topic for topic in log["topics"] if topic["columns"] and topic["clock"]] for log in logs]
     heights = [len(topics) + 1 for topics in used]
     figure = Figure(figsize=(9.0, 1.1 + 0.42 * sum(heights) + 0.45 * len(logs)), layout="constrained")
@@ -29,7 +29,7 @@ def timeline(document: Mapping[str, Any]) -> Figure:
             _intervals(right, y, topic)
         for s in log["sequences"]:
             part = s["file"].split("/")[0] if s["file"] else None
-            label, colour = _PARTS[part]
+            label, colour = _SPLITS[part]
             length = s["rows"] * document["dt"]
             left.barh(len(topics), length, 0.55, s["start"], color=colour, label=label, edgecolor="white", lw=0.6)
         left.set(yticks=range(len(topics) + 1), yticklabels=[*names, "sequences"], xlabel="time [s]")
@@ -37,11 +37,11 @@ def timeline(document: Mapping[str, Any]) -> Figure:
         left.set_ylim(len(topics) + 0.5, -0.5)
         right.set(ylim=left.get_ylim(), yticks=[], xlabel="interval [ms]")
         intervals = [1e3 / topic["rate"] for topic in topics]
-        if max(intervals) > WIDE * min(intervals):
+        if max(intervals) > LOG_AXIS_RATIO * min(intervals):
             right.set_xscale("log")
         else:
             right.set_xlim(left=0.0)
-        right.axvline(1e3 * document["dt"], color=ZERO, ls="--", lw=1.0, label="one row")
+        right.axvline(1e3 * document["dt"], color=ZERO_LINE, ls="--", lw=1.0, label="one row")
         left.grid(axis="y", visible=False)
     undrawn = len(document["logs"]) - len(logs)
     head(figure, "Topics and sequences", list(grid.ravel()), f"{undrawn} further logs are not drawn" if undrawn else "")

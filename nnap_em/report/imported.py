@@ -19,7 +19,7 @@ from .tables import write_json
 
 NOTABLE = 0.2
 """Share of a row from which on a delay, where it is surely one, is pointed out."""
-SURE = 4.0
+CERTAIN_DELAY = 4.0
 """Standard deviations from which on a delay is surely one."""
 
 
@@ -96,7 +96,7 @@ def _remarks(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
 
 def surely(entry: Delay) -> bool:
     """True where a delay is more than chance."""
-    return bool(np.isfinite(entry.seconds) and abs(entry.seconds) > SURE * entry.std)
+    return bool(np.isfinite(entry.seconds) and abs(entry.seconds) > CERTAIN_DELAY * entry.std)
 
 
 def delay_text(entry: Delay) -> str:

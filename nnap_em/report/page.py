@@ -17,15 +17,15 @@ from matplotlib.figure import Figure
 
 from ..diagnosis.findings import growth
 from ..numerics.digits import finite, number
-from ..residual.statistics import LEVEL
+from ..residual.statistics import FAILS
 from ..storage.files import replace_text
 from . import wording
 from .vocabulary import MEANINGS, WORDS
 from .wording import ratio, reached
 
-PLACES = ("found", "error", "residual", "details")
+FIGURE_SECTIONS = ("found", "error", "residual", "details")
 """Sections that figures may stand in."""
-MOST, ROOM = 5, 900_000
+MOST_PICTURES, PICTURE_BYTES = 5, 900_000
 """Pictures to choose from under one title, and bytes of all of them, at most; the first is always there."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _TRUST = {
@@ -88,8 +88,8 @@ def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
 def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     """The whole page; raises ValueError where an image is neither PNG nor SVG."""
     for picture in pictures:
-        if picture.place not in PLACES:
-            raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(PLACES)}")
+        if picture.place not in FIGURE_SECTIONS:
+            raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(FIGURE_SECTIONS)}")
     error, effects = document.get("error") or {}, document.get("effects") or []
     parameters = document.get("parameters") or {}
     return rendered(
@@ -135,10 +135,10 @@ def _environment() -> jinja2.Environment:
     }
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {
-        "most": MOST,
+        "most": MOST_PICTURES,
         "meanings": MEANINGS,
         "words": WORDS,
-        "level": LEVEL,
+        "level": FAILS,
         "at": _at,
         "ratio": ratio,
     }
@@ -202,7 +202,7 @@ def _failures(tests: Any) -> _Failed | None:
 
 def _fails(test: Mapping[str, Any]) -> bool:
     p = test.get("p_value")
-    return finite(p) and p < LEVEL  # type: ignore[operator]
+    return finite(p) and p < FAILS  # type: ignore[operator]
 
 
 def _doubted(document: Mapping[str, Any]) -> bool:

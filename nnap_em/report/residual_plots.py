@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ..residual.residual import Names, Residual
 from ..residual.statistics import LAGS, autocorrelation
-from .style import ACROSS, AFTER, BEFORE, NORMAL_90, ZERO, dotted, head, styled, symbol
+from .style import ACROSS, AFTER, BEFORE, NORMAL_90, ZERO_LINE, dotted, head, styled, symbol
 
 
 class _Bins(NamedTuple):
@@ -166,11 +166,11 @@ def _draw(ax: Axes, panel: _Panel, sides: Sequence[_Side], *, bold: bool) -> Non
         band = binned.mean - binned.half, binned.mean + binned.half
         ax.fill_between(binned.centre, *band, color=colour, alpha=0.4, lw=0)
         ax.plot(binned.centre, binned.mean, color=colour, label=label, lw=1.4)
-    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+    ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
     ax.set(xlabel=panel.kind.label, xlim=(panel.edges[0], panel.edges[-1]))
     if panel.kind.turn or panel.wrapped:
         _turn_ticks(ax, panel.edges)
-    share = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO)
+    share = ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, color=ZERO_LINE)
     if bold:
         share.set(color="#222222", weight="bold")
 
@@ -251,7 +251,7 @@ def _autocorrelations(ax: Axes, errors: _Errors) -> None:
     for r, _, colour, label in correlations:
         dotted(ax, np.arange(1, r.size), r[1:], colour, label)
     reach = max(0.1, *(1.15 * float(np.max(np.abs(r[1:]), initial=0)) for r, *_ in correlations))
-    ax.axhline(0, color=ZERO, lw=0.7, zorder=0)
+    ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
     ax.set(ylim=(-reach, reach), xlim=(0.5, LAGS + 0.5))
 
 
@@ -264,6 +264,6 @@ def _quantiles(ax: Axes, errors: _Errors) -> None:
         expected, got = scipy.stats.norm.ppf(p), np.quantile(x, p)
         dotted(ax, expected, got, colour, label)
         most = max(most, float(np.max(np.abs(got))))
-    ax.plot([-4, 4], [-4, 4], color=ZERO, lw=0.9, ls=(0, (4, 2)), label="a right model", zorder=0)
+    ax.plot([-4, 4], [-4, 4], color=ZERO_LINE, lw=0.9, ls=(0, (4, 2)), label="a right model", zorder=0)
     most = min(most, 12.0) * 1.05
     ax.set(xlim=(-4, 4), ylim=(-most, most))

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 # Okabe & Ito's colours for the colour-blind; black is the truth, grey the readings.
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
-TRUTH, READING, ZERO = "#000000", "#8A8A8A", "#777777"
+TRUTH, READING, ZERO_LINE = "#000000", "#8A8A8A", "#777777"
 BEFORE, AFTER = VERMILION, BLUE
 NORMAL_90 = 1.6449
 """Half width of the central 90 % of a normal distribution, in standard deviations."""

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from ..data.dataset import Dataset
 from ..fit.identify import Identified
 from .residual import Names, Residual, residual
-from .statistics import LAGS, LEVEL, bias, dependence, holm, normality, spread, whiteness
+from .statistics import FAILS, LAGS, bias, dependence, holm, normality, spread, whiteness
 
-SLIGHT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
+SMALL_MISFIT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
 """Sizes below which a failed test is called small."""
 WHITE = 0.25
 """Largest autocorrelation at which innovations count as white; 0.4 to 0.5 on real machines."""
@@ -80,10 +80,10 @@ def tests(residual: Residual, names: Names) -> list[Test]:
     corrected = holm([p for _, _, (_, p, _) in rows])
     out = []
     for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
-        slight = bool(p < LEVEL and abs(size) < SLIGHT[name.split()[0]])
+        slight = bool(p < FAILS and abs(size) < SMALL_MISFIT[name.split()[0]])
         out.append(
             Test(
-                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < LEVEL), size, slight), slight
+                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < FAILS), size, slight), slight
             )
         )
     return out

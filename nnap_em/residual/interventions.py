@@ -19,9 +19,9 @@ from ..em.build import measure_scales
 from ..fit.identify import Identified
 from .residual import Names, Residual, names_of, residual
 
-WIDTHS = (0.2, 0.4, 0.8)
+WINDOWS = (0.2, 0.4, 0.8)
 """Lengths of the Hann windows over which forces are averaged [s], each twice its width at half height."""
-STEP = 0.03
+WINDOW_DISTANCE = 0.03
 """Time between the windows that are compared [s]."""
 LEVEL = 4.0
 """Smallest disturbance, in standard deviations: normal noise reaches it once in some thousand windows."""
@@ -31,15 +31,15 @@ ALONE = 2.0
 """Factor on `LEVEL` at a state that has no neighbours."""
 SMALL = 0.05
 """Smallest disturbance, as a share of the typical torque of its joint."""
-NEAR, NEIGHBOURS = 1.2, 5
+NEIGHBOUR_DISTANCE, NEIGHBOURS = 1.2, 5
 """Largest distance of a neighbour in state space, in radians or in rms of rates and inputs; number of neighbours."""
 VIEW, OTHERS = 0.5, 10
 """The same two numbers for a comparison by the signals of one joint alone."""
 REPEATED = 0.5
 """Share of a force from which on, as the mean of its neighbours, it is a law of the machine."""
-APART = 1.0
+NEIGHBOUR_TIME = 1.0
 """Time between two moments of a recording from which on they are neighbours of each other [s]."""
-EDGE = 0.25
+EDGE_SHARE = 0.25
 """Share of its peak at which a disturbance begins and ends."""
 
 
@@ -114,7 +114,7 @@ class Places(NamedTuple):
     seq: Int[np.ndarray, " place"]
     row: Int[np.ndarray, " place"]
     state: Float[np.ndarray, "place feature"]
-    """All that a law may depend on, in units in which a distance of `NEAR` is small."""
+    """All that a law may depend on, in units in which a distance of `NEIGHBOUR_DISTANCE` is small."""
     subspaces: tuple[Float[np.ndarray, "place feature"], ...]
     """All that a law of one joint may depend on: its angle and rate; the input and rate."""
 
@@ -124,11 +124,11 @@ class Places(NamedTuple):
 
 
 def places(residual: Residual, names: Names, dt: float) -> Places:
-    """One place every `STEP` of all sequences, where the state is known."""
+    """One place every `WINDOW_DISTANCE` of all sequences, where the state is known."""
     dof = len(names.coordinates)
-    q, v, u = residual.state[..., :dof], residual.state[..., dof:], averaged(residual.u, max(3, round(WIDTHS[0] / dt)))
+    q, v, u = residual.state[..., :dof], residual.state[..., dof:], averaged(residual.u, max(3, round(WINDOWS[0] / dt)))
     seq, row = np.nonzero(np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1) & residual.valid)
-    keep = row % max(1, round(STEP / dt)) == 0
+    keep = row % max(1, round(WINDOW_DISTANCE / dt)) == 0
     seq, row = seq[keep], row[keep]
 
     def scaled(a):
@@ -151,7 +151,7 @@ def neighbours(
     """The places nearest to each in state space; True for those that count: of another moment, and one a moment."""
     count = len(samples.seq)
     near = min(128, count)
-    distance, place = KDTree(samples.state).query(samples.state, k=near, distance_upper_bound=NEAR)
+    distance, place = KDTree(samples.state).query(samples.state, k=near, distance_upper_bound=NEIGHBOUR_DISTANCE)
     distance, place = (a.reshape(count, near) for a in (distance, place))
     known = np.isfinite(distance)
     place = np.where(known, place, 0)
@@ -189,11 +189,11 @@ def disturbances(
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
     force = np.where(known[..., None], residual.force, np.nan)
     force[:, 0] = np.nan  # no reading before it fixes the start
-    samples, separation = places(residual._replace(valid=known), names, dt), max(1, round(APART / dt))
+    samples, separation = places(residual._replace(valid=known), names, dt), max(1, round(NEIGHBOUR_TIME / dt))
     if not samples.seq.size:
         return ()
     place, counts = neighbours(samples, separation)
-    lengths = list(dict.fromkeys(max(3, round(w / dt)) for w in WIDTHS))
+    lengths = list(dict.fromkeys(max(3, round(w / dt)) for w in WINDOWS))
     windows = [window_mean(force, rows) for rows in lengths]
     out: list[Intervention] = []
     for j in range(force.shape[-1]):
@@ -242,7 +242,7 @@ def _sure(mean, std, samples: Places, place, counts) -> Float[np.ndarray, " plac
 
 def _extent(mean: Float[np.ndarray, " time"], row: int, sign: float) -> tuple[int, int]:
     """First and last row about `row` at which the force is more than a share of its peak."""
-    small = ~(sign * mean > EDGE * sign * mean[row])
+    small = ~(sign * mean > EDGE_SHARE * sign * mean[row])
     before, after = np.flatnonzero(small[:row]), np.flatnonzero(small[row:])
     return int(before[-1] + 1) if before.size else 0, int(row + max(after[0] - 1, 0)) if after.size else mean.size - 1
 

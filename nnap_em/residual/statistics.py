@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 LAGS = 20
 """Samples over which innovations are tested for whiteness."""
-LEVEL = 0.05
+FAILS = 0.05
 """Corrected p-value below which a test counts as failed."""
 _GROUPS, _GROUP = 20, 50
 """Least number of groups, and least number of readings in a group where there are enough."""

@@ -24,7 +24,7 @@ from .kalman import Cubature, Filtered, Tangent, absorbed, linear_reading, moved
 from .linear import linear_posterior
 from .posterior import AbstractBranching, Posterior, likeliest
 
-WIDE = 0.2
+WIDE_STD = 0.2
 """Standard deviation of an unread angle beyond which one Gaussian does not describe it [rad].
 
 Three narrower ones of 0.13 rad, about that of a hypothesis of the start, do. On four real double pendulums the filter's
@@ -131,7 +131,7 @@ def mixture_filter(
     seq: Prepared,
     linearise: Callable,
     angles: tuple[int, ...],
-    wide: float = WIDE,
+    wide: float = WIDE_STD,
 ) -> Tree:
     """Gaussian-sum filter with as many places as `start` has components; at most one is split in a row.
 
@@ -195,7 +195,7 @@ class MixtureSmoother(AbstractBranching):
     @property
     def wide(self) -> float:
         """Standard deviation of an angle beyond which one Gaussian is not enough [rad]."""
-        return WIDE
+        return WIDE_STD
 
     @property
     def angles(self) -> tuple[int, ...]:

@@ -30,7 +30,7 @@ from .files import Kind, read_arrays, refuse, sweep, write_arrays
 from .leaves import describe, is_key, name_of, plain, restore
 
 _AGAIN = "remove it, and --resume does this step again; or leave --resume out to begin anew"
-KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
+STEP_KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
 _OWN = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
 HERE: Any = object()
 """Stands for one array or number in the form of an outcome."""
@@ -84,10 +84,10 @@ class Journal:
         leaves = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
         arrays = {str(i): array for i, (_, array) in enumerate(leaves) if array is not None}
         header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in leaves]}
-        write_arrays(self.folder / f"{name}.npz", KIND, header, arrays)
+        write_arrays(self.folder / f"{name}.npz", STEP_KIND, header, arrays)
 
     def _read(self, path: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-        header, arrays = read_arrays(path, KIND)
+        header, arrays = read_arrays(path, STEP_KIND)
         by, of = header.get("by"), header.get("of")
         if by != self.by:
             origin, this = (" and ".join(f"{k} {v}" for k, v in (d or {}).items()) for d in (by, self.by))

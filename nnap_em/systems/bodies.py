@@ -10,7 +10,7 @@ import numpy as np
 from ..data.machine import AXES, OF_BODY, PAIRS, Body, Machine
 from .frames import Layout, Mount
 from .pseudo_inertia import Numbers, stepped
-from .recursion import NOTHING, Inertia, carried, inertia, united
+from .recursion import NO_INERTIA, Inertia, carried, inertia, united
 from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed, times, transposed
 
 MARGIN = 1e-9
@@ -45,7 +45,7 @@ def carried_by(
 
     `loads`, by place of the body, are added to the bodies.
     """
-    inertias = [NOTHING] * len(layout.frames)
+    inertias = [NO_INERTIA] * len(layout.frames)
     for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
             continue

@@ -59,7 +59,7 @@ class Motion(NamedTuple):
     """Acceleration of its origin against free fall [m/s^2]."""
 
 
-NOTHING = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))
+NO_INERTIA = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))
 
 
 def inertia(mass: Scalar, centre: Three, tensor: Turn) -> Inertia:

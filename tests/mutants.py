@@ -132,15 +132,15 @@ MUTANTS = (
     Mutant(
         "a kept program whatever the package says now",
         "numerics/traced.py",
-        "hashlib.sha256(_surroundings() + text.getvalue())",
-        "hashlib.sha256(text.getvalue())",
+        "digest(_surroundings(), function,",
+        "digest(function,",
         "test_traced.py::test_another_text_of_the_package_makes_another",
     ),
     Mutant(
         "a kept program whatever it was made of",
         "numerics/traced.py",
-        "for a in arrays], static))",
-        "for a in arrays]))",
+        "jax.tree.map(mesh, static), name",
+        "name",
         "test_traced.py::test_what_decides_a_program_makes_another[constant]",
     ),
     Mutant(

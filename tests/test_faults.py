@@ -33,9 +33,10 @@ from nnap_em.commands import identify as identify_command
 from nnap_em.effects import catalogue
 from nnap_em.fit.identify import Identified
 from nnap_em.fit.store import load
+from nnap_em.numerics.digest import digest
 from nnap_em.storage import files, journal
 from nnap_em.storage.files import StoreError, sweep
-from nnap_em.storage.journal import HERE, Journal, digest, keeping, step
+from nnap_em.storage.journal import HERE, Journal, keeping, step
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))

@@ -354,8 +354,7 @@ def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, name, mod
 @pytest.mark.parametrize("packing, module", [("zstd", "zstandard"), ("lz4", "lz4")])
 def test_without_the_library_of_the_chunks_the_message_names_it(tmp_path, monkeypatch, packing, module):
     path = _log(tmp_path / "a.mcap", **LAYOUTS[packing])
-    monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setitem(sys.modules, f"{module}.frame", None)
+    monkeypatch.setattr(f"mcap.stream_reader.{module}", None)
     with pytest.raises(DataError, match=rf'packed by {packing}, .*pip install "nnap-em\[logs\]"'):
         _read(path, js=("position[elbow]",))
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 import subprocess
 import sys
 
@@ -92,7 +93,7 @@ def test_other_numbers_are_no_other_program(cache, work, monkeypatch):
 def test_another_text_of_the_package_makes_another(cache, work, monkeypatch):
     smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
     _smoothed(work, smoother, monkeypatch)
-    monkeypatch.setattr(traced, "_surroundings", lambda: b"after an edit")
+    monkeypatch.setattr(traced, "_surroundings", lambda: "after an edit")
     _smoothed(work, smoother, monkeypatch)
     assert len(_kept(cache)) == 2
 
@@ -138,7 +139,7 @@ def test_a_closure_is_told_by_nothing():
     made.__module__ = "nnap_em.somewhere"
     inside = made(2.0)
     inside.__module__ = "nnap_em.somewhere"
-    with pytest.raises(traced.pickle.PicklingError, match="somewhere"):
+    with pytest.raises(TypeError, match="somewhere"):
         traced._key(len, [], inside)
 
 
@@ -151,6 +152,42 @@ def test_what_is_damaged_is_made_anew(cache, work, monkeypatch):
     again = _smoothed(work, smoother, monkeypatch)
     np.testing.assert_array_equal(first.state.mean, again.state.mean)
     assert len((cache.folder / name).read_bytes()) == len(whole)
+
+
+class _Opened:
+    """Writes a file where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_an_entry_is_data_and_runs_nothing(cache, work, monkeypatch, tmp_path):
+    """Neither a pickle nor the name of a function in the place of a program."""
+    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
+    _smoothed(work, smoother, monkeypatch)
+    (name,) = _kept(cache)
+    whole, mark = (cache.folder / name).read_bytes(), tmp_path / "mark"
+    form, _, program = whole.partition(b"\n")
+    assert json.loads(form)[0] == "nnap_em.smoother.posterior:Posterior"
+    other = json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program
+    for content in (pickle.dumps(_Opened(mark)), pickle.dumps((program, _Opened(mark))), other):
+        (cache.folder / name).write_bytes(content)
+        _smoothed(work, smoother, monkeypatch)
+        assert not mark.exists() and (cache.folder / name).read_bytes()[: len(form)] == form
+
+
+def _named(common, one):
+    return {"doubled": common * one}
+
+
+def test_an_outcome_with_other_nodes_than_tuples_and_lists_is_not_kept(cache, monkeypatch):
+    monkeypatch.setattr(_named, "__module__", "nnap_em.somewhere")
+    out = parallel.each(_named, jnp.asarray(2.0), jnp.arange(3.0))
+    np.testing.assert_array_equal(out["doubled"], [0.0, 2.0, 4.0])
+    assert not _kept(cache)
 
 
 def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):

@@ -1,6 +1,7 @@
 """The command line: arguments in, exit status out; the work is in `commands`, and JAX is loaded only for it."""
 
 import argparse
+import functools
 import importlib
 import math
 import os
@@ -185,7 +186,7 @@ def parser() -> argparse.ArgumentParser:
         return _new(commands.add_parser, f"{summary[0].upper()}{summary[1:]}.", examples, name=name, help=summary)
 
     simulate = command("simulate", "write a data set with known truth", _SIMULATE)
-    simulate.add_argument("out", metavar="OUT", type=Path, help="the new folder")
+    _file(simulate, "out", "OUT", "the new folder")
     simulate.add_argument("--system", choices=SYSTEMS, default="acrobot", help="the machine (default: acrobot)")
     simulate.add_argument("--sequences", type=_count, default=20, metavar="N", help="training sequences (20)")
     simulate.add_argument("--test", type=_natural, default=5, metavar="N", help="test sequences (5)")
@@ -193,79 +194,52 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
     simulate.add_argument("--measured", nargs="+", metavar="STATE", help="which states are read")
     for kind, what in (("process", "kick per step"), ("measurement", "readings")):
-        simulate.add_argument(
-            f"--{kind}-noise",
-            nargs=2,
-            type=_positive,
-            metavar=("POSITION", "RATE"),
-            help=f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]",
-        )
+        text = f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]"
+        simulate.add_argument(f"--{kind}-noise", nargs=2, type=_positive, metavar=("POSITION", "RATE"), help=text)
 
     init = command("init", "write a first rig.toml for a log", _INIT)
-    init.add_argument("log", metavar="LOG", type=Path, help="a CSV file with a header, MCAP or HDF5")
+    _file(init, "log", "LOG", "a CSV file with a header, MCAP or HDF5")
     machine = init.add_mutually_exclusive_group()
     machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
-    machine.add_argument(
-        "--model",
-        metavar="FILE",
-        type=Path,
-        help='the machine as MJCF or URDF, which stays where it is, or "equations" to be written',
-    )
-    init.add_argument(
-        "--out", metavar="FOLDER", type=Path, help="for rig.toml (default: that of the log, above train/)"
-    )
+    text = 'the machine as MJCF or URDF, which stays where it is, or "equations" to be written'
+    _file(machine, "--model", "FILE", text)
+    _file(init, "--out", "FOLDER", "for rig.toml (default: that of the log, above train/)")
 
+    several: dict[str, Any] = {"action": "append", "default": []}
     importing = command("import", "write a data set from logs as machines write them", _IMPORT)
-    importing.add_argument("logs", metavar="LOG", nargs="+", type=Path, help="MCAP, HDF5, CSV, Parquet or MAT")
-    importing.add_argument(
-        "--rig", metavar="RIG", type=Path, required=True, help="rig.toml; its [import] says what is where"
-    )
-    importing.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="the new data set")
-    importing.add_argument(
-        "--test", type=_part, default=0.2, metavar="N", help="last sequences kept for the test, or share (0.2)"
-    )
-    importing.add_argument(
-        "--shift",
-        type=_shift,
-        action="append",
-        default=[],
-        metavar="TOPIC=S",
-        help="add seconds to the times of a topic",
-    )
-    importing.add_argument(
-        "--unwrap", action="append", default=[], metavar="COLUMN", help="take out the jumps of a counter"
-    )
+    _file(importing, "logs", "LOG", "MCAP, HDF5, CSV, Parquet or MAT", nargs="+")
+    _file(importing, "--rig", "RIG", "rig.toml; its [import] says what is where", required=True)
+    _file(importing, "--out", "FOLDER", "the new data set", required=True)
+    text = "last sequences kept for the test, or share (0.2)"
+    importing.add_argument("--test", type=_part, default=0.2, metavar="N", help=text)
+    text = "add seconds to the times of a topic"
+    importing.add_argument("--shift", type=_shift, metavar="TOPIC=S", help=text, **several)
+    importing.add_argument("--unwrap", metavar="COLUMN", help="take out the jumps of a counter", **several)
 
     check = command("check", "say whether the logs can identify what is asked", _CHECK)
     identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
     diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
     for bench in (check, identify, diagnose):
-        bench.add_argument("folder", metavar="FOLDER", type=Path, help="the data set: rig.toml, train/, test/")
+        _file(bench, "folder", "FOLDER", "the data set: rig.toml, train/, test/")
     for fits in (identify, diagnose):
-        fits.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
-        fits.add_argument(
-            "--more", action="append", default=[], metavar="NEW", type=Path, help="a folder of further logs to train on"
-        )
-        fits.add_argument("--from", dest="start", metavar="FIT", type=Path, help="a fit of the machine to begin from")
+        _file(fits, "--out", "OUT", "folder for the results", required=True)
+        _file(fits, "--more", "NEW", "a folder of further logs to train on", **several)
+        _file(fits, "--from", "FIT", "a fit of the machine to begin from", dest="start")
     identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
     identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
     identify.add_argument("--epochs", type=_count, default=40, metavar="N", help="at most so many in all (40)")
-    diagnose.add_argument(
-        "--minutes", type=_minutes, metavar="M", help="answer after about M minutes with what is found by then"
-    )
+    text = "answer after about M minutes with what is found by then"
+    diagnose.add_argument("--minutes", type=_minutes, metavar="M", help=text)
+    _file(diagnose, "--logs", "FOLDER", "of that fit, where they were moved", **several)
+
     design = command("design", "find the inputs to play next", _DESIGN)
-    design.add_argument("folder", metavar="FIT", type=Path, help="model.npz or after.npz, or the folder that holds it")
-    design.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the results")
+    _file(design, "folder", "FIT", "model.npz or after.npz, or the folder that holds it")
+    _file(design, "--out", "OUT", "folder for the results", required=True)
     design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be learned (default: all)")
-    design.add_argument("--rival", action="append", default=[], metavar="LAW", help="NAME[:JOINT]: one law more")
+    design.add_argument("--rival", metavar="LAW", help="NAME[:JOINT]: one law more", **several)
     design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
     design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
-    diagnose.add_argument(
-        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of that fit, where they were moved"
-    )
-    design.add_argument(
-        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
-    )
+    _file(design, "--logs", "FOLDER", "of the fit, where they were moved", **several)
     for fits in (identify, diagnose, design):
         fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
         fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
@@ -273,43 +247,40 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument("--profile", action="store_true", help="print a table of the programs that were compiled")
 
     compare = command("compare", "say what changed between fits of one machine", _COMPARE)
-    compare.add_argument("fits", metavar="FIT", nargs="+", type=Path, help="model.npz, or the folder that holds it")
-    compare.add_argument("--out", metavar="OUT", type=Path, help="folder for the page and the numbers")
+    _file(compare, "fits", "FIT", "model.npz, or the folder that holds it", nargs="+")
+    _file(compare, "--out", "OUT", "folder for the page and the numbers")
 
     monitor = command("monitor", "watch a machine, recording by recording", _MONITOR)
-    monitor.add_argument("model", metavar="FIT", type=Path, help="model.npz, or the folder that holds it")
-    monitor.add_argument("folder", metavar="FOLDER", type=Path, help="the recordings")
-    monitor.add_argument("--out", metavar="OUT", type=Path, required=True, help="folder for the page and the numbers")
+    _file(monitor, "model", "FIT", "model.npz, or the folder that holds it")
+    _file(monitor, "folder", "FOLDER", "the recordings")
+    _file(monitor, "--out", "OUT", "folder for the page and the numbers", required=True)
     monitor.add_argument("--rate", type=_rate, default=1e-3, metavar="P", help="false alarms a recording (0.001)")
     monitor.add_argument("--resume", action="store_true", help="keep what OUT/monitor.json says of recordings")
-    monitor.add_argument(
-        "--logs", action="append", default=[], metavar="FOLDER", type=Path, help="of the fit, where they were moved"
-    )
+    _file(monitor, "--logs", "FOLDER", "of the fit, where they were moved", **several)
 
     predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
     smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH_EXAMPLES)
     for use in (predict, smooth):
-        use.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
-        use.add_argument("folder", metavar="FOLDER", type=Path, help="the logs, such as bench/test")
-        use.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the CSV files")
-        use.add_argument("--mcap", metavar="FILE", type=Path, help="write the log and the results as MCAP, too")
+        _file(use, "model", "MODEL", "model.npz, or the folder that holds it")
+        _file(use, "folder", "FOLDER", "the logs, such as bench/test")
+        _file(use, "--out", "DIR", "folder for the CSV files", required=True)
+        _file(use, "--mcap", "FILE", "write the log and the results as MCAP, too")
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 
+    text = "use spikes and what a stuck, late or saturated sensor reads"
     for reads in (check, identify, diagnose, design, monitor, predict, smooth):
-        reads.add_argument(
-            "--trust-readings", action="store_true", help="use spikes and what a stuck, late or saturated sensor reads"
-        )
+        reads.add_argument("--trust-readings", action="store_true", help=text)
 
     export = command("export", "write a fitted model for other programs", _EXPORT)
-    export.add_argument("model", metavar="MODEL", type=Path, help="model.npz, or the folder that holds it")
-    export.add_argument("--out", metavar="OUT", type=Path, help="folder for the files")
-    export.add_argument("--mjcf", metavar="FILE", type=Path, help="write a machine that came from a file back as MJCF")
+    _file(export, "model", "MODEL", "model.npz, or the folder that holds it")
+    _file(export, "--out", "OUT", "folder for the files")
+    _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")
     export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
-    export.add_argument("--urdf", metavar="FILE", type=Path, help="write such a machine as URDF")
-    export.add_argument("--c", metavar="FILE", type=Path, help="write friction and feed-forward torque as C99")
-    export.add_argument("--observer", metavar="FILE", type=Path, help="write an online estimator of the states as C99")
-    export.add_argument("--fmu", metavar="FILE", type=Path, help="write that estimator as an FMU (FMI 3.0)")
+    _file(export, "--urdf", "FILE", "write such a machine as URDF")
+    _file(export, "--c", "FILE", "write friction and feed-forward torque as C99")
+    _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
+    _file(export, "--fmu", "FILE", "write that estimator as an FMU (FMI 3.0)")
     export.add_argument("--float", action="store_true", help="numbers of 32 bits in these two")
     export.add_argument("--draws", type=_count, metavar="N", help="write N draws of the posterior to OUT instead")
     export.add_argument("--seed", type=_natural, default=0, help="of the draws (0)")
@@ -414,6 +385,11 @@ def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: s
     return make(description=summary, epilog=examples, formatter_class=form, allow_abbrev=False, **options)
 
 
+def _file(command: argparse._ActionsContainer, name: str, metavar: str, text: str, **options: Any) -> None:
+    """Add the path of a file or folder to the arguments of a command."""
+    command.add_argument(name, metavar=metavar, type=Path, help=text, **options)
+
+
 _N = TypeVar("_N", int, float)
 
 
@@ -426,24 +402,14 @@ def _number(text: str, kind: type[_N], low: int | float, form: str, below: float
     raise argparse.ArgumentTypeError(f"found {text!r}; give {form}")
 
 
-def _count(text: str) -> int:
-    return _number(text, int, 1, "a whole number of 1 or more")
-
-
-def _natural(text: str) -> int:
-    return _number(text, int, 0, "a whole number of 0 or more")
-
-
-def _time(text: str) -> float:
-    return _number(text, float, 0.0, "seconds, 0 or more")
-
-
-def _minutes(text: str) -> float:
-    return _number(text, float, math.ulp(0.0), "minutes, more than 0")
-
-
-def _rate(text: str) -> float:
-    return _number(text, float, 1e-12, "false alarms a recording, above 0 and below 0.2", below=0.2)
+_count = functools.partial(_number, kind=int, low=1, form="a whole number of 1 or more")
+_natural = functools.partial(_number, kind=int, low=0, form="a whole number of 0 or more")
+_positive = functools.partial(_number, kind=float, low=math.ulp(0.0), form="a number above 0")
+_time = functools.partial(_number, kind=float, low=0.0, form="seconds, 0 or more")
+_minutes = functools.partial(_number, kind=float, low=math.ulp(0.0), form="minutes, more than 0")
+_rate = functools.partial(
+    _number, kind=float, low=1e-12, below=0.2, form="false alarms a recording, above 0 and below 0.2"
+)
 
 
 def _part(text: str) -> float:
@@ -454,10 +420,6 @@ def _part(text: str) -> float:
 def _shift(text: str) -> tuple[str, float]:
     topic, _, seconds = text.rpartition("=")
     return topic, _number(seconds, float, -1e12, "TOPIC=SECONDS, such as /joint_states=-0.012")
-
-
-def _positive(text: str) -> float:
-    return _number(text, float, 5e-324, "a number above 0")
 
 
 if __name__ == "__main__":

@@ -21,9 +21,10 @@ from ..data.limits import Bounds
 from ..data.rig import Declared, Rig
 from ..effects import catalogue, parts
 from ..model.dynamic_friction import DynamicFriction
+from ..numerics.digest import plain
 from ..smoother import kinds
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
-from ..storage.leaves import describe, name_of, plain, restore, tuples
+from ..storage.leaves import describe, name_of, restore, tuples
 from ..systems import systems
 from .identify import Identified, begin
 

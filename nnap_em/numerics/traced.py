@@ -10,9 +10,9 @@ kept.
 import functools
 import hashlib
 import importlib.metadata
-import io
+import json
 import logging
-import pickle
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -20,6 +20,9 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 from jax.core import Tracer
+from jax.sharding import Mesh
+
+from .digest import digest, full_name
 
 KEY_PACKAGES = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
 """Packages whose text a key stands for, by its own hash or by their version."""
@@ -74,7 +77,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> C
     arrays, inside = jax.tree.flatten(dynamic)
     try:
         key = _key(function, arrays, static)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
+    except TypeError as error:
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
     entry = _unpacked(cache.get(key))
@@ -89,7 +92,8 @@ def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> C
         flat.__name__ = flat.__qualname__ = run.__name__
         try:
             exported = jax.export.export(jax.jit(flat), platforms=(jax.export.default_export_platform(),))(*arrays)
-            cache.put(key, pickle.dumps((bytes(exported.serialize()), structures[-1])))
+            form = _form(jax.tree.unflatten(structures[-1], [0] * structures[-1].num_leaves))
+            cache.put(key, json.dumps(form).encode() + b"\n" + exported.serialize())
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
@@ -109,11 +113,33 @@ def _unpacked(content: bytes | None) -> tuple[jax.export.Exported, Any] | None:
     if content is None:
         return None
     try:
-        program, outside = pickle.loads(content)
-        return jax.export.deserialize(bytearray(program)), outside
+        form, _, program = content.partition(b"\n")
+        return jax.export.deserialize(bytearray(program)), jax.tree.structure(_tree(json.loads(form)))
     except Exception as error:  # whatever it is that was damaged: it is made anew
         logging.getLogger(__name__).debug("a kept program cannot be read: %s", error)
         return None
+
+
+def _form(tree: Any) -> Any:
+    """JSON of an outcome with 0 for each array: the kind of a tuple or list, then its entries.
+
+    Raises TypeError for another kind of node.
+    """
+    if isinstance(tree, tuple | list):
+        return [f"{type(tree).__module__}:{type(tree).__qualname__}", *map(_form, tree)]
+    if tree not in (None, 0):
+        raise TypeError(f"a {type(tree).__name__} in its outcome")
+    return tree
+
+
+def _tree(form: Any) -> Any:
+    """The outcome that `_form` describes: data, of which nothing but named tuples, tuples and lists is made."""
+    if not isinstance(form, list):
+        return form
+    kind, *entries = form
+    module, _, name = kind.partition(":")
+    make = {"builtins:tuple": tuple, "builtins:list": list}.get(kind) or getattr(sys.modules[module], name)._make
+    return make(map(_tree, entries))
 
 
 def _shape(a: jax.Array) -> tuple[str, bool]:
@@ -121,35 +147,25 @@ def _shape(a: jax.Array) -> tuple[str, bool]:
 
 
 def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
-    """Key of a program, as one number."""
-    text = io.BytesIO()
-    pickler = _Telling(text)
-    pickler.fast = True  # the same whichever objects are the same
-    pickler.dump((function, [_shape(a) for a in arrays], static))
-    return hashlib.sha256(_surroundings() + text.getvalue()).hexdigest()
+    """Key of a program; TypeError where something may decide it that is not described whole."""
+    mesh = lambda leaf: f"{leaf.axis_names} {leaf.devices.shape}" if isinstance(leaf, Mesh) else leaf  # noqa: E731
+    return digest(_surroundings(), function, list(map(_shape, arrays)), jax.tree.map(mesh, static), name=_name)
 
 
-class _Telling(pickle.Pickler):
-    """Describes its input, in every process alike; refuses an object that it cannot describe whole."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        """Reducer as `pickle` has it."""
-        if isinstance(obj, jax.sharding.Mesh):
-            return repr, (f"{obj.axis_names} {obj.devices.shape}",)
-        if obj in (str, repr) or not (isinstance(obj, type) or (callable(obj) and hasattr(obj, "__qualname__"))):
-            return NotImplemented
-        package, code = str(obj.__module__).partition(".")[0], getattr(obj, "__code__", None)
-        if package not in KEY_PACKAGES or ("<" in obj.__qualname__ and getattr(obj, "__closure__", ()) is not None):
-            raise pickle.PicklingError(f"it holds {obj.__module__}.{obj.__qualname__}")
-        return str, (f"{obj.__module__}.{obj.__qualname__} {code and code.co_firstlineno}",)
+def _name(code: Any) -> str:
+    """Module, name and line of a class or function; TypeError for one of another package, and for a closure."""
+    lines, package = getattr(code, "__code__", None), str(code.__module__).partition(".")[0]
+    if package not in KEY_PACKAGES or ("<" in code.__qualname__ and getattr(code, "__closure__", ()) is not None):
+        raise TypeError(f"it holds {full_name(code)}")
+    return f"{full_name(code)} {lines and lines.co_firstlineno}"
 
 
 @functools.cache
-def _surroundings() -> bytes:
+def _surroundings() -> str:
     """The package's text, what it stands on and how JAX is set, as one number."""
-    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    package, sha256 = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+        sha256.update(str(path.relative_to(package)).encode() + path.read_bytes())
     versions = [f"{name} {importlib.metadata.version(name)}" for name in STANDS_ON]
-    digest.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
-    return digest.digest()
+    sha256.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
+    return sha256.hexdigest()

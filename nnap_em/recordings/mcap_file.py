@@ -156,10 +156,8 @@ def _opened(path: Path) -> Iterator[_Open]:
         try:
             yield _Open(path, frames, counts, firsts)
         except Broken as broken:
-            text = str(broken)
-            hint = "" if ";" in text else "; use another copy, or `mcap recover` it"
-            hint = text.endswith("pip install") * f" {EXTRA.removeprefix('pip install ')}" or hint
-            raise DataError(f"{path}: {text}{hint}") from None
+            hint = "" if ";" in str(broken) else "; use another copy, or `mcap recover` it"
+            raise DataError(f"{path}: {broken}{hint}") from None
 
 
 def _samples(log: _Open) -> dict[int, list[bytes]]:

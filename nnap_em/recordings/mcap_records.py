@@ -7,12 +7,13 @@ by record.
 import io
 import os
 import struct
-import zlib
 from collections.abc import Callable, Container, Iterator, Mapping
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Int, UInt8
+
+from .recording import EXTRA
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, END = 3, 4, 5, 6, 7, (2, 15)
@@ -125,39 +126,23 @@ class Frames:
 
 def unpack(record: bytes) -> UInt8[np.ndarray, " byte"]:
     """Content of a chunk record, unpacked; Broken where it is damaged, or of an unknown compression."""
-    size, crc, length = struct.unpack_from("<QII", record, 16)
-    compression = record[32 : 32 + length].decode(errors="replace")
-    packed = memoryview(record)[40 + length :]
-    if compression not in _unpackers:
-        raise Broken(f"compression {compression!r} of its chunks is not read; write it with lz4, zstd or none")
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import UnsupportedCompressionError
+    from mcap.records import Chunk
+    from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(record)))
+    if chunk.compression not in ("", "lz4", "zstd"):
+        raise Broken(f"compression {chunk.compression!r} of its chunks is not read; write it with lz4, zstd or none")
     try:
-        data = _unpackers[compression](packed, size)
-    except ImportError as error:
-        raise Broken(f"its chunks are packed by {compression}, and {error.name} is not there; pip install") from None
+        data, size = get_chunk_data_stream(chunk, validate_crc=True)
+    except UnsupportedCompressionError:
+        raise Broken(f"its chunks are packed by {chunk.compression}, whose library is not there; {EXTRA}") from None
+    except CRCValidationError:
+        raise Broken("the checksum of a chunk does not hold") from None
     except Exception as error:
         raise Broken(f"a chunk cannot be unpacked ({error})") from None
-    if crc and zlib.crc32(data) != crc:
-        raise Broken("the checksum of a chunk does not hold")
-    return np.frombuffer(data, np.uint8)
-
-
-def _lz4(packed: memoryview, size: int) -> bytes:
-    import lz4.frame
-
-    return lz4.frame.decompress(packed)
-
-
-def _zstd(packed: memoryview, size: int) -> bytes:
-    import zstandard
-
-    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-
-
-_unpackers: dict[str, Callable[[memoryview, int], Any]] = {
-    "": lambda packed, size: packed,
-    "lz4": _lz4,
-    "zstd": _zstd,
-}
+    return np.frombuffer(data.read(size), np.uint8)
 
 
 def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:

@@ -11,9 +11,7 @@ arguments differ in one bit is computed anew.  Outside `keeping` nothing of this
 
 import contextlib
 import contextvars
-import dataclasses
 import functools
-import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -24,10 +22,11 @@ import jax
 import numpy as np
 
 from .. import __version__
+from ..numerics.digest import digest
 from ..numerics.parallel import everywhere
 from .deadline import in_time
 from .files import Kind, read_arrays, refuse, sweep, write_arrays
-from .leaves import describe, is_key, name_of, plain, restore
+from .leaves import describe, name_of, restore
 
 _AGAIN = "remove it, and --resume does this step again; or leave --resume out to begin anew"
 STEP_KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
@@ -134,44 +133,3 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
         return remembered  # type: ignore[return-value]
 
     return make
-
-
-def digest(*trees: Any) -> str:
-    """SHA-256 of all that stands in `trees`: numbers to the last bit, types and functions by name.
-
-    Raises TypeError for objects that cannot be distinguished.
-    """
-    sha256 = hashlib.sha256()
-
-    def feed(text: str, content: bytes = b"") -> None:
-        sha256.update(f"{text}\0".encode() + content)
-
-    def walk(node: Any) -> None:
-        kind = f"{type(node).__module__}.{type(node).__qualname__}"
-        if dataclasses.is_dataclass(node):
-            names = [field.name for field in dataclasses.fields(node)]
-            feed(f"{kind}{names}")
-            for name in names:
-                walk(getattr(node, name))
-        elif isinstance(node, Mapping):
-            feed(f"{kind}{list(node)}")
-            for value in node.values():
-                walk(value)
-        elif isinstance(node, tuple | list):
-            feed(f"{kind}{len(node)}")
-            for value in node:
-                walk(value)
-        elif is_key(node):
-            feed(str(jax.random.key_impl(node)), np.asarray(jax.random.key_data(node)).tobytes())
-        elif isinstance(node, jax.Array | np.ndarray | np.generic):
-            array = np.asarray(node)
-            feed(f"{array.dtype.str}{array.shape}", array.tobytes())
-        elif plain(node):
-            feed(repr(node))
-        elif callable(node) and hasattr(node, "__qualname__"):
-            feed(f"{node.__module__}.{node.__qualname__}")
-        else:
-            raise TypeError(f"{kind} cannot be distinguished from another of its kind")
-
-    walk(trees)
-    return sha256.hexdigest()

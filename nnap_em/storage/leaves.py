@@ -6,22 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-
-def plain(value: Any) -> bool:
-    """True for a value that JSON gives back unchanged; tuples come back as tuples."""
-    if isinstance(value, tuple):
-        return all(map(plain, value))
-    return value is None or type(value) in (bool, int, float, str)
+from ..numerics.digest import is_key, plain
 
 
 def tuples(value: Any) -> Any:
     """Plain value as it was before JSON."""
     return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
-
-
-def is_key(value: Any) -> bool:
-    """True for an array of random keys."""
-    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
 def name_of(code: Any) -> str:

@@ -1,4 +1,4 @@
-"""Smoothers, particle filters and one EM epoch on a GPU beside the CPU of the same machine: docs/results/gpu.md.
+"""Smoothers, particle filters and one EM epoch on a GPU beside the CPU of the same machine: docs/results/throughput.md.
 
     python benchmarks/gpu.py [--platforms cpu cuda] [--quick]
 

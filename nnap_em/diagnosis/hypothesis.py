@@ -36,7 +36,7 @@ class Found(NamedTuple):
     removed: float = math.nan
     """Share of the squared error that its refit removed where it was found."""
     candidate: Candidate | None = None
-    """What was fitted; None for a law that was read off."""
+    """Candidate that was fitted; None for a law that was read off."""
 
 
 class Addition(NamedTuple):

@@ -31,7 +31,7 @@ from nnap_em.data.rig import Declared, write_rig
 from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.findings import SuspectReport
 from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.diagnosis.verdict import MISSING_BEFORE, RISEN, veto
+from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
@@ -142,8 +142,8 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
     assert veto(**good) is None
-    assert veto(**good, before=MISSING_BEFORE - 0.01) is None
-    assert veto(**good, before=MISSING_BEFORE + 0.01).code == "before"
+    assert veto(**good, before=KEEP * 0.15 - 0.01) is None
+    assert veto(**good, before=KEEP * 0.15 + 0.01).code == "before"
 
 
 def test_where_nothing_explains_it_the_errors_decide(fit):

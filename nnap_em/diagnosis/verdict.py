@@ -59,9 +59,6 @@ FOLLOWED = 0.5
 REPEATS = 0.2
 """Mean square difference of two recordings, over their mean square, below which they are one motion: real repetitions
 differ by up to 0.13, others by 0.25 and more."""
-MISSING_BEFORE = 0.0
-"""Share of the squared error of an earlier fit's recordings above which a law was missing there: one that came since
-adds to it what it removes now, one that was always there removes the same, and 0 lies in the middle."""
 RISEN = 0.01
 """Chance of errors as large as those of new recordings, by their ranks, below which something changed since a fit."""
 COARSE = 0.1
@@ -181,7 +178,8 @@ def veto(
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
     one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
-    `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit.
+    `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit: a law that
+    counts there as well is missing, and no change.
     """
     if not possible:
         return Rejection("impossible")
@@ -191,7 +189,7 @@ def veto(
         return Rejection("undetermined", amplitude)
     if not needed(removed, required(floor, complexity)):
         return Rejection("small", removed)
-    return Rejection("before", before) if before > MISSING_BEFORE else None
+    return Rejection("before", before) if needed(before, required(floor, complexity)) else None
 
 
 def needed(share: float, floor: float) -> bool:

@@ -43,35 +43,21 @@ def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
     """Columns, as the built-in machines call them, and where they are."""
     out: dict[str, Address] = {}
     for topic in topics:
-        joints = joints_of(topic)
-        names = {joint: f"theta{i}" for i, joint in enumerate(joints, 1)}
-        for column, at in (*joint_columns(topic, names).items(), *_called(topic)):
+        there = {word: at for at, word in reversed(places([topic]))}
+        joints = [match[1] for _, word in places([topic]) if (match := re.fullmatch(r"position\[(.+)\]", word))]
+        for d, array in (("", "position"), ("d", "velocity")):
+            words = {f"{d}theta{i}": f"{array}[{joint}]" for i, joint in enumerate(joints, 1)}
+            out |= {column: there[word] for column, word in words.items() if word in there and column not in out}
+        for column, at in _called(topic):
             out.setdefault(column, at)
-    torques = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
-    efforts = {f"tau{i}": at for i, at in enumerate(_efforts(topics), 1)}
-    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques or efforts)
-
-
-def joints_of(topic: Topic) -> list[str]:
-    """The joints that a topic names, in its order."""
-    return [match[1] for _, word in places([topic]) if (match := re.fullmatch(r"position\[(.+)\]", word))]
-
-
-def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Address]:
-    """Angles and rates of joints, called as a machine calls them; `coordinates` are by the joints' names in the log."""
-    fields = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
-    fields += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
-    there = {word: at for at, word in reversed(places([topic]))}
-    return {column: there[field] for column, field in fields if field in there}
+    efforts = [at for at, word in places(topics) if word.startswith("effort[")]
+    torques = {f"tau{i}": at for i, at in enumerate(commands(topics) or efforts, 1)}
+    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques)
 
 
 def commands(topics: Sequence[Topic]) -> list[Address]:
     """Entries of an array on a topic whose name is that of torques."""
     return [at for at, word in places(topics) if re.fullmatch(r"data(\[\d+\])?", word) and COMMAND.search(str(at))]
-
-
-def _efforts(topics: Sequence[Topic]) -> list[Address]:
-    return [at for at, word in places(topics) if word.startswith("effort[")]
 
 
 def _called(topic: Topic) -> Iterator[tuple[str, Address]]:

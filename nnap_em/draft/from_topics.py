@@ -33,10 +33,8 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
         hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text((*every, 'topic:field')[0])}"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
     draft = drafted(path, columns_table(path, columns), system, specs)
-    lines = [f"# not used: {each}" for each in others(topics, columns)]
-    lines += [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if f'"{name}"' in draft.text]
-    head = "\n[import.columns]    # where each column is in the log\n"
-    return draft._replace(text=draft.text + head + "\n".join(lines) + "\n")
+    used = {name: at for name, at in columns.items() if f'"{name}"' in draft.text}
+    return draft._replace(text="\n".join([draft.text.rstrip(), *addresses(topics, used)]) + "\n")
 
 
 def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
@@ -70,12 +68,17 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
             yield name, Address(topic.name, field, SIZES[column.unit][1] if column.unit else 1.0)
 
 
-def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
-    """Topics of numbers that no column is from; of tables, the columns."""
-    used, there = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
-    tables = [str(at) for at, _ in places(topics) if at.topic[:1] != "/" and (at.topic, at.path) not in there]
-    named = [t for t in topics if t.name[:1] == "/" and t.fields and t.name not in used]
-    return [*(f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named), *tables][:10]
+def addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
+    """Addresses of columns that have another name in the log, after what is not used: topics, or columns of tables."""
+    lines = [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if at != Address("", name)]
+    if lines:
+        used, there = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
+        tables = [str(at) for at, _ in places(topics) if at.topic[:1] != "/" and (at.topic, at.path) not in there]
+        named = [t for t in topics if t.name[:1] == "/" and t.fields and t.name not in used]
+        others = [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named] + tables
+        yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
+        yield from (f"# not used: {each}" for each in others[:10])
+        yield from lines
 
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:

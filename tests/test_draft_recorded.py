@@ -9,7 +9,7 @@ from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2,
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import read_rig
-from nnap_em.draft.from_topics import draft_recorded, found_columns, joint_columns
+from nnap_em.draft.from_topics import draft_recorded, found_columns
 from nnap_em.recordings.recording import Topic
 from nnap_em.systems import specs
 
@@ -59,14 +59,11 @@ def test_hdf5_and_names_of_a_json_log(tmp_path):
     assert 'type = "slide"' in drafted.text and '"dx" = "/slide:vel"' in drafted.text
 
 
-def test_joints_are_called_as_a_machine_calls_them():
-    """The seam for machines whose coordinates are the joints of a file."""
+def test_joints_are_counted_in_the_order_of_their_topic():
     topic = Topic("/js", "", None, ("position[hip]", "position[knee]", "velocity[knee]"))
-    columns = joint_columns(topic, {"hip": "hip", "knee": "knee"})
-    assert {name: str(at) for name, at in columns.items()} == {
-        "hip": "/js:position[hip]", "knee": "/js:position[knee]", "dknee": "/js:velocity[knee]"
+    assert {name: str(at) for name, at in found_columns([topic]).items()} == {
+        "theta1": "/js:position[hip]", "theta2": "/js:position[knee]", "dtheta2": "/js:velocity[knee]"
     }  # fmt: skip
-    assert list(found_columns([topic])) == ["theta1", "theta2", "dtheta2"]
 
 
 def test_a_log_without_a_machine_is_refused(tmp_path):

@@ -209,6 +209,12 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
         write_csv(path, dict(zip(names, columns, strict=True)))
 
 
+def remove_reports(out: Path) -> None:
+    """Remove reports that are not of the models which are written now."""
+    for name in ("report.json", "report.html", "figures.html"):
+        (out / name).unlink(missing_ok=True)
+
+
 def states_of(fitted: Identified, mean, std) -> Channel:
     """Mean and standard deviation of all states as a channel."""
     units = {name: names_of(fitted).unit(name) for name in fitted.model.system.readable}

@@ -11,7 +11,7 @@ from ..diagnosis.search import diagnose
 from ..fit.store import AFTER_FILE, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import go_on, origin, read_bench, resumable, warn_of_torques
+from .common import go_on, origin, read_bench, remove_reports, resumable, warn_of_torques
 
 SEARCH_SHARE = 0.8
 """Share of the minutes given after which the search begins no new step.
@@ -42,12 +42,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds, **began_from)
         journal.open = not diagnosis.complete
         accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
-        for name in (
-            "report.json",
-            "report.html",
-            "figures.html",
-        ):  # older ones are not of the models that are written now
-            (args.out / name).unlink(missing_ok=True)
+        remove_reports(args.out)
         notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
         for name, fitted in (("before.npz", diagnosis.before), (AFTER_FILE, diagnosis.after)):
             save(args.out / name, fitted, fingerprint=mark, notes=notes)

@@ -19,7 +19,7 @@ from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import origin, read_bench, resumable, warn_of_torques
+from .common import origin, read_bench, remove_reports, resumable, warn_of_torques
 
 MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
@@ -39,12 +39,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
         watch, key = _watch(bench.rig, most, epochs, log), jax.random.key(args.seed)
         options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
         fitted = identify(bench.rig, data, **options) if fit is None else identify_from(fit, bench.rig, data, **options)
-        for name in (
-            "report.json",
-            "report.html",
-            "figures.html",
-        ):  # older ones are not of the model that is written now
-            (args.out / name).unlink(missing_ok=True)
+        remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}
         save(args.out / MODEL_FILE, fitted, fingerprint=fingerprint(data), notes=notes)

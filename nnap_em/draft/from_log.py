@@ -176,13 +176,17 @@ def _what(name: str) -> str:
 
 
 def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
-    inputs = [(c.name, spec.driven if c.number is None else c.number) for c in columns if c.kind == "input"]
-    inputs = [(name, joint) for name, joint in inputs if joint <= spec.joints]
-    names = f"[{', '.join(toml_text(name) for name, _ in inputs)}]" if inputs else "..."
-    joints = str([joint for _, joint in inputs]) if inputs else "..."
-    mark = "" if inputs else "# "
+    inputs = {c.name: spec.driven if c.number is None else c.number for c in columns if c.kind == "input"}
+    return driven({name: str(joint) for name, joint in inputs.items() if joint <= spec.joints})
+
+
+def driven(inputs: Mapping[str, str], joints: bool = True) -> Iterator[str]:
+    """Columns of inputs, and the joint that each drives as TOML has it; as comments where there are none."""
+    mark, both = "" if inputs else "# ", (map(toml_text, inputs), inputs.values())
+    names, places = (f"[{', '.join(each)}]" if inputs else "..." for each in both)
     yield from ("", "[input]", f'{mark}columns = {names}    # N m, or N on a slide; such as ["u"]')
-    yield f"{mark}joints = {joints}    # the joint that each drives, counted from 1; such as [1]"
+    if joints:
+        yield f"{mark}joints = {places}    # the joint that each drives, by name or counted from 1; such as [1]"
 
 
 def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Iterator[str]:

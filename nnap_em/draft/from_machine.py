@@ -19,8 +19,8 @@ from ..machines.urdf import stuck
 from ..recordings.files import reader
 from ..recordings.recording import Address, Topic, places
 from ..recordings.text_file import foreign
-from .from_log import DRAFT_HEAD, Draft, from_one, meaning, measurement, numbers, sampling
-from .from_topics import COMMAND, columns_table, commands, others
+from .from_log import DRAFT_HEAD, Draft, driven, from_one, meaning, measurement, numbers, sampling
+from .from_topics import COMMAND, addresses, columns_table, commands
 
 
 def draft_machine(path: Path, model: Path, home: Path) -> Draft:
@@ -48,7 +48,7 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         *_driven(machine, {column: joint for column, (_, joint) in inputs.items()}),
         *sampling(table, [meaning("time")] if "time" in table else []),
         *measurement(table, named, spec, lambda name: machine_unit(text, name)),
-        *_addresses(topics, everything),
+        *addresses(topics, everything),
     ]
     return Draft("\n".join([DRAFT_HEAD.format(name=toml_text(model.stem)), *lines]) + "\n", ())
 
@@ -168,12 +168,7 @@ def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
         yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
         yield from _servos(machine)
         return
-    mark = "" if joints else "# "
-    columns = f"[{', '.join(map(toml_text, joints))}]" if joints else "..."
-    yield from ("", "[input]", f"{mark}columns = {columns}    # N m, or N on a slide")
-    if not machine.motors:
-        places = f"[{', '.join(map(toml_text, joints.values()))}]" if joints else "..."
-        yield f"{mark}joints = {places}    # the joint that each drives"
+    yield from driven({name: toml_text(joint) for name, joint in joints.items()}, joints=not machine.motors)
 
 
 def _servos(machine: Machine) -> Iterator[str]:
@@ -185,12 +180,3 @@ def _servos(machine: Machine) -> Iterator[str]:
         yield f"# [input.{toml_text(motor.name)}]    # the goal of a {motor.kind} servo; in the file {numbers}"
         yield from (f"# {key} = {{ mean = {x:.4g}, std = {0.2 * abs(x):.2g} }}" for key, x in motor.numbers if x)
         yield "# delay = { mean = 0.01, std = 0.01 }    # s"
-
-
-def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
-    """Addresses of columns that have another name in the log."""
-    lines = [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if at != Address("", name)]
-    if lines:
-        yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
-        yield from (f"# not used: {each}" for each in others(topics, columns))
-        yield from lines

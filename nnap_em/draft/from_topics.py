@@ -33,45 +33,29 @@ def draft_recorded(path: Path, system: str | None, specs: Mapping[str, SystemSpe
         hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text((*every, 'topic:field')[0])}"
         raise DataError(f"{path}: no topic looks like joints or torques (topics: {names}); {hint}")
     draft = drafted(path, columns_table(path, columns), system, specs)
-    lines = [f"# not used: {each}" for each in others(topics, columns)]
-    lines += [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if f'"{name}"' in draft.text]
-    head = "\n[import.columns]    # where each column is in the log\n"
-    return draft._replace(text=draft.text + head + "\n".join(lines) + "\n")
+    used = {name: at for name, at in columns.items() if f'"{name}"' in draft.text}
+    return draft._replace(text="\n".join([draft.text.rstrip(), *addresses(topics, used)]) + "\n")
 
 
 def found_columns(topics: Sequence[Topic]) -> dict[str, Address]:
     """Columns, as the built-in machines call them, and where they are."""
     out: dict[str, Address] = {}
     for topic in topics:
-        joints = joints_of(topic)
-        names = {joint: f"theta{i}" for i, joint in enumerate(joints, 1)}
-        for column, at in (*joint_columns(topic, names).items(), *_called(topic)):
+        there = {word: at for at, word in reversed(places([topic]))}
+        joints = [match[1] for _, word in places([topic]) if (match := re.fullmatch(r"position\[(.+)\]", word))]
+        for d, array in (("", "position"), ("d", "velocity")):
+            words = {f"{d}theta{i}": f"{array}[{joint}]" for i, joint in enumerate(joints, 1)}
+            out |= {column: there[word] for column, word in words.items() if word in there and column not in out}
+        for column, at in _called(topic):
             out.setdefault(column, at)
-    torques = {f"tau{i}": at for i, at in enumerate(commands(topics), 1)}
-    efforts = {f"tau{i}": at for i, at in enumerate(_efforts(topics), 1)}
-    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques or efforts)
-
-
-def joints_of(topic: Topic) -> list[str]:
-    """The joints that a topic names, in its order."""
-    return [match[1] for _, word in places([topic]) if (match := re.fullmatch(r"position\[(.+)\]", word))]
-
-
-def joint_columns(topic: Topic, coordinates: Mapping[str, str]) -> dict[str, Address]:
-    """Angles and rates of joints, called as a machine calls them; `coordinates` are by the joints' names in the log."""
-    fields = [(name, f"position[{joint}]") for joint, name in coordinates.items()]
-    fields += [(f"d{name}", f"velocity[{joint}]") for joint, name in coordinates.items()]
-    there = {word: at for at, word in reversed(places([topic]))}
-    return {column: there[field] for column, field in fields if field in there}
+    efforts = [at for at, word in places(topics) if word.startswith("effort[")]
+    torques = {f"tau{i}": at for i, at in enumerate(commands(topics) or efforts, 1)}
+    return out | ({} if any(meaning(name).kind == "input" for name in out) else torques)
 
 
 def commands(topics: Sequence[Topic]) -> list[Address]:
     """Entries of an array on a topic whose name is that of torques."""
     return [at for at, word in places(topics) if re.fullmatch(r"data(\[\d+\])?", word) and COMMAND.search(str(at))]
-
-
-def _efforts(topics: Sequence[Topic]) -> list[Address]:
-    return [at for at, word in places(topics) if word.startswith("effort[")]
 
 
 def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
@@ -84,12 +68,17 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
             yield name, Address(topic.name, field, SIZES[column.unit][1] if column.unit else 1.0)
 
 
-def others(topics: Sequence[Topic], columns: Mapping[str, Address]) -> list[str]:
-    """Topics of numbers that no column is from; of tables, the columns."""
-    used, there = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
-    tables = [str(at) for at, _ in places(topics) if at.topic[:1] != "/" and (at.topic, at.path) not in there]
-    named = [t for t in topics if t.name[:1] == "/" and t.fields and t.name not in used]
-    return [*(f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named), *tables][:10]
+def addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
+    """Addresses of columns that have another name in the log, after what is not used: topics, or columns of tables."""
+    lines = [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if at != Address("", name)]
+    if lines:
+        used, there = {at.topic for at in columns.values()}, {(at.topic, at.path) for at in columns.values()}
+        tables = [str(at) for at, _ in places(topics) if at.topic[:1] != "/" and (at.topic, at.path) not in there]
+        named = [t for t in topics if t.name[:1] == "/" and t.fields and t.name not in used]
+        others = [f"{t.name} ({', '.join(t.fields[:3])}{', ...' * (len(t.fields) > 3)})" for t in named] + tables
+        yield from ("", "[import.columns]    # where each column is in the log: nnap-em import reads it there")
+        yield from (f"# not used: {each}" for each in others[:10])
+        yield from lines
 
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:

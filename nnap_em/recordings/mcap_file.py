@@ -31,8 +31,6 @@ class _Open(NamedTuple):
     frames: Frames
     counts: Mapping[int, int] | None
     """Messages of each channel, where the file has them."""
-    firsts: Mapping[int, int] | None
-    """Offset of the first chunk of each channel, where the file has it."""
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
@@ -145,41 +143,32 @@ def _opened(path: Path) -> Iterator[_Open]:
         except Exception:  # what the parser raises on damaged bytes is open-ended
             summary = None
         frames = Frames(file)
-        counts = firsts = None
+        counts = None
         if summary is not None:
             frames.schemas |= summary.schemas
             frames.channels |= summary.channels
             counts = dict(summary.statistics.channel_message_counts) if summary.statistics else None
-            firsts = {}
-            for chunk in sorted(summary.chunk_indexes, key=lambda chunk: -chunk.chunk_start_offset):
-                firsts |= {channel: chunk.chunk_start_offset for channel in chunk.message_index_offsets}
         try:
-            yield _Open(path, frames, counts, firsts)
+            yield _Open(path, frames, counts)
         except Broken as broken:
             hint = "" if ";" in str(broken) else "; use another copy, or `mcap recover` it"
             raise DataError(f"{path}: {broken}{hint}") from None
 
 
 def _samples(log: _Open) -> dict[int, list[bytes]]:
-    """The first messages of each channel."""
+    """The first messages of each channel; of a file with counts, those in its first chunk."""
     samples: dict[int, list[bytes]] = {}
 
     def lacking() -> set[int]:
-        every = log.frames.channels
-        return {n for n in every if len(samples.get(n, ())) < SAMPLES and (log.counts is None or log.counts.get(n))}
+        if log.counts is None:
+            return {number for number in log.frames.channels if len(samples.get(number, ())) < SAMPLES}
+        return {number for number, count in log.counts.items() if count and number not in samples}
 
-    def take(batches: Iterator[Batch]) -> None:
-        for batch in batches:
-            rows = zip(batch.start[:SAMPLES].tolist(), batch.size[:SAMPLES].tolist(), strict=True)
-            samples.setdefault(batch.channel, []).extend(batch.data[at : at + size].tobytes() for at, size in rows)
-            if log.counts is not None and not lacking():
-                return
-
-    if log.firsts:
-        for offset in sorted(set(log.firsts.values())):
-            take(log.frames.batches(lacking, offset))
-    if not lacking() <= samples.keys() or not log.frames.channels:  # not all are in chunks with an index
-        take(log.frames.batches(lacking))
+    for batch in log.frames.batches(lacking):
+        rows = zip(batch.start[:SAMPLES].tolist(), batch.size[:SAMPLES].tolist(), strict=True)
+        samples.setdefault(batch.channel, []).extend(batch.data[at : at + size].tobytes() for at, size in rows)
+        if log.counts is not None and not lacking():
+            break
     return samples
 
 

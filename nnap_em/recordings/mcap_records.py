@@ -60,19 +60,17 @@ class Frames:
         self.unread = 0
         """Bytes after the last whole record."""
 
-    def batches(self, channels: Callable[[], Container[int]], at: int | None = None) -> Iterator[Batch]:
-        """Messages of wanted channels, piece by piece; of all of the file, or of the chunk at an offset.
+    def batches(self, channels: Callable[[], Container[int]]) -> Iterator[Batch]:
+        """Messages of wanted channels, piece by piece.
 
         `channels` is called before each piece, because channels appear on the way.
         """
-        self.file.seek(len(MAGIC) if at is None else at)
+        self.file.seek(len(MAGIC))
         chunk, index, loose = None, {}, bytearray()
         for code, position, size in self._records():
             if chunk is not None and code != INDEX:
                 yield from self._chunk(chunk, index, channels)
                 chunk, index = None, {}
-                if at is not None:
-                    return
             if loose and (code not in (SCHEMA, CHANNEL, MESSAGE) or len(loose) > _LOOSE):
                 yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, channels)
                 loose = bytearray()

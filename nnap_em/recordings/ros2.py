@@ -84,16 +84,11 @@ def _place(run: Run, index: str | None) -> int | None:
 
 def definitions(name: str, text: str) -> Types:
     """The messages of a concatenated definition; UnknownLayout where a line is of no known form."""
-    types: dict[str, list[Field]] = {"builtin_interfaces/Time": _TIME}
-    types["builtin_interfaces/Duration"] = _TIME
-    for i, part in enumerate(re.split(r"(?m)^=+\s*$", text)):
-        head = re.match(r"\s*MSG:\s*(\S+)", part)
-        owner = (name if i == 0 else head[1] if head else "").replace("/msg/", "/")
-        fields = []
-        for line in part[head.end() if head else 0 :].splitlines():
-            line = line.split("#")[0].strip()
-            if not line:
-                continue
+    types: dict[str, list[Field]] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
+    for part in re.split(r"(?m)^=+\s*$", f"MSG: {name}\n{text}"):
+        head, *lines = [line for each in part.splitlines() if (line := each.split("#")[0].strip())] or [""]
+        owner, fields = head.removeprefix("MSG:").strip().replace("/msg/", "/"), []
+        for line in lines:
             match = _FIELD.match(line)
             if not match:
                 raise UnknownLayout(line)

@@ -128,7 +128,7 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
     rig, (smoother, schedule) = paper_rig(start_std), recipes[name]
     first = begin(rig, train.data, key=jax.random.fold_in(key, 2))
     began = time.perf_counter()
-    step = em_step(first.model, train.data, smoother(first.bank), first.m_step.early(), key)
+    step = em_step(first.model, train.data, smoother(first.bank), first.m_step.while_growing(), key)
     jax.block_until_ready(step[2])
     compile_s = time.perf_counter() - began
     lost = []

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from nnap_em.data.dataset import Dataset, active_steps, fill_missing
 from nnap_em.em.build import reading_noise
-from nnap_em.em.mstep import AbstractMStep, MStepInfo, kept
+from nnap_em.em.mstep import AbstractMStep, MStepInfo, not_diverged
 from nnap_em.model.base import AbstractModel
 from nnap_em.numerics.gaussian import Gaussian, cholesky, lower
 from nnap_em.smoother.posterior import Posterior
@@ -119,7 +119,7 @@ class GradientMStep(AbstractMStep):
     rate: float = eqx.field(static=True, default=3e-3)
     """First learning rate of an epoch; falls to a tenth along a cosine."""
 
-    def early(self) -> "GradientMStep":
+    def while_growing(self) -> "GradientMStep":
         return self
 
     def no_hessian(self, model) -> Float[Array, "weight weight"]:
@@ -128,7 +128,7 @@ class GradientMStep(AbstractMStep):
     @eqx.filter_jit
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[NetworkModel, MStepInfo]:
         finite = jnp.all(jnp.isfinite(posterior.prev) & jnp.isfinite(posterior.next), axis=(1, 2, 3))
-        used = kept(posterior, data) & finite
+        used = not_diverged(posterior, data) & finite
         pairs = gather_pairs(posterior, data, used)
         mlp = self.descend(model, pairs)
         fitted = eqx.tree_at(lambda m: m.mlp, model, mlp)

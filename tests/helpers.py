@@ -109,4 +109,4 @@ def slide() -> tuple[StateSpaceModel, ScoringMStep]:
     body = Slide(m=jnp.asarray(1.2), joints=(1,))
     model = StateSpaceModel(body, NoFriction(jnp.ones(1)), start, jnp.zeros(2), jnp.zeros(2), (0, 1), 0.05)
     prior = ParameterPrior(("m",), jnp.asarray([1.2]), jnp.asarray([0.1]))
-    return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), shape=model.log_q)
+    return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q)

@@ -863,7 +863,7 @@ MUTANTS = (
         "friction that may peak at rest while the horizon grows",
         "em/mstep.py",
         "(jnp.asarray(1e4), jnp.asarray(1.0))",
-        "(jnp.asarray(1e4), self.rough)",
+        "(jnp.asarray(1e4), self.symmetry_std)",
         "test_mstep.py::test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows",
     ),
     Mutant(

@@ -143,7 +143,7 @@ def _refit(monkeypatch, **options):
         return SimpleNamespace(loglik=-100 * (x - 1) ** 2 * np.array([1.0, 1.0, -5.0])), None, one[1]
 
     def advance(rule, core, *_):
-        strides.append(float(rule.stride))
+        strides.append(float(rule.max_log_step))
         return core._replace(log_q=core.log_q + 3.0), jnp.asarray(tried[-1]), None
 
     monkeypatch.setattr(refits, "locals_along", lambda *_: None)
@@ -158,7 +158,7 @@ def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
     np.testing.assert_allclose(tried, [0.0, 3.0, 1.0, 3.0, 1.0 + 2 / 3], atol=1e-12)
     np.testing.assert_allclose(trial.model.log_q, 1.0)
     np.testing.assert_allclose(trial.loglik, 0.0, atol=1e-9)
-    brief, late = (rule.weights(MODEL).prior_precision(MODEL.unknown) for rule in (RULE.early(), RULE))
+    brief, late = (rule.weights(MODEL).prior_precision(MODEL.unknown) for rule in (RULE.while_growing(), RULE))
     np.testing.assert_allclose(trial.hessian - late + brief, 1.0, rtol=1e-6)  # stated under the rule that was given
 
 

@@ -328,10 +328,12 @@ def test_a_coarse_prior_lets_coulomb_and_constant_friction_be_hardly_holds_visco
 
 def test_symmetry_is_asked_of_every_node_only_while_the_horizon_grows():
     model = _slide(FrictionNetwork(jnp.asarray([6.0]), jnp.asarray([1.0]), key=jax.random.key(3)))
-    rule = ScoringMStep(MASS, model.unknown.weights(), (True, True), (True, True), shape=model.log_q)
+    rule = ScoringMStep(MASS, model.unknown.weights(), (True, True), (True, True), log_q_prior=model.log_q)
     law = FixedFriction(lambda v: -jnp.clip(v, -0.01, 0.01), jnp.ones(1))
     bump = jnp.zeros(42).at[jnp.asarray([5, 35])].set(1.0)  # at high speed; the last of all is the mass
-    early, late = (float(bump @ r.weights(model).symmetry(law, jnp.zeros(1)) @ bump) for r in (rule.early(), rule))
+    early, late = (
+        float(bump @ r.weights(model).symmetry(law, jnp.zeros(1)) @ bump) for r in (rule.while_growing(), rule)
+    )
     share = np.where(np.arange(41) == 20, 0.0, 1.0) ** 2 + AT_REST**2
     for value, rough in ((early, 1.0), (late, 6.4)):
         covariance = 0.1**2 * (1.0 + rough**2 * np.diag(share))
@@ -371,7 +373,7 @@ def test_fit_with_a_bound_is_the_optimum_among_what_is_possible(least):
 def test_sequences_that_are_not_used_have_no_weight(slides):
     """A step with one of four left out, though it is garbage, is the step of the other three; each counts once."""
     model, data, posterior, each = slides
-    rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), shape=model.log_q, linearise=Tangent())
+    rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q, linearise=Tangent())
     linear = locals_along(model, MASS, posterior.state, data, Tangent())
     read = readings_along(model, posterior, linear.seq)
 

@@ -41,10 +41,10 @@ def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
 def test_a_rival_has_the_rule_and_the_precision_of_the_whole_length(weak_drive):
     """Passes have the rule of short horizons: what is stated afterwards is not under it."""
     data, bare, full = weak_drive
-    for field in ("tie", "rough"):
+    for field in ("ratio_precision", "symmetry_std"):
         assert float(getattr(full.m_step, field)) == float(getattr(bare.m_step, field))
     weights = full.m_step.weights(full.model)
-    early = full.m_step.early().weights(full.model)
+    early = full.m_step.while_growing().weights(full.model)
     stated, brief = (np.asarray(w.prior_precision(full.model.unknown)) for w in (weights, early))
     assert np.trace(stated) < np.trace(brief)  # looser
     _, info = full.m_step(full.model, e_step(full.model, data, full.smoother, key=full.state.key), data)

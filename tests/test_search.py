@@ -470,10 +470,10 @@ def test_a_likelihood_pays_for_the_numbers_of_a_law_that_takes_a_place():
 
 def test_ratios_of_noise_are_held_at_those_of_the_first_model():
     """A law that joins a fitted model does not make its noise the reference."""
-    rule = eqx.tree_at(lambda r: r.shape, RULE, jnp.asarray([-3.0, -4.0]), is_leaf=lambda leaf: leaf is None)
+    rule = eqx.tree_at(lambda r: r.log_q_prior, RULE, jnp.asarray([-3.0, -4.0]), is_leaf=lambda leaf: leaf is None)
     moved = eqx.tree_at(lambda m: m.log_q, MODEL, jnp.asarray([-1.0, -9.0]))
     hypothesis = Hypothesis(moved, rule).plus(_law("motor_gain", 1.0), _candidate("motor_gain"))
-    np.testing.assert_array_equal(hypothesis.m_step.shape, [-3.0, -4.0])
+    np.testing.assert_array_equal(hypothesis.m_step.log_q_prior, [-3.0, -4.0])
 
 
 def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):

@@ -254,8 +254,8 @@ def _lost_setting(header, arrays):
 
 
 MISFITS = {
-    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 2"),
-    "newer": (_set(format=3), "format 3"),
+    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 3"),
+    "newer": (_set(format=4), "format 4"),
     "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
     "header": (lambda header, _: header.pop("notes"), "lacks something"),
     "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset, horizon
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
-from ..em.mstep import kept
+from ..em.mstep import not_diverged
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
@@ -95,7 +95,7 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     before, rows = context.before, context.data.t.shape[1]
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
-    whole = np.asarray(kept(posterior, every))
+    whole = np.asarray(not_diverged(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
     fit = SmoothedFit(context.declared, hypothesis, *both, whole, rows, context.pieces)
     if whole.all():
@@ -109,7 +109,7 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
         early = every.valid & jnp.asarray(row < first[:, None] + later)
         cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
         posterior = e_step(hypothesis.model, cut, smoother, key=before.state.key)
-        used = np.asarray(kept(posterior, cut))
+        used = np.asarray(not_diverged(posterior, cut))
         if used.all():
             break
     return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole

@@ -76,11 +76,11 @@ class Hypothesis(NamedTuple):
             jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
             jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
         )
-        model, first = with_effects(self.model, tuple(a.effect for a in additions)), self.m_step.shape
+        model, first = with_effects(self.model, tuple(a.effect for a in additions)), self.m_step.log_q_prior
         own = 2 * len(model.system.coordinates)  # noise of a memory has no ratio to hold
         shape = model.log_q if first is None else model.log_q.at[:own].set(first[:own])
         rule = eqx.tree_at(
-            lambda m: (m.prior, m.shape), self.m_step, (joined, shape), is_leaf=lambda leaf: leaf is None
+            lambda m: (m.prior, m.log_q_prior), self.m_step, (joined, shape), is_leaf=lambda leaf: leaf is None
         )
         return Hypothesis(model, rule, tuple(a.found for a in additions))
 

@@ -68,8 +68,8 @@ def refit(
     is stated under `m_step`.  The process and reading noise stay as they are in the first passes, while the path finds
     its place: they would fit the way there, and their estimates decay slowly.
     """
-    brief = eqx.tree_at(lambda r: r.shape, m_step.early(), model.log_q, is_leaf=lambda leaf: leaf is None)
-    still = eqx.tree_at(lambda r: r.stride, brief, jnp.zeros_like(brief.stride))
+    brief = eqx.tree_at(lambda r: r.log_q_prior, m_step.while_growing(), model.log_q, is_leaf=lambda leaf: leaf is None)
+    still = eqx.tree_at(lambda r: r.max_log_step, brief, jnp.zeros_like(brief.max_log_step))
     core = m_step.core(model)
 
     def program(rule: ScoringMStep, core: Core, path: Gaussian):

@@ -18,7 +18,7 @@ from ..data.dataset import Dataset
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EMState, FitError, e_step
-from ..em.mstep import kept
+from ..em.mstep import not_diverged
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel
@@ -329,7 +329,7 @@ def _put(
     """
     before = known(start, rig, data, key=key, smoother=_unbranched, hold=hold)
     posterior = e_step(before.model, data, before.smoother, key=before.state.key)
-    used = np.asarray(kept(posterior, data))
+    used = np.asarray(not_diverged(posterior, data))
     if not used.any():
         raise FitError("the fit follows none of the recordings; look at units and columns with nnap-em check")
     top = np.where(used, np.asarray(posterior.loglik), np.nan)

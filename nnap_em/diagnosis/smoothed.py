@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 
 from ..data.dataset import Dataset
 from ..em.loop import e_step
-from ..em.mstep import ScoringMStep, kept
+from ..em.mstep import ScoringMStep, not_diverged
 from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -52,5 +52,5 @@ def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> Smoo
     hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
     posterior = e_step(fitted.model, data, smoother, key=fitted.state.key)
     return SmoothedFit(
-        hypothesis, hypothesis, posterior.state, data, np.asarray(kept(posterior, data)), data.t.shape[1]
+        hypothesis, hypothesis, posterior.state, data, np.asarray(not_diverged(posterior, data)), data.t.shape[1]
     )

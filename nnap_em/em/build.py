@@ -160,7 +160,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     system, servos = build_system(rig), build_servos(rig)
     if rig.equations:
         model, prior, learned, estimated, quiet = build_equations(rig, system, data)
-        mstep = ScoringMStep(prior, jnp.zeros(0), learned, estimated, shape=model.log_q, quiet=quiet)
+        mstep = ScoringMStep(prior, jnp.zeros(0), learned, estimated, log_q_prior=model.log_q, quiet=quiet)
         return Problem(model, mstep, StartBank((1,) * len(system.states)))
     scales = measure_scales(rig, system, data)
     states = system.coordinates + system.rates
@@ -201,7 +201,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     coarse = RESTING_OFFSET if rests > RESTS else math.inf
     reach = np.where(rests > RESTS, RESTING_STEP * _driven(system, scales), math.inf)
     mstep = ScoringMStep(
-        prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, shape=model.log_q, least=least
+        prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, log_q_prior=model.log_q, least=least
     )
     return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
 

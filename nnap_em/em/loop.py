@@ -21,7 +21,7 @@ from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import each, turns
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
-from .mstep import AbstractMStep, MStepInfo, between, kept
+from .mstep import AbstractMStep, MStepInfo, between, not_diverged
 from .readings import onset
 
 
@@ -238,7 +238,7 @@ def fit(
         if seen == longest and state.stage < min(1, last):
             state = _released(state)
         rule, key = stages[state.stage], jax.random.fold_in(state.key, state.epoch)
-        rule = rule.early() if seen < longest else rule
+        rule = rule.while_growing() if seen < longest else rule
         proposal, info, loglik, ess = em_step(
             state.model, horizon(data, seen, still), smoother, rule, key, growing=seen < longest
         )
@@ -306,7 +306,7 @@ def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArr
     logliks = []
     for trial in trials:  # the step that would follow does not count
         posterior = _alone(trial, data, smoother, key=key)
-        used = np.asarray(kept(posterior, data))
+        used = np.asarray(not_diverged(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)
     return trials[int(np.argmax(logliks))]
 

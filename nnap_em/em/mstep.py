@@ -72,7 +72,7 @@ class AbstractMStep(eqx.Module):
         """The next model."""
 
     @abstractmethod
-    def early(self) -> "AbstractMStep":
+    def while_growing(self) -> "AbstractMStep":
         """The rule while the horizon still grows."""
 
     def stages(self) -> "tuple[AbstractMStep, ...]":
@@ -85,8 +85,8 @@ class AbstractMStep(eqx.Module):
 
 
 @eqx.filter_jit
-def kept(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
-    """Sequences whose track is not lost: log-likelihood per reading not far below the median of all."""
+def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
+    """Sequences that have not diverged: log-likelihood per reading not far below the median of all."""
     _, observed = fill_missing(data.y)
     count = jnp.sum(observed & data.valid[..., None], axis=(1, 2)).astype(posterior.loglik.dtype)
     mean = posterior.loglik / jnp.maximum(count, 1.0)
@@ -180,18 +180,18 @@ class ScoringMStep(AbstractMStep):
     nodes: int = eqx.field(static=True, default=41)
     ridge: float = 1.0
     iterations: int = eqx.field(static=True, default=200)
-    stride: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
+    max_log_step: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
     """Largest change of a log variance in one step."""
-    tie: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
+    ratio_precision: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
     """Precision with which the ratios of the joints' process noises are held to those of the first model.
 
-    A wrong model would blame the joint that nobody sees: its noise grows until its motion means nothing.
+    Without this prior, model error is attributed to the unmeasured joint: its noise grows until its states are free.
     """
     linearise: Tangent | Cubature = Cubature()
-    rough: Float[Array, ""] = eqx.field(default=6.4, converter=jnp.asarray)
-    """`Weights.rough`: loose, but while the horizon grows.
+    symmetry_std: Float[Array, ""] = eqx.field(default=6.4, converter=jnp.asarray)
+    """`Weights.symmetry_std`: loose, but while the horizon grows.
 
-    A peak at rest, beside which there are few readings, would be learned from the first half second and not left again.
+    With few samples near zero velocity, EM over a short horizon fits a spurious peak there and cannot leave it.
     """
     departure: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
     """`Weights.departure`: free."""
@@ -199,7 +199,7 @@ class ScoringMStep(AbstractMStep):
     """The same while the horizon grows; finite where logs rest, which then do not determine more."""
     reach: Float[Array, "*dof"] = eqx.field(default=math.inf, converter=jnp.asarray)
     """Standard deviation of the change of a node's torque in one M-step [N m]; infinite but on logs that rest."""
-    shape: Float[Array, " state"] | None = None
+    log_q_prior: Float[Array, " state"] | None = None
     """Log variances of the process noise of the first model."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
     """`Weights.least`, of the declared parameters."""
@@ -213,14 +213,12 @@ class ScoringMStep(AbstractMStep):
     def weights(self, model) -> Weights:
         """Estimated vector: weights of the network and parameters."""
         nodes, offset = model.unknown.nodes(self.nodes), 0.1 * model.unknown.scale
-        own = self.rough, self.departure, self.least, self.known
+        own = self.symmetry_std, self.departure, self.least, self.known
         return Weights(self.prior, nodes, self.ridge, self.centre, offset, *own)
 
-    def early(self) -> "ScoringMStep":
-        """The rule with the ratio of the joints' noise nearly fixed, and friction as odd at every velocity as on the
-        whole.
-        """
-        return eqx.tree_at(lambda m: (m.tie, m.rough), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
+    def while_growing(self) -> "ScoringMStep":
+        """The rule for short horizons: ratio of the process noises nearly fixed, friction nearly odd in velocity."""
+        return eqx.tree_at(lambda m: (m.ratio_precision, m.symmetry_std), self, (jnp.asarray(1e4), jnp.asarray(1.0)))
 
     def stages(self) -> tuple["ScoringMStep", ...]:
         """Friction near a viscous, a Coulomb and a constant part, and released in steps, if it begins `coarse`."""
@@ -238,7 +236,7 @@ class ScoringMStep(AbstractMStep):
         linear = locals_along(model, self.prior, posterior.state, data, self.linearise)
         read = readings_along(model, posterior, linear.seq)
         core = self.core(model)
-        core, hessian, used = self.advance(core, linear, posterior, read, kept(posterior, data))
+        core, hessian, used = self.advance(core, linear, posterior, read, not_diverged(posterior, data))
         return self.whole(model, core), MStepInfo(hessian, used)
 
     def core(self, model) -> Core:
@@ -282,8 +280,8 @@ class ScoringMStep(AbstractMStep):
         info = info + jnp.diag(jnp.where(learn, 1e-3 * jnp.diag(info) + 1e-3, 1.0))
         n = model.log_q.shape[0]
         hold = jnp.zeros_like(info).at[:states, :states].set(self._hold(dof))
-        assert self.shape is not None
-        off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.shape)
+        assert self.log_q_prior is not None
+        off = jnp.zeros_like(total.noise_score).at[:n].set(model.log_q - self.log_q_prior)
         score = jnp.where(learn, total.noise_score, 0.0) - hold @ off
         step = jnp.linalg.solve(info + hold, score)
         if self.quiet is not None:  # those that would fall below go as far as that, the others as that lets them
@@ -292,7 +290,7 @@ class ScoringMStep(AbstractMStep):
             fixed, matrix = jnp.where(low, down, 0.0), jnp.where(low[:, None] | low[None], 0.0, info + hold)
             rest = jnp.where(low, 0.0, score - (info + hold) @ fixed)
             step = fixed + jnp.linalg.solve(matrix + jnp.diag(low.astype(score.dtype)), rest)
-        step = step * jnp.minimum(1.0, self.stride / jnp.max(jnp.abs(step)))
+        step = step * jnp.minimum(1.0, self.max_log_step / jnp.max(jnp.abs(step)))
         return model.log_q + step[:n], model.log_r + step[n:]
 
     def _hold(self, dof: int) -> Float[Array, "state state"]:
@@ -300,11 +298,11 @@ class ScoringMStep(AbstractMStep):
         of equations.
         """
         if not dof:
-            return self.tie * (jnp.eye(count := len(self.learn_start)) - 1 / count)
+            return self.ratio_precision * (jnp.eye(count := len(self.learn_start)) - 1 / count)
         rate = jnp.eye(dof)
         angle = jnp.concatenate([rate, -rate], axis=1)
         ratio = jnp.concatenate([jnp.zeros((dof, dof)), rate - 1 / dof], axis=1)
-        return 1e4 * angle.T @ angle + self.tie * ratio.T @ ratio
+        return 1e4 * angle.T @ angle + self.ratio_precision * ratio.T @ ratio
 
     def first(self, start: Gaussian, first: Gaussian, used: Bool[Array, " seq"]) -> Gaussian:
         """EM's own update of the entries that nobody declared [paper, eq. 11]."""

@@ -35,7 +35,7 @@ class Weights(eqx.Module):
     """Mean of the weights' prior: the first random features with hardly any output, so that no unit can die."""
     asymmetry: Float[Array, " port"]
     """Prior standard deviation [N m] of an offset, the even part of a friction map that all nodes share."""
-    rough: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
+    symmetry_std: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
     """Standard deviation of the even part at every node alone, in those of the offset."""
     departure: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
     """Standard deviation at every node of what no viscous, Coulomb or constant friction describes, in those of the
@@ -88,7 +88,7 @@ class Weights(eqx.Module):
         share = jnp.minimum(1.0, odd / (jnp.median(odd, axis=1, keepdims=True) + 1e-12))
         blocks = []
         for j, nodes in enumerate(self.nodes):
-            inverse = jnp.linalg.inv(1.0 + self.rough**2 * jnp.diag(share[j] ** 2 + AT_REST**2))
+            inverse = jnp.linalg.inv(1.0 + self.symmetry_std**2 * jnp.diag(share[j] ** 2 + AT_REST**2))
             precision = even.T @ inverse @ even + _beside(nodes) / self.departure**2
             blocks.append(precision / self.asymmetry[j] ** 2)
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..em.mstep import kept
+from ..em.mstep import not_diverged
 from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
@@ -104,7 +104,7 @@ def design(
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
     data = jax.device_put(data)
     posterior = posterior_of(fitted, data)
-    path, used = np.asarray(posterior.state.mean), np.asarray(kept(posterior, data))
+    path, used = np.asarray(posterior.state.mean), np.asarray(not_diverged(posterior, data))
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one

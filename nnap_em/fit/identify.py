@@ -28,7 +28,7 @@ from ..em.loop import (
     start_state,
     unsettled,
 )
-from ..em.mstep import ScoringMStep, kept
+from ..em.mstep import ScoringMStep, not_diverged
 from ..em.prior import ParameterPrior
 from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
@@ -126,7 +126,7 @@ def begin(
     key_build, key_fit = jax.random.split(key)
     model, rule, bank = build(rig, data, key=key_build)
     full = with_effects(model, effects) if effects else model
-    rule = eqx.tree_at(lambda m: m.shape, rule, full.log_q)
+    rule = eqx.tree_at(lambda m: m.log_q_prior, rule, full.log_q)
     return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
 
 
@@ -198,7 +198,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     if fitted.model.system.simulated:
         return _simulating(fitted, data)
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
-    path, used = posterior.state, np.asarray(kept(posterior, data))
+    path, used = posterior.state, np.asarray(not_diverged(posterior, data))
     if used.sum() < PARTS_LEFT_OUT:
         return fitted
     part = np.where(used, np.cumsum(used) % PARTS_LEFT_OUT, -1)

@@ -101,7 +101,7 @@ def _rule(fit: Identified, begun: ScoringMStep, hold: float) -> ScoringMStep:
         learn_r=begun.learn_r,
         coarse=np.inf,
         reach=jnp.full_like(begun.reach, np.inf),
-        shape=model.log_q,
+        log_q_prior=model.log_q,
         least=old.least - w[cut:][: old.least.shape[0]],
         known=Known(mean, precision),
     )

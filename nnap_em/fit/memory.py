@@ -19,7 +19,7 @@ from ..data.dataset import Dataset
 from ..effects import fields
 from ..em.local import locals_along
 from ..em.loop import AFTERWARDS, EMState, FitError, Schedule, e_step, fit, later_state
-from ..em.mstep import ScoringMStep, kept
+from ..em.mstep import ScoringMStep, not_diverged
 from ..em.prior import ParameterPrior
 from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
 from ..model.dynamic_friction import SHAPES, DynamicFriction
@@ -144,7 +144,7 @@ def with_contacts(
         jnp.concatenate([rule.prior.std, *stds]),
     )
     full = with_effects(model, (*model.effects, *contacts))
-    where = lambda m: (m.prior, m.shape)  # noqa: E731
+    where = lambda m: (m.prior, m.log_q_prior)  # noqa: E731
     return full, eqx.tree_at(where, rule, (prior, full.log_q), is_leaf=lambda leaf: leaf is None)
 
 
@@ -249,7 +249,7 @@ class _Fit(NamedTuple):
 
 def _smoothed(state: EMState, rule: ScoringMStep, smoother: AbstractSmoother, data: Dataset) -> _Fit:
     posterior = e_step(state.best, data, smoother, key=state.key)
-    return _Fit(state, rule, posterior.state, np.asarray(posterior.loglik), np.asarray(kept(posterior, data)))
+    return _Fit(state, rule, posterior.state, np.asarray(posterior.loglik), np.asarray(not_diverged(posterior, data)))
 
 
 def remember(

@@ -31,7 +31,7 @@ from .identify import Identified, begin
 _GIVE = "give the model.npz that `nnap-em identify` wrote"
 MODEL_KIND = Kind(
     "nnap_em fitted model",
-    2,  # 1 had the precision of the network's weights in place of that of torques
+    3,  # 1 had the precision of the network's weights in place of that of torques, 2 other names in the M-step
     "model",
     _GIVE,
     f"{_GIVE}, from a copy that is whole",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
 from ..data.units import force_unit, joint_called, state_unit
-from ..em.mstep import kept
+from ..em.mstep import not_diverged
 from ..fit.identify import Identified
 from ..fit.predict import posterior_of
 from ..model import hooks
@@ -156,5 +156,5 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
     innovation, force, std, partial_force, partial_force_std, state, predicted, u = outcome
     t, valid = np.asarray(data.t), np.asarray(data.valid)
-    used = np.asarray(kept(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
+    used = np.asarray(not_diverged(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
     return Residual(innovation, force, std, partial_force, partial_force_std, state, predicted, u, t, valid, used)

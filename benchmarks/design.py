@@ -31,7 +31,7 @@ import nnap_em
 from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.limits import Bounds
-from nnap_em.diagnosis.rivals import instead
+from nnap_em.diagnosis.rivals import with_rival
 from nnap_em.experiment.criteria import after
 from nnap_em.experiment.experiment import Design, design
 from nnap_em.experiment.rivals import Law, Rivals
@@ -168,7 +168,7 @@ def weaker(effect: dict[str, Any], share: float, top: float) -> dict[str, Any]:
 def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified], list[float]]:
     """Log-likelihood of the first law over the second [nat], both fits, and by how much each is above none."""
     base = identify(rig, data, key=key)
-    fits = [instead(base, data, None, law.means) for law in laws]
+    fits = [with_rival(base, data, None, law.means) for law in laws]
     none, *tops = (float(np.sum(np.nan_to_num(np.asarray(fit.state.top), nan=-1e6))) for fit in (base, *fits))
     return tops[0] - tops[1], fits, [top - none for top in tops]
 

@@ -1,4 +1,4 @@
-"""The backward pass: laws that are not needed go, and what explains clearly more takes the place of a law."""
+"""The backward pass: laws that are not needed go, and a rival that explains clearly more replaces a law."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""The outcome of the loop in words and numbers: what was found, how sure, and the error that it removes."""
+"""The outcome of the search in words and numbers: effects, their uncertainty, the error that they remove."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -70,7 +70,7 @@ class AbstractLoss(eqx.Module):
     measure: ClassVar[str]
     """Name of the share that the screen computes, as a figure labels it."""
     multi_step: ClassVar[bool] = False
-    """True where errors of many steps decide: likelihood then proves nothing."""
+    """True where multi-step errors decide, and not the likelihood."""
 
     def remaining_share(self, fit: SmoothedFit) -> float:
         """Share of the declared model's squared error that the accepted laws left; 1 where it does not matter."""
@@ -81,7 +81,7 @@ class AbstractLoss(eqx.Module):
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
-        """A `trial` after what its fit by likelihood leaves to do."""
+        """A `trial` after the steps of this loss, which follow its fit by likelihood."""
         return trial
 
     @abstractmethod
@@ -215,7 +215,7 @@ def readings(data: Dataset, used) -> int:
 
 
 def _machine(fit: SmoothedFit) -> StateSpaceModel:
-    """The declared machine with the friction of the fit: what candidates act on."""
+    """The declared machine with the friction of the fit, on which candidates act."""
     return eqx.tree_at(lambda m: m.unknown, fit.declared.model, fit.model.unknown)
 
 

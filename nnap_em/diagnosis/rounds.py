@@ -125,7 +125,7 @@ def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
 
 
 def _worths(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[float]:
-    """Values times prior odds: what laws of different causes are compared by."""
+    """Values times prior odds, by which laws of different causes are compared."""
     return [value * odds(number) for value, number in zip(values, _complexities(laws, model), strict=True)]
 
 
@@ -152,7 +152,7 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
 
 
 def _listed(screened: Screened) -> float:
-    """Share as a report lists it: none where the parts disagree."""
+    """Share as a report lists it; 0 where the parts disagree."""
     return screened.share.least if screened.admissible else 0.0
 
 

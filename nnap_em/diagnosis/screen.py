@@ -1,8 +1,8 @@
 """The share of a squared error that each candidate removes, and the share that chance removes.
 
 Friction, parameters and accepted effects are nuisance: all data together project them out of errors and candidates, and
-only the strengths of a candidate are fitted without the parts left out.  A nuisance fitted anew to every fold
-diverges on chaotic recordings, and refuses true effects.
+only the strengths of a candidate are fitted without the parts left out.  Refitting friction and
+parameters on every fold diverges on chaotic recordings and rejects true effects.
 """
 
 import itertools
@@ -38,7 +38,7 @@ class Rows(NamedTuple):
     overlap: float
     """Rows that count as one."""
     survived: Float[np.ndarray, " column"]
-    """Norm of every column over what it was before."""
+    """Norm of every column over its norm before the projection."""
 
 
 class Shares(NamedTuple):

@@ -1,4 +1,4 @@
-"""Diagnosis: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
+"""Diagnosis: find the effects that a fitted model lacks, add them, fit again, remove those no longer needed."""
 
 import dataclasses
 import math

@@ -63,7 +63,7 @@ class Trial(NamedTuple):
 
 
 class Null(NamedTuple):
-    """A hypothesis before its passes and after them: what trials are compared with."""
+    """A hypothesis before and after its passes, with which trials are compared."""
 
     start: Refit
     end: Refit

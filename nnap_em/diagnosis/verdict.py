@@ -74,7 +74,7 @@ class Bars(NamedTuple):
     """Smallest share and smallest gain that count, whatever chance can do."""
 
     share: float
-    """Smallest share that counts: what a model lacks for another reason looks like some law up to here."""
+    """Smallest share that counts: below it an effect that is not in the catalogue looks like some law that is."""
     nats: float
     """Smallest gain in log-likelihood that counts [nat]."""
 

@@ -144,7 +144,7 @@ class UnknownFunction(JointEffect):
         return any(axis.responds_to_feedback for axis in self.axes)
 
     def is_physical(self):
-        """A drive gives no less torque for more input, whatever it loses: what zigzags stands for another cause."""
+        """A drive's torque is monotone in its input: a function that is not is a symptom of another missing effect."""
         if len(self.axes) != 1 or not self.responds_to_feedback():
             return True
         (axis,) = self.axes

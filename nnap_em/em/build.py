@@ -67,7 +67,7 @@ def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array,
 def derivatives(signal: Float[np.ndarray, "seq time"], order: int, dt: float) -> list[Float[np.ndarray, " reading"]]:
     """Derivatives of each sequence by differences over `LAG` rows, or over one reading where these are further apart.
 
-    Missing samples are bridged: of readings that come every other row none are `LAG` rows apart.
+    Missing samples are bridged, since readings of every other row are never `LAG` rows apart.
     """
     out = []
     for y in signal:
@@ -207,7 +207,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
 
 
 def _driven(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " dof"]:
-    """Typical torque of the drive of each joint, or of what moves it where none does [N m, or N]."""
+    """Typical torque of the drive of each joint; of a joint without one, of gravity and coupling [N m, or N]."""
     torque = scales.torque - loads(system)[1]
     return np.where(torque > 1e-3 * scales.torque, torque, scales.torque)
 
@@ -225,7 +225,7 @@ def _by_acceleration(system: AbstractSystem, scales: Scales) -> Float[np.ndarray
 
 
 def _quiet(layer: eqx.nn.Linear) -> eqx.nn.Linear:
-    """The output layer, scaled so that the first friction is nearly none."""
+    """The output layer, scaled so that the first friction is nearly zero."""
     return eqx.tree_at(
         lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, jax.tree.map(jnp.zeros_like, layer.bias))
     )

@@ -255,7 +255,7 @@ def fit(
 
 
 def _afresh(state: EMState) -> EMState:
-    """The state that goes on from the likeliest model, compared with nothing before."""
+    """The state restarted from the likeliest model, without likelihoods to compare with."""
     return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
 
 

@@ -244,7 +244,7 @@ class ScoringMStep(AbstractMStep):
         return Core(model.unknown, self.weights(model).read(model), model.log_q, model.log_r, model.start)
 
     def whole(self, model, core: Core) -> StateSpaceModel:
-        """`model` with what a step has changed."""
+        """`model` with the parts that a step changes."""
         fitted = self.weights(model).write(model, core.w)
         return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
 

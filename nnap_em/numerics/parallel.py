@@ -78,7 +78,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     rounds = -(-share // (together or share))
     group = -(-share // rounds)
     padded = group * rounds * (1 if mesh is None else mesh.size)
-    if padded > count:  # what is over does the work of the last once more
+    if padded > count:  # padding repeats the last entry
         index = np.minimum(np.arange(padded), count - 1)
         batch = jax.tree.map(lambda a: a[index], batch)
     if mesh is None:

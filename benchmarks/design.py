@@ -214,14 +214,14 @@ def _discriminated(
     began = time.perf_counter()
     fits = allowed(fits, first, rate)
     designed = design(
-        fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
+        fits[own], first, key=key, question="discriminate", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
     )
-    assert designed.apart is not None
+    assert designed.discrimination is not None
     seconds, (_, new) = time.perf_counter() - began, play(case, designed, seed)
     leads = ahead(rig, joined(first, new), laws, key)[0]
     more = math.nan if quick else ahead(rig, data, laws, key)[0]
     far = {
-        side: designed.apart.distance(t).tolist()
+        side: designed.discrimination.distance(t).tolist()
         for side, t in (("designed", designed.expected), ("old", designed.old))
     }
     return row | {"more": more, "designed": leads, "distance": far, "design_s": seconds}

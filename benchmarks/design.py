@@ -31,7 +31,7 @@ import nnap_em
 from nnap_em.commands import common
 from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.limits import Bounds
-from nnap_em.diagnosis.rivals import instead
+from nnap_em.diagnosis.rivals import with_rival
 from nnap_em.experiment.criteria import after
 from nnap_em.experiment.experiment import Design, design
 from nnap_em.experiment.rivals import Law, Rivals
@@ -168,7 +168,7 @@ def weaker(effect: dict[str, Any], share: float, top: float) -> dict[str, Any]:
 def ahead(rig, data: Dataset, laws, key) -> tuple[float, list[Identified], list[float]]:
     """Log-likelihood of the first law over the second [nat], both fits, and by how much each is above none."""
     base = identify(rig, data, key=key)
-    fits = [instead(base, data, None, law.means) for law in laws]
+    fits = [with_rival(base, data, None, law.means) for law in laws]
     none, *tops = (float(np.sum(np.nan_to_num(np.asarray(fit.state.top), nan=-1e6))) for fit in (base, *fits))
     return tops[0] - tops[1], fits, [top - none for top in tops]
 
@@ -214,14 +214,14 @@ def _discriminated(
     began = time.perf_counter()
     fits = allowed(fits, first, rate)
     designed = design(
-        fits[own], first, key=key, question="apart", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
+        fits[own], first, key=key, question="discriminate", rivals=[pair], seconds=5.0 * SEQUENCES, sequences=SEQUENCES
     )
-    assert designed.apart is not None
+    assert designed.discrimination is not None
     seconds, (_, new) = time.perf_counter() - began, play(case, designed, seed)
     leads = ahead(rig, joined(first, new), laws, key)[0]
     more = math.nan if quick else ahead(rig, data, laws, key)[0]
     far = {
-        side: designed.apart.distance(t).tolist()
+        side: designed.discrimination.distance(t).tolist()
         for side, t in (("designed", designed.expected), ("old", designed.old))
     }
     return row | {"more": more, "designed": leads, "distance": far, "design_s": seconds}

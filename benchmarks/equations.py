@@ -182,7 +182,7 @@ def run(name: str, seed: int, rows: int, log: Callable[[str], None]) -> dict:
         "right": right,
         "others": sum(not is_right(case, key) for key in keys),
         "laws": [words(key) for key in keys],
-        "share": [record.share for record in closed.found],
+        "share": [record.share for record in closed.evidence],
         "seconds": round(seconds, 1),
     }
 

@@ -127,7 +127,7 @@ def apart(out: Path) -> Arrays:
     _command(*next_experiment.design(first, plan, effect))
     design = json.loads((plan / "design.json").read_text())
     old, new = _read(rig / "train" / "01.csv"), _read(plan / design["inputs"][0])
-    wrong = design["apart"][0]["misleading"]
+    wrong = design["discrimination"][0]["misleading"]
     rates = {"wrong_old": wrong["same_time_of_old_inputs"], "wrong_new": wrong["expected"]}
     return {"t_old": old["time"], "u_old": old["u"], "t_new": new["time"], "u_new": new["u"]} | rates
 

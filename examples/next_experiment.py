@@ -40,7 +40,7 @@ def diagnosis(rig: Path, first: Path) -> tuple[object, ...]:
 def design(first: Path, plan: Path, effect: str) -> tuple[object, ...]:
     """The command that proposes inputs by which the law is discriminated from the other one."""
     rival = next(name for name in EFFECTS if name != effect)
-    return "design", first, "--out", plan, "--for", "apart", "--rival", rival, "--seconds", "30"
+    return "design", first, "--out", plan, "--for", "discriminate", "--rival", rival, "--seconds", "30"
 
 
 def play(case: plant.Case, folder: Path, out: Path) -> None:

@@ -1086,8 +1086,8 @@ MUTANTS = (
     Mutant(
         "a refit without a look",
         "diagnosis/trial.py",
-        "if loss.predicts and not needed(foreseen,",
-        "if loss.predicts and needed(foreseen,",
+        "if loss.multi_step and not needed(foreseen,",
+        "if loss.multi_step and needed(foreseen,",
         "test_rounds.py::test_a_law_whose_step_removes_nothing_is_not_refitted",
     ),
     Mutant(

@@ -237,9 +237,9 @@ def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says
     _, _, data, fitted = slide
     pairs = rivals(fitted, data, [(None, Law("motor_gain", 1))])
     plan = {"seconds": 4.0, "sequences": 2, "effort": SMALL}
-    designed = design(fitted, data, key=jax.random.key(2), question="apart", rivals=pairs, **plan)
-    assert designed.apart is not None
-    assert np.all(designed.apart.distance(designed.expected) > 0)
+    designed = design(fitted, data, key=jax.random.key(2), question="discriminate", rivals=pairs, **plan)
+    assert designed.discrimination is not None
+    assert np.all(designed.discrimination.distance(designed.expected) > 0)
     std = lambda expected: np.sqrt(after(np.asarray(designed.fit.cov), expected.information)[-1, -1])  # noqa: E731
     assert std(designed.expected) < 0.99 * std(designed.nothing)  # of the mass
 
@@ -269,7 +269,7 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
 @pytest.mark.parametrize(
     "question, reason",
     {
-        "apart": "--rival",
+        "discriminate": "--rival",
         "spring": "possible here: friction, parameters, m, all",
         "friction ": "not a question",
     }.items(),

@@ -214,7 +214,7 @@ def test_brakes_never_add_energy(name):
         return scene.v @ force, scene.v @ (force + effect.friction(scene.friction, scene))
 
     alone, whole = map(np.asarray, jax.jit(jax.vmap(power))(x, rows))
-    assert effect.possible()
+    assert effect.is_physical()
     assert np.all(alone <= 0) and np.all(whole < 0)
     assert np.all(alone < 0) or np.all(alone == 0)  # a force, or a change of the friction
 
@@ -224,7 +224,7 @@ def test_what_must_be_above_zero_is_refused_below(name):
     effect = MAKE[name]({**plant.STRONG, **plant.UNNAMED}[name][0])
     number = lambda e: getattr(e, e.above_zero)  # noqa: E731
     below, none = (eqx.tree_at(number, effect, share * number(effect)) for share in (-1.0, 0.0))
-    assert effect.possible() and not below.possible() and not none.possible()
+    assert effect.is_physical() and not below.is_physical() and not none.is_physical()
 
 
 def test_a_bristle_gives_back_less_than_it_was_given():
@@ -322,5 +322,5 @@ def test_a_vibration_has_a_period_in_the_recording():
     kind, known_of = catalogue["base_vibration"], around(declared_model(plant.Case(steps=STEPS, hidden=False, seed=3)))
     first = kind.candidates(known_of)[0].start
     assert float(first.frequency) == pytest.approx(1 / (known_of.duration[1] - known_of.duration[0]))
-    assert first.possible()
-    assert not eqx.tree_at(lambda law: law.frequency, first, 0.99 * first.frequency).possible()
+    assert first.is_physical()
+    assert not eqx.tree_at(lambda law: law.frequency, first, 0.99 * first.frequency).is_physical()

@@ -13,7 +13,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis.findings import advice, disputes, entry, estimates, findings, suspected, undecided, verdict
-from nnap_em.diagnosis.hypothesis import Found, Hypothesis
+from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis
 from nnap_em.diagnosis.keys import key_of
 from nnap_em.diagnosis.outcome import Diagnosis, Disputed, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
@@ -52,7 +52,7 @@ def _closed(rig: Rig, *effects: AbstractEffect) -> Diagnosis:
     hypothesis = Hypothesis(before.model, before.m_step)
     for effect in effects:
         candidate = Candidate(effect, (effect,), effect)
-        hypothesis = hypothesis.plus(effect, candidate, Found(100.0, 50.0, 1e-20))
+        hypothesis = hypothesis.plus(effect, candidate, Evidence(100.0, 50.0, 1e-20))
     model, rule, found = hypothesis
     size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
     state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))
@@ -105,13 +105,13 @@ def test_a_law_names_its_headline_number_first():
 
 
 def test_a_law_by_many_steps_has_shares_and_one_by_one_step_has_nats():
-    nats, shares = Found(100.0, 50.0, 1e-20), Found(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
+    nats, shares = Evidence(100.0, 50.0, 1e-20), Evidence(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
     for found, known in (
         (nats, {"log_likelihood_gain", "held_out_gain", "p_value"}),
         (shares, {"share_of_error", "chance"}),
     ):
         diagnosis = _closed(ARM, _spring(2))
-        (finding,) = findings(diagnosis._replace(found=(found,)))
+        (finding,) = findings(diagnosis._replace(evidence=(found,)))
         numbers = {name for name, value in finding.evidence.items() if name != "parts" and np.isfinite(value)}
         assert numbers == known and finding.evidence["parts"] == list(found.parts)
 

@@ -63,10 +63,10 @@ def test_the_package_does_not_grow():
 
 def test_a_constant_has_one_meaning():
     """Its name is that of one module."""
-    homes: dict[str, set[str]] = {}
+    homes: dict[str, list[str]] = {}
     for path in PACKAGE.rglob("*.py"):
         for name in _constants(path.read_text()):
-            homes.setdefault(name, set()).add(str(path.relative_to(PACKAGE)))
+            homes.setdefault(name, []).append(str(path.relative_to(PACKAGE)))
     assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
 
 

@@ -104,7 +104,7 @@ def test_a_drive_that_gives_less_for_more_is_none(plain):
     zone, ripple = -np.clip(u, -0.2 * size, 0.2 * size), 0.3 * size * np.sin(25 * u / size)
     place = Axis(("theta2",), -1.0, 1.0, False, 20)
     for force, signal, possible in ((zone, axis, True), (ripple, axis, False), (ripple, place, True)):
-        assert UnknownFunction(learned(force), (signal,), joint=2).possible() == possible
+        assert UnknownFunction(learned(force), (signal,), joint=2).is_physical() == possible
 
 
 def test_nothing_is_learned_beyond_the_ends():

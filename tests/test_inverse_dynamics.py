@@ -12,7 +12,13 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build_system
 from nnap_em.identifiability.check import dynamics
-from nnap_em.identifiability.inverse_dynamics import LARGEST_REMAINDER, UNEXPLAINED, Explanation, mistakes, regression
+from nnap_em.identifiability.inverse_dynamics import (
+    LARGEST_REMAINDER,
+    SMALLEST_MISFIT,
+    Explanation,
+    mistakes,
+    regression,
+)
 
 Log = tuple[Rig, Dataset]
 SEQUENCES, ROWS, DT = 2, 401, 0.01
@@ -168,8 +174,8 @@ def test_a_hidden_coordinate_or_another_kind_of_input_says_nothing(log):
         (0.5, 1.1 * LARGEST_REMAINDER * 0.5, False),
         (2.0, 0.19, True),
         (2.0, 0.21, False),  # more than a fifth stays unexplained
-        (1.1 * UNEXPLAINED, 0.0, True),
-        (0.9 * UNEXPLAINED, 0.0, False),
+        (1.1 * SMALLEST_MISFIT, 0.0, True),
+        (0.9 * SMALLEST_MISFIT, 0.0, False),
     ],
 )
 def test_a_mistake_must_explain_much_of_what_is_unexplained(plain, left, named):

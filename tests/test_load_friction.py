@@ -73,7 +73,7 @@ def test_a_form_is_that_of_the_paper(law, level, model):
     q, v, u = (states := _states()).T
     weight = rod.GRAVITY * rod.MASS * rod.LENGTH * np.sin(q)
     np.testing.assert_allclose(_forces(law, model, states), -level(u, weight, v) * np.tanh(v / KNEE), atol=1e-12)
-    assert law.possible() and set(law.values()) <= set(law.units)
+    assert law.is_physical() and set(law.values()) <= set(law.units)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
         seen.append(law)
         for candidate in law.richer(around_rod):
             assert len(fields(candidate.start)) > len(fields(law))
-            assert jax.tree.structure(candidate.spread) == jax.tree.structure(candidate.start)
+            assert jax.tree.structure(candidate.prior_std) == jax.tree.structure(candidate.start)
             np.testing.assert_allclose(_forces(candidate.start, model, states), _forces(law, model, states), atol=1e-14)
             for probe in candidate.probes:
                 assert np.abs(_forces(probe, model, states) - _forces(law, model, states)).max() > 1e-4

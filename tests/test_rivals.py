@@ -7,7 +7,7 @@ import pytest
 from nnap_em.commands import cli
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis.rivals import instead, possible
+from nnap_em.diagnosis.rivals import proposals_for, with_rival
 from nnap_em.em.loop import e_step
 from nnap_em.fit.identify import identify
 from nnap_em.systems import specs
@@ -25,7 +25,7 @@ def weak_drive(tmp_path_factory):
     logged = read_logs(folder / "train", rig).data
     data = logged._replace(u=np.asarray(logged.u) / GAIN)
     bare = identify(rig, data, key=jax.random.key(0), epochs=12)
-    full = instead(bare, data, None, lambda effect: effect.name == "motor_gain")
+    full = with_rival(bare, data, None, lambda effect: effect.name == "motor_gain")
     assert full is not None
     return data, bare, full
 
@@ -34,8 +34,8 @@ def test_a_law_on_top_is_fitted_near_the_truth(weak_drive):
     data, bare, full = weak_drive
     (effect,) = full.model.effects
     assert abs(float(effect.values()["gain"]) - GAIN) < 0.05
-    assert instead(bare, data, None, lambda effect: effect.name == "base_tilt") is None  # a slide has no such law
-    assert "motor_gain" in {effect.name for effect in possible(bare, data)}
+    assert with_rival(bare, data, None, lambda effect: effect.name == "base_tilt") is None  # a slide has no such law
+    assert "motor_gain" in {effect.name for effect in proposals_for(bare, data)}
 
 
 def test_a_rival_has_the_rule_and_the_precision_of_the_whole_length(weak_drive):

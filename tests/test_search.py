@@ -16,7 +16,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis import backward, search
 from nnap_em.diagnosis import context as context_of
 from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, ahead
-from nnap_em.diagnosis.hypothesis import Found, Hypothesis, covariances
+from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
 from nnap_em.diagnosis.outcome import Step, Suspect
@@ -54,8 +54,8 @@ def _candidate(name: str, spread: float = 2.0) -> Candidate:
     return Candidate(_law(name), (_law(name, 1.0),), _law(name, spread))
 
 
-def _found(removed: float) -> Found:
-    return Found(100.0, 50.0, 1e-20, removed=removed)
+def _found(removed: float) -> Evidence:
+    return Evidence(100.0, 50.0, 1e-20, removed=removed)
 
 
 def _function(name: str = "unknown_function"):
@@ -113,7 +113,7 @@ def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
     left, names = [i for i in range(3) if i != place], ("motor_gain", "dead_zone", "air_drag")
     hypothesis = _with(*names).without(place)
     assert _names(hypothesis.model) == [names[i] for i in left]
-    assert [f.removed for f in hypothesis.found if f] == [0.5 + 0.1 * i for i in left]
+    assert [f.removed for f in hypothesis.evidence if f] == [0.5 + 0.1 * i for i in left]
     np.testing.assert_allclose(hypothesis.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
     assert [name.partition(".")[0] for name in hypothesis.m_step.prior.names] == ["m", "0", "1"]
 
@@ -168,11 +168,11 @@ def test_one_repeats_each_turn_and_the_other_does_not():
 def test_a_stop_that_yields_is_none():
     """One that a typical torque pushes in by half a radian, or whose ends nearly meet, is a spring in disguise."""
     stop = next(c for c in catalogue["hard_stop"].candidates(AROUND) if c.start.joint == 2).probes[0]
-    assert stop.possible()
+    assert stop.is_physical()
     half = np.log(2.0 * AROUND.torque[1])  # N m/rad
-    assert eqx.tree_at(lambda s: s.stiffness, stop, half + 0.01).possible()
-    assert not eqx.tree_at(lambda s: s.stiffness, stop, half - 0.01).possible()
-    assert not eqx.tree_at(lambda s: s.lower, stop, stop.upper - 0.1).possible()
+    assert eqx.tree_at(lambda s: s.stiffness, stop, half + 0.01).is_physical()
+    assert not eqx.tree_at(lambda s: s.stiffness, stop, half - 0.01).is_physical()
+    assert not eqx.tree_at(lambda s: s.lower, stop, stop.upper - 0.1).is_physical()
 
 
 # --- the search
@@ -233,13 +233,13 @@ def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, names, least, 
 
 def test_both_of_two_laws_go_that_are_worth_nothing(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.01, "dead_zone": 0.02})
-    assert backward.backward(_context(), _with("motor_gain", "dead_zone")).found == ()
+    assert backward.backward(_context(), _with("motor_gain", "dead_zone")).evidence == ()
 
 
 def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
     _pretend(monkeypatch, {"dead_zone": 0.5})
     hypothesis = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
-    assert backward.backward(_context(), hypothesis).found == ()
+    assert backward.backward(_context(), hypothesis).evidence == ()
 
 
 def _case(law, removed: float = 0.5) -> Trial:
@@ -272,7 +272,7 @@ def test_laws_are_added_until_none_is_accepted(monkeypatch):
     hypothesis, state, steps, complete = search._search(_context(), BARE, None, [9])
     assert _names(hypothesis.model) == ["motor_gain", "air_drag"] and state is not None and complete
     assert [step.accepted is not None for step in steps] == [True, True, False]
-    record = hypothesis.found[0]
+    record = hypothesis.evidence[0]
     assert (record.removed, record.share, record.chance, record.parts) == (0.5, 0.4, 0.0, (3, 3))
     assert np.isnan([record.gain, record.held_out, record.p_value]).all()  # a likelihood proves nothing there
 
@@ -282,7 +282,7 @@ def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
     _pretend(monkeypatch, {"motor_gain": 0.01})
     _rounds(monkeypatch, _law("motor_gain", 0.5), None, _law("motor_gain", 0.5), None)
     hypothesis, state, steps, complete = search._search(_context(), BARE, None, [9])
-    assert hypothesis.found == () and state is None and len(steps) == 2 and complete
+    assert hypothesis.evidence == () and state is None and len(steps) == 2 and complete
 
 
 @pytest.mark.parametrize("left", [0, 3])
@@ -293,7 +293,7 @@ def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, l
     rounds = search.screening_round
 
     def late(fit, context):
-        if not fit.hypothesis.found:
+        if not fit.hypothesis.evidence:
             return rounds(fit, context)
         if not left:
             raise TimeUp
@@ -322,13 +322,13 @@ def test_no_step_begins_after_the_deadline():
 def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(removed, names):
     """The remainder removes half of what is left by a law that removed nine tenths, or one."""
     spring = Candidate(_spring(), (_spring(),), _spring())
-    hypothesis = BARE.plus(_spring(), spring, Found(1.0, 1.0, 0.0, removed=removed))
+    hypothesis = BARE.plus(_spring(), spring, Evidence(1.0, 1.0, 0.0, removed=removed))
     law = _function()
     case = _case(law)._replace(after=hypothesis.plus(law, _case(law).screened.candidate))
     following = search._with(hypothesis, case, _found(0.5), _context())
     assert _names(following.model) == names
     # the remainder that took the place removed what both did; beside the law only its own
-    assert following.found[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
+    assert following.evidence[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
 
 
 @pytest.mark.parametrize(
@@ -342,6 +342,7 @@ def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, 
     spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": np.eye(1)}
     monkeypatch.setattr(search, "covariances", lambda model, *_: [spreads[e.name] for e in model.effects])
     monkeypatch.setattr(search, "extend", lambda context, one, length: _emstate(one.model, 1.0))
+    monkeypatch.setattr(search, "backward", lambda context, one: one)
     rounds = [Step(9, (), (), key_of(effect), 2) for effect in hypothesis.model.effects]
     state, log = _emstate(hypothesis.model, 1.0), []
     context = _context()._replace(log=log.append)
@@ -417,7 +418,7 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
     monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)
     monkeypatch.setattr(search, "disturbance_free", disturbance_free)
     outcome = search.diagnose(RIG, DATA, key=jax.random.key(0))
-    assert ran == losses and len(outcome.found) == len(losses) and outcome.complete == complete
+    assert ran == losses and len(outcome.evidence) == len(losses) and outcome.complete == complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
     assert bool(cut) != white  # external disturbances are sought where noise is not what the model says
 
@@ -443,7 +444,7 @@ def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth,
     after = backward.backward(_context(), hypothesis)
     assert _names(after.model) == [name]
     same = () if name == "dead_zone" else evidence.equivalent
-    assert after.found[0].equivalent == same
+    assert after.evidence[0].equivalent == same
 
 
 def test_an_equivalent_that_explains_clearly_less_is_none(monkeypatch):
@@ -455,7 +456,7 @@ def test_an_equivalent_that_explains_clearly_less_is_none(monkeypatch):
     evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
     hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
     after = backward.backward(_context(), hypothesis)
-    assert after.found[0].equivalent == (key_of(_law("motor_gain")),)  # one that was not fitted stays
+    assert after.evidence[0].equivalent == (key_of(_law("motor_gain")),)  # one that was not fitted stays
 
 
 def test_a_likelihood_pays_for_the_numbers_of_a_law_that_takes_a_place():

@@ -26,7 +26,7 @@ from nnap_em.draft.from_machine import _sensors, draft_machine
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.local import local, readings_at
-from nnap_em.em.mstep import _shaken
+from nnap_em.em.mstep import _noise_floor
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
 from nnap_em.export.mjcf import write_mjcf
@@ -188,7 +188,7 @@ def _expanded(model, prior, data: Dataset):
     step = 1e-4
     ahead, behind = (jax.vmap(filtered)(sign * step * jnp.eye(2)) for sign in (1, -1))
     slope, jac = ((a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True))
-    return expansion, slope, jac, _shaken(jax.tree.map(lambda a: a[None], linear), model.log_q, model.log_r)
+    return expansion, slope, jac, _noise_floor(jax.tree.map(lambda a: a[None], linear), model.log_q, model.log_r)
 
 
 def test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information(tmp_path):

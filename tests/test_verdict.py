@@ -65,7 +65,7 @@ def test_the_error_falls_on_most_parts_and_rises_on_none_by_much(folds, fine):
 
 @pytest.mark.parametrize(("least", "fine"), [(0.15, True), (0.149, False)])
 def test_a_function_that_answers_a_disturbance_removes_the_floor_on_every_part(least, fine):
-    assert agreed((0.9, 0.9, least), 0.15, answers=True) == fine
+    assert agreed((0.9, 0.9, least), 0.15, responds=True) == fine
 
 
 @pytest.mark.parametrize(

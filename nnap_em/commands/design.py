@@ -26,7 +26,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     check_question(question, fitted, bool(laws))
     with resumable(args, bench, log):
         data = bench.train.data
-        pairs = rivals(fitted, data, laws, log) if question in ("all", "apart") else []
+        pairs = rivals(fitted, data, laws, log) if question in ("all", "discriminate") else []
         designed = design(
             fitted, data, key=key, question=question, rivals=pairs,
             seconds=args.seconds, sequences=args.sequences, log=log,

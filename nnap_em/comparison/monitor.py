@@ -102,7 +102,7 @@ def _estimate(linearised: Linearised, i: int, candidates: Sequence[Candidate], s
 
 def _probe(candidate: Candidate) -> tuple[float, float]:
     """Size of the probe of a number, and standard deviation of its prior."""
-    start, probe, spread = (float(flat(law)[0]) for law in (candidate.start, candidate.probes[0], candidate.spread))
+    start, probe, spread = (float(flat(law)[0]) for law in (candidate.start, candidate.probes[0], candidate.prior_std))
     return probe - start, spread
 
 

@@ -1,4 +1,4 @@
-"""Equal readings that are none: of a sensor that is stuck, starts late, or is at the end of its range.
+"""Repeated readings that are not measurements: of a sensor that is stuck, starts late or is saturated.
 
 A joint that rests repeats a reading as well: only its motion contradicts the sensor.
 """
@@ -80,7 +80,7 @@ def runs(y: Float[np.ndarray, " time"], least: int = 1) -> list[Run]:
 
 
 def _closed(rows: Bool[np.ndarray, " time"], hole: int = 2) -> Bool[np.ndarray, " time"]:
-    """`rows` with the holes of up to `hole` rows between them: what is let through there was chosen by its noise."""
+    """`rows` with the holes of up to `hole` rows between them: readings in a hole passed the test by chance."""
     k = np.flatnonzero(rows)
     out = rows.copy()
     for a, b in pairwise(k.tolist()):

@@ -10,7 +10,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lowest and highest values, by column, in SI units; what is absent is as far as the logs went."""
+    """Lowest and highest values, by column, in SI units; absent ones are the ranges of the logs."""
 
     values: Mapping[str, Range] = field(default_factory=dict)
     """Ranges of inputs [N m, or N], coordinates and rates."""

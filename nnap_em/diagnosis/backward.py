@@ -1,4 +1,4 @@
-"""The backward pass: laws that are not needed go, and what explains clearly more takes the place of a law."""
+"""The backward pass: laws that are not needed go, and a rival that explains clearly more replaces a law."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ import numpy as np
 
 from ..numerics.digits import share_of
 from .context import SearchContext, smooth
-from .hypothesis import Found, Hypothesis
+from .hypothesis import Evidence, Hypothesis
 from .keys import Key, elsewhere, key_of, remainder_of, words
 from .losses import readings
 from .propose import proposals, surroundings
@@ -34,12 +34,12 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
 
     The models with and without a law are fitted in the same way, from their own smoothed paths.
     """
-    while hypothesis.found:
+    while hypothesis.evidence:
         fit, _ = smooth(context, hypothesis, context.longest)
         if not fit.used.any():
             break
         full = null_of(hypothesis, fit, context.loss, context.effort.passes).end
-        reduced = [_without(context, fit, full, place) for place in range(len(hypothesis.found))]
+        reduced = [_without(context, fit, full, place) for place in range(len(hypothesis.evidence))]
         least = int(np.argmin([one.lost for one in reduced]))
         lost, floor = reduced[least].lost, context.loss.bars.floor(float(readings(fit.data, fit.used)))
         if needed(lost, floor):
@@ -55,12 +55,12 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
     """The fit without the effect at `place`, and the share of its squared error that the effect removes at best."""
     hypothesis, effects = fit.hypothesis, fit.model.effects
     if (
-        hypothesis.found[place] is None
+        hypothesis.evidence[place] is None
         or effects[place].read_off
         or any(remainder_of(other, fit.model) == place for other in effects)
     ):
         return _Reduced(math.inf)  # of an earlier fit, seen in the numbers themselves, or its remainder goes first
-    if not effects[place].possible():
+    if not effects[place].is_physical():
         return _Reduced(-math.inf)
     smoothed, _ = smooth(context, hypothesis.without(place), context.longest)
     both = fit._replace(hypothesis=smoothed.hypothesis, path=smoothed.path, used=fit.used & smoothed.used)
@@ -76,7 +76,7 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
 
     One that is clearly worse is no equivalent any more; the first that is clearly better takes the place.
     """
-    found = list(hypothesis.found)
+    found = list(hypothesis.evidence)
     for place, (law, without) in enumerate(zip(hypothesis.model.effects, reduced, strict=True)):
         evidence, leads = found[place], {}
         if without.fit is None or without.null is None or evidence is None:
@@ -87,14 +87,19 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
             leads[key] = max(lead, leads.get(key, -math.inf))
             if lead > 1:
                 context.log(f"  {words(key)} takes the place of {words(key_of(law))}")
+<<<<<<< HEAD
                 record = evidence._replace(removed=trial.removed, equivalent=(), candidate=trial.candidate)
                 return trial.after._replace(found=(*trial.after.found[:-1], record))
+=======
+                record = evidence._replace(removed=trial.removed, equivalent=())
+                return trial.after._replace(evidence=(*trial.after.evidence[:-1], record))
+>>>>>>> wt-docs
         same = tuple(key for key in evidence.equivalent if leads.get(key, 0.0) >= -1)
         found[place] = evidence._replace(equivalent=same)
-    return hypothesis._replace(found=tuple(found))
+    return hypothesis._replace(evidence=tuple(found))
 
 
-def _in_place(context: SearchContext, law: Key, evidence: Found, fit: SmoothedFit, null: Null) -> Iterator[Trial]:
+def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: SmoothedFit, null: Null) -> Iterator[Trial]:
     """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: a law alone
     was compared with that when it was found.  Of each the best candidate.
     """

@@ -190,7 +190,7 @@ def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState
     hypothesis as it stands: EM, by one-step likelihood, may leave what the errors of many steps had taught.
     """
     state = functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, fits)
-    if not context.loss.predicts:
+    if not context.loss.multi_step:
         return state
     (own, used), *others = (
         smooth(context, hypothesis.refitted(model), context.longest)

@@ -27,7 +27,7 @@ from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..prediction_error import simulated
 from ..storage.log import Log
-from .hypothesis import Found, Hypothesis
+from .hypothesis import Evidence, Hypothesis
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
@@ -106,7 +106,7 @@ class Search(NamedTuple):
         """The hypothesis with some laws more, which begin with the numbers of `starts`."""
         system = hypothesis.model.system
         for law, start in zip(laws, starts, strict=True):
-            lean = Candidate(law.start.lean(system), (), law.spread.lean(system))
+            lean = Candidate(law.start.lean(system), (), law.prior_std.lean(system))
             hypothesis = hypothesis.plus(start.lean(system), lean)
         return hypothesis
 
@@ -233,7 +233,7 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
         if chosen is None:
             break
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Found(math.nan, math.nan, math.nan, alike, chosen.share, chosen.share)
+            record = Evidence(math.nan, math.nan, math.nan, alike, chosen.share, chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
@@ -241,7 +241,7 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
         return Diagnosis(before, before, (), tuple(steps), complete=complete)
     state = before.state._replace(best=hypothesis.model)
     after = fitted_to_horizon(before._replace(state=state, m_step=hypothesis.m_step), data)
-    return Diagnosis(before, after, hypothesis.found, tuple(steps), complete=complete)  # type: ignore[arg-type]
+    return Diagnosis(before, after, hypothesis.evidence, tuple(steps), complete=complete)  # type: ignore[arg-type]
 
 
 def _with_numbers(hypothesis: Hypothesis, case: Case) -> Any:
@@ -305,7 +305,7 @@ def _round(
 
 def _sound(case: Case) -> bool:
     """True for physical values that differ from none."""
-    return all(effect.possible() for effect in case.effects)
+    return all(effect.is_physical() for effect in case.effects)
 
 
 def _passes(case: Case) -> bool:

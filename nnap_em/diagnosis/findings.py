@@ -1,4 +1,4 @@
-"""The outcome of the loop in words and numbers: what was found, how sure, and the error that it removes."""
+"""The outcome of the search in words and numbers: effects, their uncertainty, the error that they remove."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -88,7 +88,7 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     fitted, model = diagnosis.after, diagnosis.after.model
     numbers = covariances(model, fitted.m_step, fitted.state.hessian)
     laws = [None if (place := remainder_of(e, model)) is None else model.effects[place] for e in model.effects]
-    entries = list(zip(model.effects, diagnosis.found, numbers, laws, strict=True))
+    entries = list(zip(model.effects, diagnosis.evidence, numbers, laws, strict=True))
     out = []
     for effect, record, cov, law in entries:
         if law is not None or record is None:
@@ -208,7 +208,7 @@ def _sized(finding: Finding) -> str:
 
 def friction_change(diagnosis: Diagnosis, velocity: Float[np.ndarray, "dof node"]) -> str | None:
     """Change of the learned friction by the added effects."""
-    if not (diagnosis.found and diagnosis.before.rig.friction):
+    if not (diagnosis.evidence and diagnosis.before.rig.friction):
         return None
     first, second = (
         np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (diagnosis.before, diagnosis.after)

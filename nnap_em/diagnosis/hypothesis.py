@@ -15,7 +15,7 @@ from ..model.state_space import StateSpaceModel, with_effects
 from .keys import Key
 
 
-class Found(NamedTuple):
+class Evidence(NamedTuple):
     """Evidence for an added effect."""
 
     gain: float = math.nan
@@ -47,7 +47,7 @@ class Addition(NamedTuple):
     mean: Float[Array, " param"]
     """Prior of its parameters."""
     std: Float[Array, " param"]
-    found: Found | None = None
+    evidence: Evidence | None = None
 
 
 class Hypothesis(NamedTuple):
@@ -55,13 +55,13 @@ class Hypothesis(NamedTuple):
 
     model: StateSpaceModel
     m_step: ScoringMStep
-    found: tuple[Found | None, ...] = ()
+    evidence: tuple[Evidence | None, ...] = ()
 
     @property
     def additions(self) -> tuple[Addition, ...]:
         """The effects of the model, each with all that belongs to it."""
         prior = self.m_step.prior
-        entries = zip(self.model.effects, blocks(self.model, self.m_step), self.found, strict=True)
+        entries = zip(self.model.effects, blocks(self.model, self.m_step), self.evidence, strict=True)
         return tuple(
             Addition(effect, prior.mean[block], prior.std[block], evidence) for effect, block, evidence in entries
         )
@@ -82,12 +82,12 @@ class Hypothesis(NamedTuple):
         rule = eqx.tree_at(
             lambda m: (m.prior, m.log_q_prior), self.m_step, (joined, shape), is_leaf=lambda leaf: leaf is None
         )
-        return Hypothesis(model, rule, tuple(a.found for a in additions))
+        return Hypothesis(model, rule, tuple(a.evidence for a in additions))
 
-    def plus(self, effect: AbstractEffect, candidate: Candidate, evidence: Found | None = None) -> "Hypothesis":
+    def plus(self, effect: AbstractEffect, candidate: Candidate, evidence: Evidence | None = None) -> "Hypothesis":
         """The hypothesis with one effect more, behind the others."""
         centre = candidate.start if effect.linear else effect
-        return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.spread), evidence)))
+        return self.having((*self.additions, Addition(effect, flat(centre), flat(candidate.prior_std), evidence)))
 
     def without(self, place: int) -> "Hypothesis":
         """The hypothesis without the effect at `place`."""

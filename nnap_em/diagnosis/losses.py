@@ -24,7 +24,7 @@ from ..em.local import locals_along
 from ..em.quadratic import whitened_sensitivities
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, turns
+from ..numerics.parallel import batches, each
 from ..prediction_error.multistep import (
     HORIZONS,
     JUDGED,
@@ -69,10 +69,10 @@ class AbstractLoss(eqx.Module):
     """Horizons [s] whose errors are screened together, in the order of precedence."""
     measure: ClassVar[str]
     """Name of the share that the screen computes, as a figure labels it."""
-    predicts: ClassVar[bool] = False
-    """True where errors of many steps decide: likelihood then proves nothing."""
+    multi_step: ClassVar[bool] = False
+    """True where multi-step errors decide, and not the likelihood."""
 
-    def left(self, fit: SmoothedFit) -> float:
+    def remaining_share(self, fit: SmoothedFit) -> float:
         """Share of the declared model's squared error that the accepted laws left; 1 where it does not matter."""
         return 1.0
 
@@ -81,7 +81,7 @@ class AbstractLoss(eqx.Module):
         """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
 
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
-        """A `trial` after what its fit by likelihood leaves to do."""
+        """A `trial` after the steps of this loss, which follow its fit by likelihood."""
         return trial
 
     @abstractmethod
@@ -108,14 +108,14 @@ class MultiStep(AbstractLoss):
 
     bars: ClassVar[Bars] = MULTI_STEP
     measure: ClassVar[str] = "share of the squared multi-step error"
-    predicts: ClassVar[bool] = True
+    multi_step: ClassVar[bool] = True
     bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(HORIZONS, SHORT_HORIZONS))
     judged: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(JUDGED, SHORT_HORIZONS))
     """Horizons [s] at which a law that a band shows is judged after its refit."""
 
-    def left(self, fit: SmoothedFit) -> float:
+    def remaining_share(self, fit: SmoothedFit) -> float:
         """Product of what each refit left: a later law must remove the floor of the first error, not of the rest."""
-        removed = [evidence.removed for evidence in fit.hypothesis.found if evidence is not None]
+        removed = [evidence.removed for evidence in fit.hypothesis.evidence if evidence is not None]
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
@@ -182,7 +182,7 @@ class OneStep(AbstractLoss):
         along = candidate_columns(_machine(fit), candidates, fit.rows)
         common = (model.log_q, model.log_r, model.start, weights.nodes)
         parts = []
-        for _, (local, batch) in turns(len(data.t), linear, track):  # columns of all at once fill the memory
+        for _, (local, batch) in batches(len(data.t), linear, track):  # columns of all at once fill the memory
             innovations = each(_innovations, common, (local, batch.middle, along(batch)), together=1)
             parts.append([np.asarray(a, np.float32) for a in innovations])
         error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
@@ -215,7 +215,7 @@ def readings(data: Dataset, used) -> int:
 
 
 def _machine(fit: SmoothedFit) -> StateSpaceModel:
-    """The declared machine with the friction of the fit: what candidates act on."""
+    """The declared machine with the friction of the fit, on which candidates act."""
     return eqx.tree_at(lambda m: m.unknown, fit.declared.model, fit.model.unknown)
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 from ..fit.identify import Identified
 from ..prediction_error.recorded import Risen
 from ..residual.interventions import Intervention
-from .hypothesis import Found
+from .hypothesis import Evidence
 from .keys import Key, key_of, listed, words
 
 
@@ -58,7 +58,7 @@ class Diagnosis(NamedTuple):
 
     before: Identified
     after: Identified
-    found: tuple[Found, ...]
+    evidence: tuple[Evidence, ...]
     steps: tuple[Step, ...]
     interventions: tuple[Intervention, ...] = ()
     """External disturbances, whose rows are in no fit."""

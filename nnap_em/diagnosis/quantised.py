@@ -12,7 +12,7 @@ from ..effects.sensor import SensorQuantization, grid_step
 from ..em.loop import EMState
 from ..model.state_space import StateSpaceModel
 from .context import SearchContext, extend
-from .hypothesis import Found, Hypothesis
+from .hypothesis import Evidence, Hypothesis
 from .verdict import COARSE, FINEST, ONE_STEP
 
 
@@ -35,7 +35,7 @@ def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesi
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        evidence = Found(float(gain), math.nan, math.nan)  # of the same numbers: nothing is left out
+        evidence = Evidence(float(gain), math.nan, math.nan)  # of the same numbers: nothing is left out
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         hypothesis = hypothesis.refitted(early).plus(effect, candidate, evidence)
         if declared:

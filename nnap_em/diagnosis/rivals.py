@@ -23,14 +23,14 @@ PASSES = 10
 """Passes of a fit from one of them, more than in a search: rivals are compared closely."""
 
 
-def possible(fitted: Identified, data: Dataset) -> list[AbstractEffect]:
+def proposals_for(fitted: Identified, data: Dataset) -> list[AbstractEffect]:
     """The laws that the machine of a fit may have."""
     fit = _smoothed(fitted, data, None)
     around = surroundings(fitted.rig, fit.model, fit.data, fit.path, fit.rows)
     return [candidate.start for candidate in proposals(around, fit.model.effects)]
 
 
-def instead(
+def with_rival(
     fitted: Identified, data: Dataset, place: int | None, means: Callable[[AbstractEffect], bool]
 ) -> Identified | None:
     """The fit with such a law in the place of its effect number `place` (None: on top), from quick refits.

@@ -41,10 +41,10 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
     seen = screen(context.loss, fit, proposals(around, model.effects))
     fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
-    ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).possible())
+    ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
-    disputed = _disputed(fresh, seen) if context.loss.predicts else ()
+    disputed = _disputed(fresh, seen) if context.loss.multi_step else ()
     step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, disputed)
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
@@ -66,7 +66,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     except TimeUp:
         step = step._replace(untried=len(admitted))
     others = [s for s in ranked if not any(s is case.screened for case in tried)]
-    suspects = _suspects(others) if context.loss.predicts else ()
+    suspects = _suspects(others) if context.loss.multi_step else ()
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
 
@@ -93,21 +93,21 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
     None is accepted where one that is worth as much is of another cause.
     """
     model, values = fit.model, [case.removed for case in admissible]
-    ties = values if context.loss.predicts else [_priced(case) for case in admissible]
+    ties = values if context.loss.multi_step else [_priced(case) for case in admissible]
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), ties)]
     best = _form(leader, admissible, values, ties, model)
     law = best.candidate.start
     tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
     rivals = [case for case in tied if other_cause(case.effect, law, model.system)]
-    if rivals and context.loss.predicts:
+    if rivals and context.loss.multi_step:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = list(zip(candidates, overlaps(outcome.screen, best.screened), strict=True))
     same = [key_of(c) for c, part in parts if c.named and part < SAME]
-    if not context.loss.predicts:
+    if not context.loss.multi_step:
         tied = [case for case in tied if _priced(best) - _priced(case) < EQUIVALENT_NATS]
         same += [key_of(c) for c, part in parts if c.named and 0.0 < part * best.gain < EQUIVALENT_NATS]
     same += [key_of(case.effect) for case in tied if case.effect.named]
@@ -125,7 +125,7 @@ def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
 
 
 def _worths(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> list[float]:
-    """Values times prior odds: what laws of different causes are compared by."""
+    """Values times prior odds, by which laws of different causes are compared."""
     return [value * odds(number) for value, number in zip(values, _complexities(laws, model), strict=True)]
 
 
@@ -152,7 +152,7 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
 
 
 def _listed(screened: Screened) -> float:
-    """Share as a report lists it: none where the parts disagree."""
+    """Share as a report lists it; 0 where the parts disagree."""
     return screened.share.least if screened.admissible else 0.0
 
 
@@ -160,7 +160,7 @@ def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
     """True for a law that the model does not hold, or that takes the place of one; for a change of one of the fit from
     which the search began, too, in the form that it has there.
     """
-    model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.found, strict=True))
+    model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.evidence, strict=True))
     present = {key_of(effect) for effect, evidence in pairs if evidence is not None}
     place = replaced(law, model)
     new = place is None and key_of(law) not in present
@@ -227,7 +227,7 @@ def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
         against = held[folds < 0].any(axis=0)
         if not 0 < 2 * against.sum() < held.any(axis=0).sum():
             continue  # no odd ones: it is no law
-        if not seeded(screened.candidate, screened.coefficients).possible():
+        if not seeded(screened.candidate, screened.coefficients).is_physical():
             continue
         key = key_of(start)
         entry = Disputed(key, share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))

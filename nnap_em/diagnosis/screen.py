@@ -1,8 +1,8 @@
 """The share of a squared error that each candidate removes, and the share that chance removes.
 
 Friction, parameters and accepted effects are nuisance: all data together project them out of errors and candidates, and
-only the strengths of a candidate are fitted without the parts left out.  A nuisance fitted anew to every fold
-diverges on chaotic recordings, and refuses true effects.
+only the strengths of a candidate are fitted without the parts left out.  Refitting friction and
+parameters on every fold diverges on chaotic recordings and rejects true effects.
 """
 
 import itertools
@@ -38,7 +38,7 @@ class Rows(NamedTuple):
     overlap: float
     """Rows that count as one."""
     survived: Float[np.ndarray, " column"]
-    """Norm of every column over what it was before."""
+    """Norm of every column over its norm before the projection."""
 
 
 class Shares(NamedTuple):
@@ -97,7 +97,7 @@ class Screened(NamedTuple):
         far = float(np.sqrt(np.mean(self.coefficients**2 * _ridge(self.candidate))))
         if not sensible(multiple, far, self.survived, linear=start.linear):
             return False
-        return agreed(self.share.folds, self.floor, answers=start.answers())
+        return agreed(self.share.folds, self.floor, responds=start.responds_to_feedback())
 
 
 def spans(candidates: Sequence[Candidate]) -> list[slice]:
@@ -220,7 +220,7 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
     """Prior precision of the multiples of the probes."""
-    start, spread = np.asarray(flat(candidate.start)), np.asarray(flat(candidate.spread))
+    start, spread = np.asarray(flat(candidate.start)), np.asarray(flat(candidate.prior_std))
     steps = [(np.asarray(flat(probe)) - start) / spread for probe in candidate.probes]
     return np.array([np.sum(step**2) for step in steps]) if candidate.start.linear else np.zeros(len(steps))
 
@@ -284,7 +284,7 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
     bands = _bands(loss, fit, candidates, shifts)
     out = []
     for number, band in enumerate(bands):
-        floor = loss.bars.floor(band.independent) / loss.left(fit)
+        floor = loss.bars.floor(band.independent) / loss.remaining_share(fit)
         placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
         chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
         out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))

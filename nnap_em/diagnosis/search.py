@@ -1,4 +1,4 @@
-"""Diagnosis: find what a fitted model lacks, add it, fit again, and remove what that made needless."""
+"""Diagnosis: find the effects that a fitted model lacks, add them, fit again, remove those no longer needed."""
 
 import dataclasses
 import math
@@ -35,7 +35,11 @@ from ..storage.log import Log, silent
 from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
+<<<<<<< HEAD
 from .hypothesis import Found, Hypothesis, covariances
+=======
+from .hypothesis import Evidence, Hypothesis
+>>>>>>> wt-docs
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step, Suspect
@@ -52,7 +56,7 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     fit, followed = smooth(context, hypothesis, length)
     reach = f"{length * context.before.rig.dt:.2f} s"
     context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
-    effects = zip(hypothesis.model.effects, hypothesis.found, strict=True)
+    effects = zip(hypothesis.model.effects, hypothesis.evidence, strict=True)
     added = sum(not effect.read_off and evidence is not None for effect, evidence in effects)
     if not fit.used.any() or added >= context.effort.most:
         return hypothesis
@@ -65,17 +69,17 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     return _with(hypothesis, outcome.accepted, _evidence(outcome, context.loss), context)
 
 
-def _with(hypothesis: Hypothesis, case: Trial, evidence: Found, context: SearchContext) -> Hypothesis:
+def _with(hypothesis: Hypothesis, case: Trial, evidence: Evidence, context: SearchContext) -> Hypothesis:
     """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
     remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
     place = remainder if form is None else form
-    law = None if place is None else hypothesis.found[place]
+    law = None if place is None else hypothesis.evidence[place]
     both = None if law is None else 1 - (1 - law.removed) * (1 - case.removed)
     stays = law is None or (form is None and 0 in even([law.removed, cast(float, both)]))
     if not stays:  # over the model without the older law
         evidence = evidence._replace(removed=cast(float, both))
-    following = case.after._replace(found=(*case.after.found[:-1], evidence))
+    following = case.after._replace(evidence=(*case.after.evidence[:-1], evidence))
     if stays or form is not None:  # its place is taken already
         return following
     context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
@@ -87,12 +91,17 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[tuple[Key, Any], int]]:
     return frozenset(Counter((key_of(e), jax.tree.structure(e)) for e in hypothesis.model.effects).items())
 
 
-def _evidence(outcome: Round, loss: AbstractLoss) -> Found:
+def _evidence(outcome: Round, loss: AbstractLoss) -> Evidence:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Trial, outcome.accepted)
     screened, share = case.screened, case.screened.share
+<<<<<<< HEAD
     evidence = Found(equivalent=outcome.equivalent, removed=case.removed, candidate=case.candidate)
     if loss.predicts:  # a likelihood proves nothing there
+=======
+    evidence = Evidence(equivalent=outcome.equivalent, removed=case.removed)
+    if loss.multi_step:  # a likelihood proves nothing there
+>>>>>>> wt-docs
         parts = sum(part > 0 for part in share.folds), len(share.folds)
         return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
     p_value = float(stats.chi2.sf(2 * max(case.gain, 0.0), max(screened.directions, 1))) * outcome.step.tried
@@ -118,10 +127,17 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
+<<<<<<< HEAD
     hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
     if outcome is None:
         return Diagnosis(before, before, (), tuple(steps), complete=complete)
     return Diagnosis(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
+=======
+    if not hypothesis.evidence or state is None:
+        return Diagnosis(before, before, (), tuple(steps), complete=complete)
+    outcome = release(_outcome(before, hypothesis, state), data)
+    return Diagnosis(before, outcome, cast(tuple[Evidence, ...], hypothesis.evidence), tuple(steps), complete=complete)
+>>>>>>> wt-docs
 
 
 def _determined(
@@ -151,7 +167,7 @@ def _determined(
         steps = [step._replace(accepted=None) if step.accepted == law else step for step in steps]
         suspects = Suspect(law, evidence.share, evidence.chance), *steps[-1].suspects
         steps[-1] = steps[-1]._replace(suspects=suspects)
-        hypothesis = hypothesis.refitted(cast(StateSpaceModel, state.best)).without(least)
+        hypothesis = backward(context, hypothesis.refitted(cast(StateSpaceModel, state.best)).without(least))
         state = extend(context, hypothesis, context.longest) if hypothesis.found else None
     return hypothesis, None, steps
 
@@ -206,19 +222,19 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
         try:
             with until(context.until):
                 proposed = _forward(context, hypothesis, length, steps)
-                if proposed.found is hypothesis.found and ahead:
+                if proposed.evidence is hypothesis.evidence and ahead:
                     continue
                 searched.add(_names(hypothesis))
                 if _names(proposed) in searched:  # nothing new, or one law in the place of another and back
                     steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
                     proposed = backward(context, hypothesis)
                     if _names(proposed) == _names(hypothesis):
-                        return _Searched(hypothesis._replace(found=proposed.found), state, steps)
+                        return _Searched(hypothesis._replace(evidence=proposed.evidence), state, steps)
         except TimeUp:
             context.log("the time is up: the search is not finished")
             return _Searched(hypothesis, state, steps, complete=False)
         try:
-            hypothesis, state = proposed, extend(context, proposed, length) if proposed.found else None
+            hypothesis, state = proposed, extend(context, proposed, length) if proposed.evidence else None
         except FitError as error:
             context.log(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
@@ -317,7 +333,7 @@ def diagnose(
     if change:
         return _compared(diagnosis, origin, data, ended)
     before = ended(before, data)
-    return _branching(diagnosis._replace(before=before, after=diagnosis.after if diagnosis.found else before))
+    return _branching(diagnosis._replace(before=before, after=diagnosis.after if diagnosis.evidence else before))
 
 
 def _put(
@@ -360,7 +376,7 @@ def _compared(
         now = level(errors_of(before.model, before.m_step, path, data), out.scale)
         diagnosis = diagnosis._replace(risen=risen(out.level, now))
     before = ended(diagnosis.before, data)
-    after = diagnosis.after if any(evidence is not None for evidence in diagnosis.found) else before
+    after = diagnosis.after if any(evidence is not None for evidence in diagnosis.evidence) else before
     return _branching(diagnosis._replace(before=before, after=after, change=True))
 
 

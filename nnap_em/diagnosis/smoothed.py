@@ -1,4 +1,4 @@
-"""A hypothesis along its smoothed paths: what every loss is taken of."""
+"""A hypothesis along its smoothed paths, of which every loss is taken."""
 
 from typing import NamedTuple
 

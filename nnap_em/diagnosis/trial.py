@@ -58,12 +58,12 @@ class Trial(NamedTuple):
         numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
         numbers["before"] = self.before
         return veto(
-            possible=self.effect.possible(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
+            possible=self.effect.is_physical(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
         )
 
 
 class Null(NamedTuple):
-    """A hypothesis before its passes and after them: what trials are compared with."""
+    """A hypothesis before and after its passes, with which trials are compared."""
 
     start: Refit
     end: Refit
@@ -96,8 +96,8 @@ def with_candidate(screened: Screened, null: Null, fit: SmoothedFit, loss: Abstr
     place = replaced(effect, hypothesis.model)
     full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, candidate)
     start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-    foreseen = 1 - loss.ratio(null.start, start, fit, screened.band) if loss.predicts else np.nan
-    if loss.predicts and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
+    foreseen = 1 - loss.ratio(null.start, start, fit, screened.band) if loss.multi_step else np.nan
+    if loss.multi_step and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
         return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
     end = fitted(start, fit, loss, passes)
     after = full.refitted(end.model)

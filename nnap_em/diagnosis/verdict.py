@@ -71,7 +71,7 @@ class Bars(NamedTuple):
     """Smallest share and smallest gain that count, whatever chance can do."""
 
     share: float
-    """Smallest share that counts: what a model lacks for another reason looks like some law up to here."""
+    """Smallest share that counts: below it an effect that is not in the catalogue looks like some law that is."""
     nats: float
     """Smallest gain in log-likelihood that counts [nat]."""
 
@@ -111,12 +111,12 @@ def sensible(multiple: float, far: float, survived: float, *, linear: bool) -> b
     return (linear or PROBE[0] < multiple < PROBE[1]) and far < FAR and survived >= SURVIVES
 
 
-def agreed(folds: Sequence[float], floor: float, *, answers: bool = False) -> bool:
+def agreed(folds: Sequence[float], floor: float, *, responds: bool = False) -> bool:
     """True where the error falls on most parts and rises on none by much.
 
-    A free function of an input `answers` any disturbance under feedback, and has to remove the floor on every part.
+    A free function of an input `responds` to any disturbance under feedback, and has to remove the floor on every part.
     """
-    if answers:
+    if responds:
         return min(folds) >= floor
     return sum(fold > 0 for fold in folds) >= AGREE * len(folds) and min(folds) > -HARM * floor
 

@@ -112,7 +112,7 @@ class OneSidedLoss(InputEffect):
     def inputs_named(self):
         return (self.column,)
 
-    def possible(self):
+    def is_physical(self):
         return 0 < float(self.loss) < 1
 
     def drive(self, torque):

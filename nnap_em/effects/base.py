@@ -126,7 +126,7 @@ class Candidate(NamedTuple):
     """Strengths zero (linear), inner parameters at one place of their grid."""
     probes: tuple["AbstractEffect", ...]
     """The effect with one strength each at a typical size: the directions that the score test looks along."""
-    spread: "AbstractEffect"
+    prior_std: "AbstractEffect"
     """Prior standard deviation of every parameter."""
 
 
@@ -230,7 +230,7 @@ class AbstractEffect(eqx.Module):
         force, angle = system.force_unit(self.joint), system.unit(system.coordinates[self.joint - 1])
         return {name: unit.replace("N m", force).replace("rad", angle) for name, unit in self.units.items()}
 
-    def possible(self) -> bool:
+    def is_physical(self) -> bool:
         """True if the fitted values are physical."""
         return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
@@ -254,7 +254,7 @@ class AbstractEffect(eqx.Module):
         """Laws that are the same model on this machine, by name, joint, channel and inputs."""
         return ()
 
-    def answers(self) -> bool:
+    def responds_to_feedback(self) -> bool:
         """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False
 

@@ -135,7 +135,7 @@ class PortEffect(AbstractEffect):
     def signals(self, system):
         return self.reads
 
-    def possible(self) -> bool:
+    def is_physical(self) -> bool:
         """A flow that leaves a state has a positive strength, and no more of it arrives than leaves, but for errors."""
         return (not self.leaves or float(self.strength) > 0) and ("share" not in self.reports or self._shared())
 

@@ -159,7 +159,7 @@ class LoadFriction(JointEffect):
             shares += [motor, motor if load is None and self.whole else load]
         return tuple(shares)
 
-    def possible(self):
+    def is_physical(self):
         return float(self.mu) + (0.0 if self.load is None else float(self.load)) > 0
 
     def inputs_named(self):

@@ -23,7 +23,7 @@ BACKWARDS = 0.1
 class AbstractAxis(eqx.Module):
     """One axis of the function: what it reads, and where its basis functions stand."""
 
-    answers: ClassVar[bool]
+    responds_to_feedback: ClassVar[bool]
     """True for an input."""
     names: tuple[str, ...] = eqx.field(static=True)
     low: Scalar = eqx.field(converter=a)
@@ -68,7 +68,7 @@ class AbstractAxis(eqx.Module):
 class Axis(AbstractAxis):
     """A coordinate, a rate, the time, or a sum of angles."""
 
-    answers: ClassVar[bool] = False
+    responds_to_feedback: ClassVar[bool] = False
 
     def value(self, scene):
         system = scene.system
@@ -84,7 +84,7 @@ class Axis(AbstractAxis):
 class InputAxis(AbstractAxis):
     """An input by its column, as it reaches its joint [N m]."""
 
-    answers: ClassVar[bool] = True
+    responds_to_feedback: ClassVar[bool] = True
     index: int = eqx.field(static=True, kw_only=True)
     """Place among the inputs of the rig, counted from 0."""
 
@@ -140,12 +140,12 @@ class UnknownFunction(JointEffect):
     def signals(self, system):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.signals(system)))
 
-    def answers(self):
-        return any(axis.answers for axis in self.axes)
+    def responds_to_feedback(self):
+        return any(axis.responds_to_feedback for axis in self.axes)
 
-    def possible(self):
-        """A drive gives no less torque for more input, whatever it loses: what zigzags stands for another cause."""
-        if len(self.axes) != 1 or not self.answers():
+    def is_physical(self):
+        """A drive's torque is monotone in its input: a function that is not is a symptom of another missing effect."""
+        if len(self.axes) != 1 or not self.responds_to_feedback():
             return True
         (axis,) = self.axes
         u = np.linspace(float(axis.low), float(axis.high), 8 * axis.count)

@@ -65,7 +65,7 @@ class BaseVibration(AbstractEffect):
         make = lambda *numbers: cls.of(*numbers, 1 / span)  # noqa: E731
         return [pair(make, 0.1, 5.0, (float(f), 0.3 / span)) for f in np.linspace(1 / span, 8.0, count)]
 
-    def possible(self):
+    def is_physical(self):
         return float(self.frequency) >= float(self.slowest)
 
     def values(self):

@@ -61,7 +61,7 @@ class TorsionalSpring(PlaceEffect):
             at = at + self._pull(at) / jnp.where(slope == 0, 1.0, slope)
         return {"k": self._slope(at), "theta0": at}
 
-    def possible(self):
+    def is_physical(self):
         return float(self.values()["k"]) > 0
 
     def _pull(self, angle):
@@ -105,7 +105,7 @@ class Cogging(PlaceEffect):
         amplitude = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"amplitude": amplitude, "k": self.k, "phase": jnp.arctan2(self.cosine, self.sine)}
 
-    def possible(self):
+    def is_physical(self):
         return float(self.k) > 0.7 and abs(float(self.k) - float(self.near)) < 0.3
 
     def visible(self, around):
@@ -170,7 +170,7 @@ class HardStop(PlaceEffect):
                 out.append(Candidate(start, (make(up, down, *numbers),), spread))
         return out
 
-    def possible(self):
+    def is_physical(self):
         separate = float(self.upper - self.lower) > 0.3 * float(self.reach)
         return separate and float(self.stiffness) > float(self.soft)
 

@@ -67,7 +67,7 @@ def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array,
 def derivatives(signal: Float[np.ndarray, "seq time"], order: int, dt: float) -> list[Float[np.ndarray, " reading"]]:
     """Derivatives of each sequence by differences over `LAG` rows, or over one reading where these are further apart.
 
-    Missing samples are bridged: of readings that come every other row none are `LAG` rows apart.
+    Missing samples are bridged, since readings of every other row are never `LAG` rows apart.
     """
     out = []
     for y in signal:
@@ -171,12 +171,12 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         d if d is not None else max(2 * reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i, d in enumerate(declared)
     ]
     places = [system.readable.index(name) for name in rig.measured]
-    shaken = _shaken(system, scales)[places]
+    shaken = _by_acceleration(system, scales)[places]
     unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
     if rig.friction:
         speed, scale = jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque)
         unknown = FrictionNetwork(speed, scale, key=key, resolution=300.0)
-        unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_hush)
+        unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_quiet)
     model = StateSpaceModel(
         system=system,
         unknown=unknown,
@@ -207,12 +207,12 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
 
 
 def _driven(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " dof"]:
-    """Typical torque of the drive of each joint, or of what moves it where none does [N m, or N]."""
+    """Typical torque of the drive of each joint; of a joint without one, of gravity and coupling [N m, or N]."""
     torque = scales.torque - loads(system)[1]
     return np.where(torque > 1e-3 * scales.torque, torque, scales.torque)
 
 
-def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
+def _by_acceleration(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
     """Change of a reading by accelerations as large as those in the logs: the first uncertainty of forces."""
     dof = len(system.coordinates)
     still, out = jnp.zeros(dof), np.zeros(len(system.readable))
@@ -224,8 +224,8 @@ def _shaken(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " reada
     return out
 
 
-def _hush(layer: eqx.nn.Linear) -> eqx.nn.Linear:
-    """The output layer, scaled so that the first friction is nearly none."""
+def _quiet(layer: eqx.nn.Linear) -> eqx.nn.Linear:
+    """The output layer, scaled so that the first friction is nearly zero."""
     return eqx.tree_at(
         lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, jax.tree.map(jnp.zeros_like, layer.bias))
     )

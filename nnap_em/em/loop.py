@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
-from ..numerics.parallel import each, turns
+from ..numerics.parallel import batches, each
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
@@ -84,7 +84,7 @@ def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
 
     Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
     """
-    return _seconded(model, data, smoother.second(), _alone(model, data, smoother, key=key))
+    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key))
 
 
 def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
@@ -100,12 +100,12 @@ def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys
     return each(_smooth, (model, smoother), (data, keys), together=together)
 
 
-def _seconded(model: AbstractModel, data: Dataset, second: AbstractBranching | None, first: Posterior) -> Posterior:
+def _with_mixture(model: AbstractModel, data: Dataset, second: AbstractBranching | None, first: Posterior) -> Posterior:
     """`first`, with the likeliest path of the second smoother where a sequence is wide."""
     some = beyond(first, second)
     if second is None or not some.size:
         return first
-    for few, batch in turns(len(some), *jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))):
+    for few, batch in batches(len(some), *jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))):
         path, loglik = each(_likeliest_path, (model, second), batch)
         first = _replaced(first, path, loglik, some[few])
     return first
@@ -255,7 +255,7 @@ def fit(
 
 
 def _afresh(state: EMState) -> EMState:
-    """The state that goes on from the likeliest model, compared with nothing before."""
+    """The state restarted from the likeliest model, without likelihoods to compare with."""
     return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
 
 

@@ -23,7 +23,7 @@ from ..data.dataset import Dataset, fill_missing
 from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import at_home, each
+from ..numerics.parallel import each, on_default_device
 from ..smoother.kalman import Cubature, Tangent
 from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
@@ -55,7 +55,7 @@ class Core(NamedTuple):
 
 def between(origin: Any, target: Any, share: float) -> Any:
     """A model, or a part of one, a share of the way from `origin` to `target`."""
-    return _between(*at_home((origin, target, jnp.asarray(share, jnp.result_type(float)))))
+    return _between(*on_default_device((origin, target, jnp.asarray(share, jnp.result_type(float)))))
 
 
 @eqx.filter_jit
@@ -116,7 +116,7 @@ def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
 
 
 @eqx.filter_jit
-def _shaken(linear: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
+def _noise_floor(linear: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
     """`log_r` where it is no less than the mean effect of the kicks of a step, as accelerations, on a reading."""
     assert linear.reading_by_force is not None
     dof = linear.by_force.shape[-1]
@@ -244,7 +244,7 @@ class ScoringMStep(AbstractMStep):
         return Core(model.unknown, self.weights(model).read(model), model.log_q, model.log_r, model.start)
 
     def whole(self, model, core: Core) -> StateSpaceModel:
-        """`model` with what a step has changed."""
+        """`model` with the parts that a step changes."""
         fitted = self.weights(model).write(model, core.w)
         return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
 
@@ -266,10 +266,10 @@ class ScoringMStep(AbstractMStep):
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))
-        inputs = at_home((rule, core._replace(w=w), terms, first, posterior.loglik, used))
+        inputs = on_default_device((rule, core._replace(w=w), terms, first, posterior.loglik, used))
         core, hessian, used = _advance(*inputs)
         if linear.reading_by_force is not None:
-            core = core._replace(log_r=_shaken(linear, core.log_q, core.log_r))
+            core = core._replace(log_r=_noise_floor(linear, core.log_q, core.log_r))
         return *_narrowed(core, hessian, pad), used
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:

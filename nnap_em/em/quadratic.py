@@ -59,7 +59,7 @@ def whitened_sensitivities(
     readings: Float[Array, "time obs column"],
     observed: Bool[Array, "time obs"],
 ) -> Float[Array, "time obs column"]:
-    """Sensitivity of the whitened readings to what moves the next state by `columns` and the reading by `readings`."""
+    """Sensitivity of whitened readings to numbers that move the next state by `columns`, the reading by `readings`."""
 
     def step(s, slices):
         matrix, rows, columns, readings, gain, log_variance, observed = slices

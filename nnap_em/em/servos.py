@@ -54,7 +54,7 @@ def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], data: Dat
 
 @eqx.filter_jit
 def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof state"]:
-    """Derivatives of the accelerations that the servos give by position and rate, under a unit of what is fed."""
+    """Derivatives by position and rate of the accelerations that servos give, per unit of the fed-back signal."""
     fed, still = jnp.ones(len(servos)), jnp.zeros(q.shape[1])
 
     def one(q):

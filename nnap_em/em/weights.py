@@ -38,8 +38,7 @@ class Weights(eqx.Module):
     symmetry_std: Float[Array, ""] = eqx.field(default=1.0, converter=jnp.asarray)
     """Standard deviation of the even part at every node alone, in those of the offset."""
     departure: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
-    """Standard deviation at every node of what no viscous, Coulomb or constant friction describes, in those of the
-    offset."""
+    """Standard deviation at every node of the friction beside viscous, Coulomb and constant, in those of the offset."""
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
     """Smallest possible values of the first parameters, in units of their prior."""
     known: Known | None = None

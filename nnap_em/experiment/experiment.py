@@ -54,7 +54,7 @@ class Design(NamedTuple):
     """Information of as much time of the old inputs."""
     question: AbstractCriterion
     rivals: tuple[Rivals, ...]
-    apart: Discrimination | None
+    discrimination: Discrimination | None
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
@@ -87,8 +87,7 @@ def design(
         fitted: the model.
         data: the logs that it was fitted to.
         key: random key of the search.
-        question: "friction", "parameters", the name of one, "apart" (discriminate each of `rivals`) or "all" of what
-            there is.
+        question: "friction", "parameters", the name of one, "discriminate" (each of `rivals`) or "all" of what there is.
         rivals: pairs of laws to be discriminated.
         seconds: length of all sequences together [s].
         sequences: their number.
@@ -153,13 +152,13 @@ def design(
 def check_question(name: str, fitted: Identified, rivals: bool) -> None:
     """Raise DesignError where a fit, with or without rivals, has no criterion of that name."""
     prior = fitted.m_step.prior
-    several = {"friction": fitted.rig.friction, "parameters": prior.size, "apart": rivals}
+    several = {"friction": fitted.rig.friction, "parameters": prior.size, "discriminate": rivals}
     known = [kind for kind, there in several.items() if there]
     if known:
         known += [*prior.declared, "all"]
     if name not in known:
         why = {
-            "apart": "the fit has no effect that the data could not discriminate from another; name a law with --rival",
+            "discriminate": "the fit has no effect that another law explains as well; name a law with --rival",
             "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
             "friction": "the rig is declared free of friction",
         }.get(name, "not a question of this fit")
@@ -179,7 +178,7 @@ def _criterion(
         criteria["parameters"] = Parameters(fit, tuple(range(prior.size)))
     singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
     if discrimination is not None:
-        criteria["apart"] = discrimination
+        criteria["discriminate"] = discrimination
     return Several(tuple(criteria.values())) if name == "all" else (criteria | singles)[name]
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from ..data.dataset import Dataset
 from ..diagnosis.keys import key_of, words
-from ..diagnosis.rivals import instead, possible
+from ..diagnosis.rivals import proposals_for, with_rival
 from ..effects import AbstractEffect
 from ..fit.identify import Identified
 from ..storage.log import Log, silent
@@ -81,8 +81,8 @@ def _instead(fitted: Identified, data: Dataset, law: Law | None, other: Law) -> 
     if law is not None and place is None:
         held = ", ".join(words(key_of(effect)) for effect in effects)
         raise DesignError(f"the fit holds no {law}; it holds {held or 'no effect'}")
-    refit = instead(fitted, data, place, other.means)
+    refit = with_rival(fitted, data, place, other.means)
     if refit is None:
-        known = sorted({Law(effect.name, effect.joint, effect.channel).typed for effect in possible(fitted, data)})
+        known = sorted({Law(effect.name, effect.joint, effect.channel).typed for effect in proposals_for(fitted, data)})
         raise DesignError(f"this machine cannot have {other}; possible here: {', '.join(known)}")
     return refit

@@ -74,7 +74,7 @@ class Drive(NamedTuple):
     """Time constant [s]."""
     gain: float = 1.0
     after: float = math.inf
-    """Limit of what the gain gives, in the unit of the command."""
+    """Limit of the output of the gain, in the unit of the command."""
 
 
 class SensorContent(NamedTuple):

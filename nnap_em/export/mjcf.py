@@ -271,7 +271,7 @@ def _spring(laws: JointContent) -> dict[str, str]:
 
 
 def _rest(laws: JointContent) -> float:
-    """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
+    """Stable equilibrium of the springs, the stiffest if there are several; 0 where there is none."""
     a, b, c, d = laws.pull
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
     real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])

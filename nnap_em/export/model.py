@@ -28,7 +28,7 @@ PARAMETERS_FILE, PREDICTOR_FILE, STABLEHLO_FILE = "parameters.json", "predictor.
 
 
 class ExportError(ValueError):
-    """A model that has no plain NumPy form: the message names what it is about it."""
+    """A model that has no plain NumPy form; the message names the reason."""
 
 
 def write_model(fitted: Identified, out: Path | str) -> str:
@@ -243,7 +243,7 @@ def _row(model: StateSpaceModel, columns: Float[Array, " input"]) -> Inputs:
 
 
 def _spread(fitted: Identified, weights: Weights) -> Float[np.ndarray, "phi rank"]:
-    """Factor of the covariance that `phi_samples` draws from, without what is no more than rounding."""
+    """Factor of the covariance that `phi_samples` draws from, without directions that are rounding."""
     half = np.linalg.inv(np.linalg.cholesky(np.asarray(fitted.state.hessian))).T
     left, size, _ = np.linalg.svd(half, full_matrices=False)
     large = size > 1e-6 * np.max(size, initial=1e-300)

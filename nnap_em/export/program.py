@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Affine = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Matrix, offset and covariance of what they leave out."""
+"""Matrix, offset, and covariance of the remainder."""
 
 
 class Model(NamedTuple):

@@ -73,7 +73,7 @@ def moved(fitted: Identified) -> list[Moved]:
 
 
 def misfits(fitted: Identified, data: Dataset, error: Mapping[str, Any] | None, test: Dataset | None) -> list[Misfit]:
-    """Joints whose motion the fit takes for random; none where it predicts the test sequences all the same, or where
+    """Joints whose motion the fit takes for random; empty where it predicts the test sequences all the same, or where
     its epochs ended before it came to rest.
 
     The random acceleration is the process noise of a rate in a step over the length of the step.

@@ -44,7 +44,7 @@ the one before holds; the estimate had diverged and has started anew; more than 
 
 
 class Observation(NamedTuple):
-    """State of an observer after a row: the estimate, its test, and what the next row needs."""
+    """State of an observer after a row: the estimate, its test, and the memory for the next row."""
 
     mean: Float[Array, " state"]
     """Mean of the likeliest branch: coordinates, rates, memory of laws [rad and rad/s, or m and m/s]."""

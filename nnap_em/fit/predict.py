@@ -80,7 +80,7 @@ def _shown(model, one) -> Gaussian:
 
 
 class Paths(NamedTuple):
-    """Models drawn from the posterior: what the sample paths of all sequences have in common."""
+    """Models drawn from the posterior, shared by the sample paths of all sequences."""
 
     model: StateSpaceModel
     prior: ParameterPrior

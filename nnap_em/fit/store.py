@@ -158,7 +158,7 @@ def _tree(fitted: Identified) -> dict[str, Any]:
 
 
 def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Callable[[str, Any], Any]) -> Any:
-    """`node` anew, with `leaf` applied to what is data in it and `setting` to what is static."""
+    """A copy of `node`, with `leaf` applied to its arrays and numbers and `setting` to its static fields."""
     if isinstance(node, eqx.Module):
         rebuilt = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
         for field in dataclasses.fields(node):
@@ -270,7 +270,7 @@ def _rig(entries: Mapping[str, Any]) -> Rig:
 
 
 def _blank(rig: Rig, rows: int = 32) -> Dataset:
-    """Logs of the right shape, of which nothing is left when the numbers are in."""
+    """Placeholder logs of the right shape; all their numbers are replaced by those of the file."""
     t = rig.dt * np.arange(rows)
     swing = np.sin(t / t[-1])[None, :, None]
     u, y = (np.repeat(swing, n, axis=2) for n in (len(rig.input_columns), len(rig.measured)))

@@ -309,11 +309,11 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
     problem = regression(rig, system, data)
     if problem is None:
         return
-    plain = problem.left()
+    plain = problem.remains()
     explained = lambda left: ", ".join(f"{100 * (1 - share):.4g} %" for share in left)  # noqa: E731
     if found := mistakes(explanations(rig, problem), plain):
         text = ", or just as well: ".join(one.text for one in found)
-        text += f"; with that the declared bodies explain {explained(found[0].left)} of the torque, by joint, "
+        text += f"; with that the declared bodies explain {explained(found[0].remains)} of the torque, by joint, "
         yield CheckResult(
             _mark(True, any(one.ruins for one in found)), "dynamics", f"{text}as it is {explained(plain)}"
         )

@@ -40,7 +40,7 @@ FILTERED_ROWS = 5 * KNOTS
 """Filtered rows below which nothing is concluded."""
 WITHIN = 3.0
 """Standard deviations within which an uncertain number may move."""
-UNEXPLAINED = 5e-5
+SMALLEST_MISFIT = 5e-5
 """Share of the squared torque that may stay unexplained: 0.7 % of the torque, as a zero off by 0.4 degrees leaves."""
 LARGEST_REMAINDER = 0.25
 """Largest ratio of the unexplained with a named mistake corrected to that without.
@@ -63,7 +63,7 @@ CARRIED = 0.3
 class Explanation(NamedTuple):
     """A correction of the log, and the part of the torques that stays unexplained with it."""
 
-    left: Float[np.ndarray, " dof"]
+    remains: Float[np.ndarray, " dof"]
     """Share of the squared torque of each joint that stays unexplained."""
     text: str = ""
     ruins: bool = True
@@ -114,7 +114,7 @@ class Regression(NamedTuple):
         both = [filtered(inertia, motion.inertial), *(_by_joint(part, motion.direct) for part in others)]
         return np.stack(both)[:, self.rows]
 
-    def left(
+    def remains(
         self,
         sign: np.ndarray | float = 1.0,
         shift: np.ndarray | float = 0.0,
@@ -125,10 +125,10 @@ class Regression(NamedTuple):
         """Share of the squared torque that stays unexplained, by joint, with these changes of the log."""
         share = np.stack([np.ones_like(self.size), np.ones_like(self.size), gravity * np.ones_like(self.size)])
         needed = np.einsum("pj,prj->rj", share, self.parts(sign, shift))
-        error = self.apart(needed - self.applied(gains * self.inputs[:, order]))
+        error = self.beyond(needed - self.applied(gains * self.inputs[:, order]))
         if len(self.std):
             slopes = np.einsum("pj,prjk->rjk", share, self.parts(sign, shift, slopes=True)) * self.std
-            columns = np.stack([self.apart(slopes[..., k]) for k in range(len(self.std))], axis=-1)
+            columns = np.stack([self.beyond(slopes[..., k]) for k in range(len(self.std))], axis=-1)
             both = np.concatenate([columns, error[..., None]], axis=-1).reshape(-1, len(self.std) + 1)
             triangle = np.asarray(np.linalg.qr(both, mode="r"))
             error = error - columns @ lsq_linear(triangle[:, :-1], triangle[:, -1], (-WITHIN, WITHIN)).x
@@ -141,7 +141,7 @@ class Regression(NamedTuple):
             out[:, joint - 1] += inputs[:, i]
         return out
 
-    def apart(self, torque: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, "row dof"]:
+    def beyond(self, torque: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, "row dof"]:
         """Part of a torque that no static friction explains, in units of `size`."""
         out = [torque[:, j] - basis @ (basis.T @ torque[:, j]) for j, basis in enumerate(self.friction)]
         return np.stack(out, axis=1) / self.size
@@ -222,10 +222,10 @@ def explanations(rig: Rig, problem: Regression) -> Iterator[Explanation]:
 
 def gains(problem: Regression) -> Float[np.ndarray, " input"]:
     """Slope of the needed torque by every input; declared numbers are held, or all would shrink together."""
-    out, needed = np.ones(problem.inputs.shape[1]), problem.apart(problem.plain.sum(axis=0))
+    out, needed = np.ones(problem.inputs.shape[1]), problem.beyond(problem.plain.sum(axis=0))
     for joint in set(problem.system.joints):
         of = [i for i, at in enumerate(problem.system.joints) if at == joint]
-        columns = [problem.apart(np.outer(problem.inputs[:, i], np.ones(needed.shape[1])))[:, joint - 1] for i in of]
+        columns = [problem.beyond(np.outer(problem.inputs[:, i], np.ones(needed.shape[1])))[:, joint - 1] for i in of]
         out[of] = np.linalg.lstsq(np.stack(columns, axis=1), needed[:, joint - 1], rcond=None)[0]
     return out
 
@@ -244,7 +244,7 @@ def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:
             text += " (a current, per mille of a rated torque, a torque before the gear?)"
             texts.append(f"{text}; or masses and lengths are not in kg and m")
     if texts:
-        yield Explanation(problem.left(gains=slopes), "; ".join(texts))
+        yield Explanation(problem.remains(gains=slopes), "; ".join(texts))
 
 
 def _swapped(rig: Rig, problem: Regression) -> Iterator[Explanation]:
@@ -253,13 +253,13 @@ def _swapped(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     for i, j in itertools.combinations(range(len(names)), 2):
         order = list(range(len(names)))
         order[i], order[j] = j, i
-        yield Explanation(problem.left(order=order), f"{names[i]} and {names[j]} are swapped: exchange the columns")
+        yield Explanation(problem.remains(order=order), f"{names[i]} and {names[j]} are swapped: exchange the columns")
 
 
 def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     """Torques without the gravity of some joints."""
     inertia, velocity, gravity = problem.plain
-    rest, weight = problem.apart(inertia + velocity - problem.applied(problem.inputs)), problem.apart(gravity)
+    rest, weight = problem.beyond(inertia + velocity - problem.applied(problem.inputs)), problem.beyond(gravity)
     share = -np.sum(rest * weight, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1e-300)
     without = (np.abs(share) < CARRIED) & (np.std(weight, axis=0) > 0)
     names = [name for name, joint in zip(rig.input_columns, problem.system.joints, strict=True) if without[joint - 1]]
@@ -268,7 +268,7 @@ def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
             f"{' and '.join(names)}: the gravity of the declared bodies is not in it: log the whole torque of the motor"
         )
         text += ", with what a controller adds against gravity; or a spring or counterweight bears it"
-        yield Explanation(problem.left(gravity=1.0 - without), text, ruins=False)
+        yield Explanation(problem.remains(gravity=1.0 - without), text, ruins=False)
 
 
 def _mirrored(problem: Regression) -> Iterator[Explanation]:
@@ -276,7 +276,7 @@ def _mirrored(problem: Regression) -> Iterator[Explanation]:
     system = problem.system
     for name, rate, axis in zip(system.coordinates, system.rates, np.eye(len(problem.size)), strict=True):
         text = f"{name} counts in the other direction than that of the machine: multiply it by -1, and {rate}"
-        yield Explanation(problem.left(sign=1 - 2 * axis), text)
+        yield Explanation(problem.remains(sign=1 - 2 * axis), text)
 
 
 TURNS = 5
@@ -292,13 +292,13 @@ def _zeros(problem: Regression) -> Iterator[Explanation]:
     for joint, axis in enumerate(np.eye(len(problem.size))):
         if not problem.system.angles[joint]:
             continue
-        errors = [problem.apart(problem.parts(shift=b * axis).sum(axis=0) - applied).ravel() for b in tried]
+        errors = [problem.beyond(problem.parts(shift=b * axis).sum(axis=0) - applied).ravel() for b in tried]
         amplitudes = np.linalg.solve(waves(tried), np.stack(errors))
         squares = np.einsum("bi,ij,bj->b", waves(fine), amplitudes @ amplitudes.T, waves(fine))
         bias, name = fine[np.argmin(squares)], problem.system.coordinates[joint]
         text = f"{name} reads {bias:.3g} rad ({np.degrees(bias):.3g} degrees) more than it is: subtract that"
         text += ", or level the base, which is tilted by the opposite" if joint == 0 else ""
-        yield Explanation(problem.left(shift=bias * axis), text, ruins=False)
+        yield Explanation(problem.remains(shift=bias * axis), text, ruins=False)
 
 
 def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> list[Explanation]:
@@ -306,10 +306,10 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
 
     None where the best correction explains no joint much better, or where it explains little.
     """
-    total = lambda one: float(np.sum(np.log(np.maximum(one.left, UNEXPLAINED / 10))))  # noqa: E731
+    total = lambda one: float(np.sum(np.log(np.maximum(one.remains, SMALLEST_MISFIT / 10))))  # noqa: E731
     ranked = sorted([Explanation(plain), *found], key=total)
-    best, explained = ranked[0], (ranked[0].left <= LARGEST_REMAINDER * plain) & (ranked[0].left <= UNEXPLAINED)
-    if not np.any(explained & (plain > UNEXPLAINED)):
+    best, explained = ranked[0], (ranked[0].remains <= LARGEST_REMAINDER * plain) & (ranked[0].remains <= UNEXPLAINED)
+    if not np.any(explained & (plain > SMALLEST_MISFIT)):
         return []
     return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(TIED_RATIO)]
 

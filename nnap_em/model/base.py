@@ -21,7 +21,7 @@ class AbstractModel(eqx.Module):
     log_r: eqx.AbstractVar[Float[Array, " obs"]]
     """Log of the measurement variance."""
     measured: eqx.AbstractVar[tuple[int, ...]]
-    """Places of what is read among all that may be, states first, in the order of y."""
+    """Index of each channel of y among all that can be measured, states first."""
     dt: eqx.AbstractVar[float]
     """Sample interval [s]."""
 

@@ -108,7 +108,7 @@ def spd_solve(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> Fl
 
 
 def _factor(a: Float[Array, "dim dim"]) -> Float[Array, "dim dim"]:
-    """`cholesky`, a column at a time off what is left."""
+    """`cholesky`, right-looking, unrolled by columns."""
     place = jnp.arange(a.shape[0])
 
     def step(left, k):

@@ -78,11 +78,11 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     rounds = -(-share // (together or share))
     group = -(-share // rounds)
     padded = group * rounds * (1 if mesh is None else mesh.size)
-    if padded > count:  # what is over does the work of the last once more
+    if padded > count:  # padding repeats the last entry
         index = np.minimum(np.arange(padded), count - 1)
         batch = jax.tree.map(lambda a: a[index], batch)
     if mesh is None:
-        common, batch = at_home((common, batch))
+        common, batch = on_default_device((common, batch))
         out = _program(function)(None, group, common, batch)
     else:
         common, batch = _place(common, NamedSharding(mesh, P())), _place(batch, NamedSharding(mesh, P(AXIS)))
@@ -90,7 +90,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     return jax.tree.map(lambda a: a[:count], out) if padded > count else out
 
 
-def turns(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " entry"], tuple[Any, ...]]]:
+def batches(count: int, *trees: Any) -> Iterator[tuple[Int[np.ndarray, " entry"], tuple[Any, ...]]]:
     """Batches of as many entries as there are devices: indices, and the entries of `trees`; the last is repeated at the
     end. They serve work whose results, of all entries together, would not fit the memory.
     """
@@ -126,7 +126,7 @@ def _program(function: Callable) -> Callable:
     return traced(run, function)
 
 
-def at_home(tree: Any) -> Any:
+def on_default_device(tree: Any) -> Any:
     """Arrays on this process's first device, where `each` leaves its results.
 
     A program is compiled once for arrays that are bound to a device, and once more where one of them is not.

@@ -22,7 +22,7 @@ from ..em.quadratic import Local, friction_columns, reading_columns
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, turns
+from ..numerics.parallel import batches, each
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .shape import friction_prior
 
@@ -127,7 +127,7 @@ def open_loop(
         yield Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))
 
     columns, see = [], channels(along.model)
-    for indices, part in turns(len(along.state), along.linear, along.gain, along.middle):
+    for indices, part in batches(len(along.state), along.linear, along.gain, along.middle):
         blocks: list[np.ndarray] = []
         for block in (extra or none)(indices):
             sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]

@@ -20,7 +20,7 @@ SPREAD = 0.01
 ROWS = 12_000
 """Readings used for a delay at most: those around the liveliest input."""
 WIDTHS = (1, 2, 4, 8)
-"""Differences are over so many times the least stretch that shows anything: what is surest decides."""
+"""Differences are over so many times the shortest stretch that shows anything; the most significant is used."""
 SURE = 0.3
 """Smallest correlation of the residual signals at which a delay is reported."""
 

@@ -90,7 +90,7 @@ def describe(design: Design) -> dict[str, Any]:
         },
         "friction": friction_entries(design) if fitted.rig.friction else [],
         "parameters": parameter_entries(design),
-        "apart": pair_entries(design),
+        "discrimination": pair_entries(design),
     }
     return document | {"verdict": _verdict(document)}
 
@@ -154,9 +154,9 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
 
 def pair_entries(design: Design) -> list[dict[str, Any]]:
     """Distance of every pair of rivals, and the probability that the wrong one is likelier."""
-    if design.apart is None:
+    if design.discrimination is None:
         return []
-    far = {side: design.apart.distance(info) for side, info in _sides(design).items()}
+    far = {side: design.discrimination.distance(info) for side, info in _sides(design).items()}
     out = []
     for i, pair in enumerate(design.rivals):
         both = {side: float(np.min(d[2 * i : 2 * i + 2])) for side, d in far.items() if side != "now"}
@@ -184,7 +184,7 @@ def _verdict(document: dict[str, Any]) -> str:
     surer = {name: p["now"] / p["expected"] for name, p in document["parameters"].items() if p["expected"] > 0}
     told_most = sorted((name for name, times in surer.items() if times > NOTED), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
-    for pair in document["apart"]:
+    for pair in document["discrimination"]:
         wrong, old = pair["misleading"]["expected"], pair["misleading"]["same_time_of_old_inputs"]
         gains.append(
             f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"

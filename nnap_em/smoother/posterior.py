@@ -91,5 +91,5 @@ class AbstractBranching(AbstractSmoother):
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:
-    """The place of the largest; what is no number is never it."""
+    """Index of the largest finite score."""
     return jnp.argmax(jnp.where(jnp.isfinite(score), score, -jnp.inf))

@@ -338,7 +338,7 @@ def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, 
     """The gain is 1, of so many standard deviations as stated; the dead zone of 2 is sure."""
     hypothesis = _with("motor_gain", "dead_zone")
     records = (_found(0.5)._replace(candidate=_candidate("motor_gain"), share=0.3, chance=0.1), _found(0.5))
-    hypothesis = hypothesis._replace(found=records)
+    hypothesis = hypothesis._replace(evidence=records)
     spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": np.eye(1)}
     monkeypatch.setattr(search, "covariances", lambda model, *_: [spreads[e.name] for e in model.effects])
     monkeypatch.setattr(search, "extend", lambda context, one, length: _emstate(one.model, 1.0))

@@ -87,13 +87,8 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
             leads[key] = max(lead, leads.get(key, -math.inf))
             if lead > 1:
                 context.log(f"  {words(key)} takes the place of {words(key_of(law))}")
-<<<<<<< HEAD
                 record = evidence._replace(removed=trial.removed, equivalent=(), candidate=trial.candidate)
-                return trial.after._replace(found=(*trial.after.found[:-1], record))
-=======
-                record = evidence._replace(removed=trial.removed, equivalent=())
                 return trial.after._replace(evidence=(*trial.after.evidence[:-1], record))
->>>>>>> wt-docs
         same = tuple(key for key in evidence.equivalent if leads.get(key, 0.0) >= -1)
         found[place] = evidence._replace(equivalent=same)
     return hypothesis._replace(evidence=tuple(found))

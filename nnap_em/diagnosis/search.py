@@ -35,11 +35,7 @@ from ..storage.log import Log, silent
 from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
-<<<<<<< HEAD
-from .hypothesis import Found, Hypothesis, covariances
-=======
-from .hypothesis import Evidence, Hypothesis
->>>>>>> wt-docs
+from .hypothesis import Evidence, Hypothesis, covariances
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step, Suspect
@@ -95,13 +91,8 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Evidence:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Trial, outcome.accepted)
     screened, share = case.screened, case.screened.share
-<<<<<<< HEAD
-    evidence = Found(equivalent=outcome.equivalent, removed=case.removed, candidate=case.candidate)
-    if loss.predicts:  # a likelihood proves nothing there
-=======
-    evidence = Evidence(equivalent=outcome.equivalent, removed=case.removed)
+    evidence = Evidence(equivalent=outcome.equivalent, removed=case.removed, candidate=case.candidate)
     if loss.multi_step:  # a likelihood proves nothing there
->>>>>>> wt-docs
         parts = sum(part > 0 for part in share.folds), len(share.folds)
         return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
     p_value = float(stats.chi2.sf(2 * max(case.gain, 0.0), max(screened.directions, 1))) * outcome.step.tried
@@ -127,17 +118,10 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
-<<<<<<< HEAD
     hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
     if outcome is None:
         return Diagnosis(before, before, (), tuple(steps), complete=complete)
-    return Diagnosis(before, outcome, cast(tuple[Found, ...], hypothesis.found), tuple(steps), complete=complete)
-=======
-    if not hypothesis.evidence or state is None:
-        return Diagnosis(before, before, (), tuple(steps), complete=complete)
-    outcome = release(_outcome(before, hypothesis, state), data)
     return Diagnosis(before, outcome, cast(tuple[Evidence, ...], hypothesis.evidence), tuple(steps), complete=complete)
->>>>>>> wt-docs
 
 
 def _determined(
@@ -151,9 +135,9 @@ def _determined(
 
     The search counts rows by their likelihood, which is surer than recordings agree.
     """
-    while state is not None and any(evidence is not None for evidence in hypothesis.found):
+    while state is not None and any(evidence is not None for evidence in hypothesis.evidence):
         outcome = release(_outcome(context.before, hypothesis, state), context.data)
-        model, found = outcome.model, hypothesis.found
+        model, found = outcome.model, hypothesis.evidence
         spreads = covariances(model, outcome.m_step, outcome.state.hessian)
         sure = [
             certainty(one.candidate, effect, cov) if one and one.candidate else math.inf
@@ -162,13 +146,13 @@ def _determined(
         least = int(np.argmin(sure))
         if sure[least] > DETERMINED:
             return hypothesis, outcome, steps
-        law, evidence = key_of(model.effects[least]), cast(Found, found[least])
+        law, evidence = key_of(model.effects[least]), cast(Evidence, found[least])
         context.log(f"  {words(law)} is removed: it {Rejection('uncertain', sure[least]).sentence}")
         steps = [step._replace(accepted=None) if step.accepted == law else step for step in steps]
         suspects = Suspect(law, evidence.share, evidence.chance), *steps[-1].suspects
         steps[-1] = steps[-1]._replace(suspects=suspects)
         hypothesis = backward(context, hypothesis.refitted(cast(StateSpaceModel, state.best)).without(least))
-        state = extend(context, hypothesis, context.longest) if hypothesis.found else None
+        state = extend(context, hypothesis, context.longest) if hypothesis.evidence else None
     return hypothesis, None, steps
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import plant
 
 from nnap_em.data.rig import Rig
-from nnap_em.effects.base import Around
+from nnap_em.effects.base import SearchScales
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.friction import FixedFriction, NoFriction
@@ -95,9 +95,9 @@ def declared_model(case: plant.Case) -> StateSpaceModel:
     )
 
 
-def around(model: StateSpaceModel) -> Around:
+def around(model: StateSpaceModel) -> SearchScales:
     """What a search knows of a two-link arm: sizes of torques, rates and angles, all measured."""
-    return Around(
+    return SearchScales(
         model.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
         ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True, ("u",),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
 from nnap_em.draft.equations import draft_equations
-from nnap_em.effects import Candidate, Scene, catalogue, flat
+from nnap_em.effects import Candidate, OperatingPoint, catalogue, flat
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
 from nnap_em.fit.identify import begin, identify
@@ -34,7 +34,7 @@ PLANT = {
 def _pushes(effect, a=2.0, b=0.5, u=3.0):
     system = Equations({}, json.dumps(PLANT))
     q, inputs, none = jnp.asarray([a, b]), jnp.asarray([u]), jnp.zeros(2)
-    scene = Scene(system, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
+    scene = OperatingPoint(system, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
     return np.asarray(effect.force(scene, jnp.zeros(0)))
 
 

@@ -16,7 +16,7 @@ from nnap_em.diagnosis.losses import OneStep
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.effects import Around, Scene, catalogue, free_form
+from nnap_em.effects import OperatingPoint, SearchScales, catalogue, free_form
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build
 from nnap_em.model.state_space import Inputs, with_effects
@@ -140,12 +140,12 @@ class Chain(AbstractSystem):
 def test_a_machine_with_three_joints_has_laws_at_each():
     chain = Chain(joints=(1, 2, 3))
     every, names = np.ones(3), (*Chain.coordinates, *Chain.rates)
-    around = Around(
+    around = SearchScales(
         chain, every, every, every, -3 * every, 3 * every, every, names, np.ones(6), 0.01, (0.0, 5.0), 5.0, False, True,
         ("tau1", "tau2", "tau3"),
     )  # fmt: skip
     q, v, u = (jnp.asarray([0.3, -0.2, 0.5]) * s for s in (1.0, 2.0, -1.0))
-    scene = Scene(chain, q, v, u, jnp.asarray(0.7), -v, jnp.negative)
+    scene = OperatingPoint(chain, q, v, u, jnp.asarray(0.7), -v, jnp.negative)
     one_each = {(c.start.name, c.start.joint): c.probes[0] for c in proposals(around)}
     for (_, joint), effect in one_each.items():
         force = effect.force(scene, jnp.zeros(effect.memory))

@@ -9,7 +9,7 @@ import pytest
 import rod
 
 from nnap_em import diagnose, findings
-from nnap_em.effects import Around, fields
+from nnap_em.effects import SearchScales, fields
 from nnap_em.effects.base import a
 from nnap_em.effects.friction import LoadFriction
 from nnap_em.fit.identify import begin
@@ -113,7 +113,7 @@ def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
 def around_rod(model):
     """Candidates' surroundings of the rod."""
     one = np.ones(1)
-    return Around(
+    return SearchScales(
         model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,
         (0.0, 3.0), 3.0, False, True, ("u",),
     )  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
-from nnap_em.effects import Scene
+from nnap_em.effects import OperatingPoint
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.fit import memory as memories
 from nnap_em.fit.identify import begin, friction_table, identify
@@ -38,9 +38,9 @@ def _contact(*, level=0.3, distance=0.02, damping=1e-9, rise=1e-9, shape=None) -
     return DynamicFriction(*numbers, shape, knee=KNEE, stiffest=1e9, fastest=1e9, joint=1)
 
 
-def _scene(v) -> Scene:
+def _scene(v) -> OperatingPoint:
     v, still = jnp.ravel(jnp.asarray(v, float)), jnp.zeros(1)
-    return Scene(None, still, v, still, jnp.zeros(()), still, None)  # type: ignore[arg-type]
+    return OperatingPoint(None, still, v, still, jnp.zeros(()), still, None)  # type: ignore[arg-type]
 
 
 def _random(key) -> DynamicFriction:

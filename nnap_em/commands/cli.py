@@ -329,9 +329,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _stoppable(log: Log) -> Iterator[Log]:
-    """`log`, which ends a command that lost its Ctrl-C: what is raised in a garbage collection is dropped,
-    noisily.
-    """
+    """`log`, which ends a command that lost its Ctrl-C: exceptions raised in a garbage collection are dropped."""
     interrupted = False
 
     def handle(number: int, frame: FrameType | None) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, Candidate, Scene
+from ..effects import AbstractEffect, Candidate, OperatingPoint
 from ..model import hooks
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -57,7 +57,7 @@ def _track(null: StateSpaceModel, one) -> Track:
     return Track(middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
 
 
-def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: Scene) -> Columns:
+def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes: OperatingPoint) -> Columns:
     """Columns that `effect` adds, by its own hooks, to the machine `base` along a track."""
     alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
     drive, plain = (base.driving(laws, track.middle, track.inputs) for laws in (alone, ()))
@@ -82,7 +82,7 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     return Columns(force, jax.vmap(read)(track.true, track.rate))
 
 
-def _scene(base: StateSpaceModel, numbers: Scene) -> Scene:
+def _scene(base: StateSpaceModel, numbers: OperatingPoint) -> OperatingPoint:
     """A scene whose numbers came through a batch."""
     return numbers._replace(system=base.system, map=base.unknown)
 
@@ -132,7 +132,7 @@ def _stack_columns(common, track: Track) -> list[Columns]:
     base, stacks = common
     dof = len(base.system.coordinates)
     q, v = track.middle[:, :dof], track.middle[:, dof:]
-    scenes = Scene(None, q, v, track.drive, track.inputs.time, track.friction, None)  # type: ignore[arg-type]
+    scenes = OperatingPoint(None, q, v, track.drive, track.inputs.time, track.friction, None)  # type: ignore[arg-type]
     one = lambda e: _columns(base, e, track, scenes)  # noqa: E731
     return [jax.vmap(one, in_axes=(axes,))(stack) for stack, axes in stacks]
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..data.dataset import Dataset
-from ..effects import AbstractEffect, Around, Candidate, SensorEffect, catalogue, flat
+from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, flat
 from ..effects.actuator import DriveEffect
 from ..effects.equations import STRONG, PortEffect
 from ..em.equations import free_term, motion
@@ -179,7 +179,7 @@ def folds(at: simulated.Windows, sequences: int) -> list[Bool[np.ndarray, "seq w
     return [(settled & (block % FOLDS == part))[..., None] for part in range(FOLDS)]
 
 
-def around_of(fitted: Identified, data: Dataset) -> Around:
+def around_of(fitted: Identified, data: Dataset) -> SearchScales:
     """Ranges of states, inputs and readings by a simulation of the fit."""
     model, rig = fitted.model, fitted.rig
     seen, valid = motion(model, data), np.asarray(data.valid)
@@ -194,14 +194,14 @@ def around_of(fitted: Identified, data: Dataset) -> Around:
     }
     none, wait = np.zeros(0), max(rig.dt, model.pace / GROWN)
     drive = np.max(np.abs(u), axis=0, initial=0.0)
-    return Around(
+    return SearchScales(
         model.system, np.asarray(cast(Any, model.unknown).scale), none, none, low, high, drive,
         rig.measured, np.array([b - a for a, b in ends.values()]), wait,
         (float(t.min()), float(t.max())), float(t.max()), rig.clock == "session", False, rig.input_columns, sizes, ends,
     )  # fmt: skip
 
 
-def free_functions(before: Identified, around: Around, data: Dataset) -> list[Candidate]:
+def free_functions(before: Identified, around: SearchScales, data: Dataset) -> list[Candidate]:
     """Functions of one or two signals at every port, free of what the parameters can do."""
     model, prior = before.model, before.m_step.prior
     system, seen, out = cast(Any, model.system), motion(model, data), []

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..effects import AbstractEffect, Around, Candidate, catalogue, free_form
+from ..effects import AbstractEffect, Candidate, SearchScales, catalogue, free_form
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
@@ -19,7 +19,7 @@ from .keys import key_of
 
 def surroundings(
     rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int, *, change: bool = False
-) -> Around:
+) -> SearchScales:
     """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`.
 
     `change`: candidates are what may have changed since the fit of `model`, too.
@@ -39,7 +39,7 @@ def surroundings(
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
     # what rises between 0.4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
     viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
-    return Around(
+    return SearchScales(
         model.system,
         scales.torque,
         speed,
@@ -74,7 +74,7 @@ def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
     return jax.vmap(unknown)(v)
 
 
-def proposals(around: Around, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:
+def proposals(around: SearchScales, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:
     """Everything in the catalogue that this machine could have, and other forms of what is `known` to be there."""
     every = [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
     keys = {key_of(candidate.start) for candidate in every}

@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 
-from .base import AbstractEffect, Around, Candidate, JointEffect, Scene, SensorEffect, fields, flat
+from .base import AbstractEffect, Candidate, JointEffect, OperatingPoint, SearchScales, SensorEffect, fields, flat
 from .function import Axis, InputAxis, free_form
 
 
@@ -20,6 +20,15 @@ parts: tuple[type, ...] = (Axis, InputAxis)
 """Parts of effects besides numbers."""
 
 __all__ = [
-    "AbstractEffect", "Around", "Candidate", "JointEffect", "Scene", "SensorEffect", "catalogue", "fields", "flat",
-    "free_form", "parts",
+    "AbstractEffect",
+    "Candidate",
+    "JointEffect",
+    "OperatingPoint",
+    "SearchScales",
+    "SensorEffect",
+    "catalogue",
+    "fields",
+    "flat",
+    "free_form",
+    "parts",
 ]  # fmt: skip

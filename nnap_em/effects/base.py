@@ -18,7 +18,7 @@ Scalar = Float[Array, ""]
 CHANNEL_UNIT = "unit of the channel"
 
 
-class Scene(NamedTuple):
+class OperatingPoint(NamedTuple):
     """State of the machine at one moment, as effects get it."""
 
     system: Any
@@ -37,7 +37,7 @@ class Scene(NamedTuple):
     """Inputs that reach the plant."""
 
 
-class Around(NamedTuple):
+class SearchScales(NamedTuple):
     """Sizes that candidates are built from, all read off the logs and the declared physics."""
 
     system: Any
@@ -209,7 +209,7 @@ class AbstractEffect(eqx.Module):
         return cls(*map(a, numbers), **where)
 
     @classmethod
-    def candidates(cls, around: Around) -> list[Candidate]:
+    def candidates(cls, around: SearchScales) -> list[Candidate]:
         """Candidates of this kind for a machine; none where the machine cannot have it."""
         return []
 
@@ -234,7 +234,7 @@ class AbstractEffect(eqx.Module):
         """True if the fitted values are physical."""
         return not self.above_zero or float(getattr(self, self.above_zero)) > 0
 
-    def visible(self, around: Around) -> bool:
+    def visible(self, around: SearchScales) -> bool:
         """True if the visited range distinguishes it from simpler laws."""
         return True
 
@@ -246,7 +246,7 @@ class AbstractEffect(eqx.Module):
         """Arguments of its force at its joint: coordinates, rates, "time", `input_of` a joint."""
         return ()
 
-    def richer(self, around: Around) -> list[Candidate]:
+    def richer(self, around: SearchScales) -> list[Candidate]:
         """The same law with more of a form, to be tried once it is found."""
         return []
 
@@ -290,15 +290,15 @@ class AbstractEffect(eqx.Module):
         """The machine as it truly is."""
         return system
 
-    def friction(self, torque: Float[Array, " port"], scene: Scene) -> Float[Array, " port"]:
+    def friction(self, torque: Float[Array, " port"], scene: OperatingPoint) -> Float[Array, " port"]:
         """The friction torque as it truly is."""
         return torque
 
-    def force(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " port"]:
+    def force(self, scene: OperatingPoint, memory: Float[Array, " memory"]) -> Float[Array, " port"]:
         """Generalised force that comes on top [N m], or push at every port."""
         return jnp.zeros_like(scene.drive)
 
-    def drift(self, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
+    def drift(self, scene: OperatingPoint, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
         """Time derivative of its own states."""
         return memory
 
@@ -321,7 +321,7 @@ class JointEffect(AbstractEffect):
         """Entry of an array at its joint."""
         return values[self.joint - 1]
 
-    def at(self, scene: Scene, value: Scalar) -> Float[Array, " dof"]:
+    def at(self, scene: OperatingPoint, value: Scalar) -> Float[Array, " dof"]:
         """A generalised force at its joint alone."""
         return jnp.zeros_like(scene.v).at[self.joint - 1].set(value)
 

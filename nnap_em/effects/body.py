@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import Around, Candidate, JointEffect, Scalar, a, known, one
+from .base import Candidate, JointEffect, Scalar, SearchScales, a, known, one
 
 
-def varieties(around: Around, name: str) -> list[tuple[int, float]]:
+def varieties(around: SearchScales, name: str) -> list[tuple[int, float]]:
     """Joints at which the system has the variation `name`, and its typical size."""
     sizes = [(j, size) for (kind, j), (_, size) in around.system.variations.items() if kind == name]
     return [(j, float(size(around.system))) for j, size in sizes]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Around, Candidate, Scalar, SensorEffect, a, known
+from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known
 
 EDGE = 0.02
 """Width of a step at a level, as a share of the range of its signal."""
@@ -144,7 +144,7 @@ class PortEffect(AbstractEffect):
 
     @classmethod
     def at(
-        cls, around: Around, port: str, of: tuple[str, ...], to: str | None = None, level: float | None = None
+        cls, around: SearchScales, port: str, of: tuple[str, ...], to: str | None = None, level: float | None = None
     ) -> Candidate:
         """The law at a port, of signals, from a level on, with strengths of the size of what moves the port."""
         rate = float(around.torque[around.system.ports.index(port)])
@@ -164,7 +164,7 @@ class PortEffect(AbstractEffect):
         return Candidate(start, (probe,), wide)
 
 
-def _levels(around: Around, name: str) -> list[float]:
+def _levels(around: SearchScales, name: str) -> list[float]:
     """Levels at which a search begins."""
     low, high = around.sizes[name]
     return [low + share * (high - low) for share in LEVELS]

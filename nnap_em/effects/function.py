@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..systems.base import AbstractSystem
-from .base import AbstractEffect, Around, Candidate, Curve, JointEffect, Scalar, Scene, a, input_of
+from .base import AbstractEffect, Candidate, Curve, JointEffect, OperatingPoint, Scalar, SearchScales, a, input_of
 
 BACKWARDS = 0.1
 """Share of its range by which a drive may seem to fall with its input: noise of what was learned."""
@@ -33,7 +33,7 @@ class AbstractAxis(eqx.Module):
     count: int = eqx.field(static=True)
 
     @abstractmethod
-    def value(self, scene: Scene) -> Scalar:
+    def value(self, scene: OperatingPoint) -> Scalar:
         """Argument of the function."""
 
     @abstractmethod
@@ -183,7 +183,7 @@ def _signals_near(system: AbstractSystem, joint: int) -> set[str]:
     return {names[i] for names in (system.coordinates, system.rates) for i in places}
 
 
-def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:
+def free_form(effect: AbstractEffect, around: SearchScales) -> list[Candidate]:
     """The unknown functions of the same signals at the same joint: what `effect` would be, were its form not known."""
     axes = _axes(around)
     inputs = {input_of(j): around.column(j) for j, _ in around.driven}
@@ -193,7 +193,7 @@ def free_form(effect: AbstractEffect, around: Around) -> list[Candidate]:
     return [_function(effect.joint, tuple(axes[name](20 if len(names) == 1 else 6) for name in names), around)]
 
 
-def _function(joint: int, axes: tuple[AbstractAxis, ...], around: Around) -> Candidate:
+def _function(joint: int, axes: tuple[AbstractAxis, ...], around: SearchScales) -> Candidate:
     """An unknown function at a joint, a probe for every weight."""
     size, number = float(around.torque[joint - 1]), math.prod(axis.count for axis in axes)
     make = lambda w: UnknownFunction(jnp.asarray(w, float), axes, joint=joint)  # noqa: E731
@@ -201,7 +201,7 @@ def _function(joint: int, axes: tuple[AbstractAxis, ...], around: Around) -> Can
     return Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size)))
 
 
-def _axes(around: Around) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:
+def _axes(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:
     """Axes that a function may have, of any number of basis functions, by the names of what they read."""
     system = around.system
     ranges = {}

@@ -87,7 +87,7 @@ def design(
         fitted: the model.
         data: the logs that it was fitted to.
         key: random key of the search.
-        question: "friction", "parameters", the name of one, "discriminate" (each of `rivals`) or "all" there is.
+        question: "friction", "parameters", the name of one, "discriminate" (each of `rivals`) or "all" of these.
         rivals: pairs of laws to be discriminated.
         seconds: length of all sequences together [s].
         sequences: their number.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .. import __version__
 from ..effects import AbstractEffect
-from ..effects.base import Scene
+from ..effects.base import OperatingPoint
 from ..fit.identify import Identified
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
@@ -48,7 +48,7 @@ def actuator(
         return (u,)
 
     def torque(q, v, drive, time):
-        scene = Scene(system, q, v, drive, time[0], model.unknown(v), model.unknown)
+        scene = OperatingPoint(system, q, v, drive, time[0], model.unknown(v), model.unknown)
         return (hooks.added(laws, scene, jnp.zeros(0, q.dtype), jnp.zeros_like(q)),)
 
     def reading(y):

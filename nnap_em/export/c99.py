@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from .. import __version__
 from ..effects import AbstractEffect
-from ..effects.base import Scene
+from ..effects.base import OperatingPoint
 from ..fit.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_text
@@ -66,7 +66,7 @@ def torques(fitted: Identified) -> Torques:
     def feedforward(q, v, a, time):
         system = model.system
         needed = system.mass(q) @ a + system.bias(q, v) - model.unknown(v)
-        scene = Scene(system, q, v, needed, time[0], model.unknown(v), model.unknown)
+        scene = OperatingPoint(system, q, v, needed, time[0], model.unknown(v), model.unknown)
         return (needed - hooks.added(laws, scene, jnp.zeros(0, q.dtype), a),)
 
     return Torques(friction, feedforward, without)

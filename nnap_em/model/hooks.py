@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.actuator import InputDelay
-from ..effects.base import AbstractEffect, Scalar, Scene
+from ..effects.base import AbstractEffect, OperatingPoint, Scalar
 from ..systems.base import AbstractSystem
 from ..systems.plant import AbstractPlant
 from .servo import LAWS, Servo
@@ -140,14 +140,14 @@ def machine(effects: Effects, system: Any, time: Scalar) -> Any:
 
 
 def pushed(
-    effects: Effects, scene: Scene, memory: Float[Array, " memory"], push: Float[Array, " port"]
+    effects: Effects, scene: OperatingPoint, memory: Float[Array, " memory"], push: Float[Array, " port"]
 ) -> Float[Array, " port"]:
     """Push at every port by the inputs, all effects in the scene, and an extra `push` [N m, at a joint]."""
     return _total(effects, scene, memory, scene.drive + push)
 
 
 def added(
-    effects: Effects, scene: Scene, memory: Float[Array, " memory"], acceleration: Float[Array, " dof"]
+    effects: Effects, scene: OperatingPoint, memory: Float[Array, " memory"], acceleration: Float[Array, " dof"]
 ) -> Float[Array, " dof"]:
     """Generalised force that the effects add to a scene without them, at a given acceleration [N m]."""
     extra = _total(effects, scene, memory, jnp.zeros_like(scene.v)) - scene.friction
@@ -159,7 +159,7 @@ def added(
 
 
 def _total(
-    effects: Effects, scene: Scene, memory: Float[Array, " memory"], known: Float[Array, " port"]
+    effects: Effects, scene: OperatingPoint, memory: Float[Array, " memory"], known: Float[Array, " port"]
 ) -> Float[Array, " port"]:
     """`known` with the forces of the effects, and friction as it truly is, on top [N m]."""
     torque = scene.friction
@@ -169,7 +169,7 @@ def _total(
     return known + torque
 
 
-def drift(effects: Effects, scene: Scene, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
+def drift(effects: Effects, scene: OperatingPoint, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
     """Time derivative of the memory of all effects."""
     return jnp.concatenate([memory[:0], *(effect.drift(scene, part) for effect, part in _memories(effects, memory))])
 

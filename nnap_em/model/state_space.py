@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
-from ..effects.base import AbstractEffect, Scalar, Scene
+from ..effects.base import AbstractEffect, OperatingPoint, Scalar
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import in_loop, integrate
 from . import hooks
@@ -97,13 +97,13 @@ class StateSpaceModel(AbstractModel):
             u = hooks.reaching(self.effects, self.system, u, self.dt)
         return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale)
 
-    def scene(self, x: Float[Array, " state"], u: Inputs) -> Scene:
+    def scene(self, x: Float[Array, " state"], u: Inputs) -> OperatingPoint:
         """State of the machine at one moment, as effects get it."""
         q, v = self.system.split(x)
         system = hooks.machine(self.effects, self.system, u.time)
         torque = hooks.driven(self.effects, self.servos, system, u.u, q, v, u.scale) if self.servos else u.u
         friction = system.at_ports(self.unknown(v))
-        return Scene(system, q, v, system.drive(torque), u.time, friction, self.unknown, torque)
+        return OperatingPoint(system, q, v, system.drive(torque), u.time, friction, self.unknown, torque)
 
     def driving(
         self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs

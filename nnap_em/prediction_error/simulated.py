@@ -117,9 +117,8 @@ def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begi
     return together([model], [prior], [np.zeros_like(begin.mean)], data, begin)[0]
 
 
-GROUPS = (1, 16, 64)
-"""Numbers of models whose errors are computed at once, a program for each: a simulation is a long loop, whose steps
-take as long for one as for many."""
+GROUPS = (1, 4, 16, 64)
+"""Numbers of models whose errors are computed at once, a program for each; copies of the last model fill one up."""
 
 
 def together(
@@ -158,8 +157,9 @@ def _errors(common, one):
     model, prior, z = eqx.combine(numbers, static)
     first = at.row[:, 0]
 
-    def predicted(z, start):
-        changed = prior.write(model, z)
+    def predicted(both):
+        moved, shift = both[: len(z)], both[len(z) :]
+        changed = prior.write(model, moved)
         ready = prepare(changed, seq)
         row = lambda k: jax.tree.map(lambda a: a[k], ready.inputs)  # noqa: E731
 
@@ -167,14 +167,13 @@ def _errors(common, one):
             inputs = row(first + h)
             return jax.vmap(changed.transition)(x, inputs), jax.vmap(changed.emission)(x, inputs)
 
-        _, read = jax.lax.scan(step, begin + start * width[None], jnp.arange(at.rows))
+        _, read = jax.lax.scan(step, begin + (start + shift[None]) * width[None], jnp.arange(at.rows))
         known = jnp.where(ready.observed, ready.y, jnp.nan)
         out = jnp.moveaxis(read[:: at.every], 0, 1)
         return out, known[at.row] - out
 
-    by_start = jax.jacfwd(lambda shift: predicted(z, start + shift[None])[0])(jnp.zeros_like(start[0]))
-    columns, error = jax.jacfwd(predicted, has_aux=True)(z, start)
-    return error, columns, by_start
+    slopes, error = jax.jacfwd(predicted, has_aux=True)(jnp.concatenate([z, jnp.zeros_like(start[0])]))
+    return error, slopes[..., : len(z)], slopes[..., len(z) :]
 
 
 def scale_of(of: Simulated) -> Scale:

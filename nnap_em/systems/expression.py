@@ -85,10 +85,9 @@ def parse(text: str, known: Collection[str]) -> Formula:
             case ast.UnaryOp(op=op, operand=one) if type(op) in _OPERATORS:
                 operate, first = _OPERATORS[type(op)], built(one)
                 return lambda values: operate(first(values))
-            case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
-                operate, first, second = _OPERATORS[type(op)], built(left), built(right)
-                return lambda values: operate(first(values), second(values))
-            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATORS:
+            case ast.BinOp(op=op, left=left, right=right) | ast.Compare(left=left, ops=[op], comparators=[right]) if (
+                type(op) in _OPERATORS
+            ):
                 operate, first, second = _OPERATORS[type(op)], built(left), built(right)
                 return lambda values: operate(first(values), second(values))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):

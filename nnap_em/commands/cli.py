@@ -307,7 +307,7 @@ def parser() -> argparse.ArgumentParser:
     export.add_argument("--mjcf", metavar="FILE", type=Path, help="write a machine that came from a file back as MJCF")
     export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
     export.add_argument("--urdf", metavar="FILE", type=Path, help="write such a machine as URDF")
-    export.add_argument("--c", metavar="FILE", type=Path, help="write friction and feed-forward torque as C99")
+    export.add_argument("--c", metavar="FILE", type=Path, help="friction and feed-forward torque, or equations, as C99")
     export.add_argument("--observer", metavar="FILE", type=Path, help="write an online estimator of the states as C99")
     export.add_argument("--fmu", metavar="FILE", type=Path, help="write that estimator as an FMU (FMI 3.0)")
     export.add_argument("--float", action="store_true", help="numbers of 32 bits in these two")

@@ -111,6 +111,21 @@ def test_what_needs_joints_refuses_with_one_sentence_and_writes_nothing(place, c
     assert sorted(place.rglob("*")) == before
 
 
+def test_identify_reports_its_unknown_terms(place, monkeypatch):
+    monkeypatch.chdir(place)
+    shutil.copytree(place / "monday_logs", place / "unknown_logs")
+    terms = '[model.unknown]\nf = { signals = ["a"], enters = "a" }\ng = { signals = ["b", "u"], enters = "b" }\n'
+    (place / "unknown_logs" / "rig.toml").write_text(RIG.replace("[sampling]", f"{terms}[sampling]"))
+    assert main(["identify", "unknown_logs", "--out", "unknown", "--epochs", "1"]) == 0
+    report = json.loads((place / "unknown" / "report.json").read_text())
+    assert [(term["name"], term["enters"], term["unit"]) for term in report["unknown"]] == [
+        ("f", "a", "V/s"), ("g", "b", "V/s"),
+    ]  # fmt: skip
+    assert report["contacts"] == []
+    page = (place / "unknown" / "report.html").read_text() + (place / "unknown" / "figures.html").read_text()
+    assert "Unknown term f" in page and "Unknown term g" in page
+
+
 def test_two_fits_are_compared_by_their_parameters(place, monkeypatch, capsys):
     """Parameters far apart in standard deviations; recordings are not searched, which the log states."""
     monkeypatch.chdir(place)

@@ -354,6 +354,14 @@ class UnknownTerm(AbstractEffect):
         """The function at values of its signals."""
         return _function(self.weights @ self.basis, values, self.low, self.high)
 
+    def table(self, cov: Float[np.ndarray, "basis basis"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places over the ranges of its signals (place, signal), the function there, and its standard deviation."""
+        count = 2 * NODES[len(self.reads)] - 1
+        axes = np.meshgrid(*np.linspace(self.low, self.high, count).T, indexing="ij")
+        places = np.stack([axis.ravel() for axis in axes], axis=1)
+        rows = np.asarray(jax.vmap(self.grid)(jnp.asarray(places))) @ np.asarray(self.basis).T
+        return places, rows @ np.asarray(self.weights), np.sqrt(np.einsum("pi,ij,pj->p", rows, cov, rows))
+
     def force(self, scene, memory):
         return self.lean(scene.system).force(scene, memory)
 

@@ -52,16 +52,13 @@ def torques(fitted: Identified) -> tuple[Callable, Callable, tuple[AbstractEffec
     without = tuple(effect for effect in model.effects if effect.memory or of_command(effect))
     laws = tuple(effect for effect in model.effects if effect not in without and effect.channel is None)
 
-    def friction(v):
-        return (model.unknown(v),)
-
     def feedforward(q, v, a, time):
         system = model.system
         needed = system.mass(q) @ a + system.bias(q, v) - model.unknown(v)
         scene = Scene(system, q, v, needed, time[0], model.unknown(v), model.unknown)
         return (needed - hooks.added(laws, scene, jnp.zeros(0, q.dtype), a),)
 
-    return friction, feedforward, without
+    return lambda v: (model.unknown(v),), feedforward, without
 
 
 def write_c(fitted: Identified, out: Path | str) -> list[str]:
@@ -101,12 +98,8 @@ enum {{ {sizes} }};
     return absent
 
 
-Parts = tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]
-"""C functions, their sizes, laws that are not in them, and the lines that describe them."""
-
-
-def _joints(fitted: Identified, name: str) -> Parts:
-    """Friction and feed-forward torque."""
+def _joints(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
+    """Functions of friction and feed-forward torque, their sizes, laws that are not in them, and lines about them."""
     system, (friction, feedforward, without) = fitted.model.system, torques(fitted)
     still = jnp.zeros(len(system.coordinates))
     sources = [
@@ -124,8 +117,8 @@ def _joints(fitted: Identified, name: str) -> Parts:
     return list(map(function, sources)), {"JOINTS": len(still)}, without, lines
 
 
-def _equations(fitted: Identified, name: str) -> Parts:
-    """Rates and readings of equations, at states, those of laws behind them, and inputs as they reach the laws."""
+def _equations(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
+    """The same of rates and readings of equations, at states, those of laws behind them, and inputs that reach them."""
     model, x, u = fitted.model, fitted.model.start.mean, jnp.zeros(len(fitted.rig.input_columns))
     push = jnp.zeros(len(model.system.ports))
     rates = unrolled(f"{name}_rates", lambda x, u: (model.rate(x, Inputs.held(u), push),), x=x, u=u)

@@ -10,7 +10,7 @@ algorithm", LNM 630; Bock 1983 for many starts]
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -132,7 +132,8 @@ def together(
     for first in range(0, len(models), GROUPS[-1]):
         some, begun = numbers[first : first + GROUPS[-1]], list(starts[first : first + GROUPS[-1]])
         size = next(size for size in GROUPS if size >= len(some))
-        stacked = jax.tree.map(_stacked(size, count), *some)
+        filled = [*some, *some[-1:] * (size - len(some))]
+        stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *filled)
         tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
         begun = np.concatenate([*begun, *begun[-1:] * (size - len(begun))])
         error, columns, by_start = each(
@@ -143,13 +144,6 @@ def together(
             values = (np.asarray(a[part]) for a in (begun, error, columns, by_start))
             out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))
     return out
-
-
-def _stacked(size: int, count: int) -> Callable[..., np.ndarray]:
-    """Arrays of some models as one of `size`, the last repeated, each for `count` sequences."""
-    return lambda *each_one: np.repeat(
-        np.stack([np.asarray(a) for a in (*each_one, *each_one[-1:] * (size - len(each_one)))]), count, axis=0
-    )
 
 
 def _errors(common, one):

@@ -153,11 +153,7 @@ def _zstd(packed: memoryview, size: int) -> bytes:
     return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
 
 
-_unpackers: dict[str, Callable[[memoryview, int], Any]] = {
-    "": lambda packed, size: packed,
-    "lz4": _lz4,
-    "zstd": _zstd,
-}
+_unpackers: dict[str, Callable[[memoryview, int], Any]] = {"": lambda packed, size: packed, "lz4": _lz4, "zstd": _zstd}
 
 
 def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:

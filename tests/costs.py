@@ -32,6 +32,8 @@ SECONDS = {
     "test_effects.py": 32,
     "test_equation_laws.py": 60,
     "test_equations.py": 30,
+    "test_equation_commands.py": 30,
+    "test_tanks.py": 30,
     "test_import.py": 31,
     "test_shapes.py": 30,
     "test_payload.py": 30,

@@ -22,6 +22,8 @@ from nnap_em.fit.identify import begin, identify
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.prediction_error.simulated import Simulated, Windows
+from nnap_em.report.document import unknown_terms as reported_terms
+from nnap_em.report.effect_plots import term_figure
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.acrobot import table_i
 
@@ -141,6 +143,21 @@ def test_the_common_form_of_a_free_function_is_the_same_function():
     np.testing.assert_array_equal(term.with_numbers(lean).weights, term.weights)
 
 
+@pytest.mark.parametrize("reads", [("b",), ("b", "u"), ("a", "b", "u")])
+def test_the_table_of_an_unknown_term_has_its_values_and_their_spread(reads):
+    """Values are those of the function, the spread that of functions of drawn weights: four standard errors."""
+    rng, nodes = np.random.default_rng(0), {1: 9, 2: 25, 3: 64}[len(reads)]
+    basis, half = rng.standard_normal((5, nodes)), 0.1 * rng.standard_normal((5, 5))
+    term = UnknownTerm(jnp.arange(5.0), basis, np.zeros(len(reads)), np.full(len(reads), 4.0), channel="b", reads=reads)
+    places, value, std = term.table(half @ half.T)
+    assert places.shape == ({1: 17, 2: 81, 3: 343}[len(reads)], len(reads))
+    np.testing.assert_array_equal([places.min(axis=0), places.max(axis=0)], [[0.0] * len(reads), [4.0] * len(reads)])
+    np.testing.assert_allclose(value, jax.vmap(term.at)(jnp.asarray(places)), rtol=1e-9, atol=1e-9)
+    weights = jnp.asarray(half @ rng.standard_normal((5, 4000))).T
+    each = jax.vmap(lambda w: jax.vmap(dataclasses.replace(term, weights=w).at)(jnp.asarray(places)))(weights)
+    np.testing.assert_allclose(std, np.std(np.asarray(each), axis=0), rtol=4 / np.sqrt(2 * 4000))
+
+
 # --- with logs
 
 RIG = """format = 1
@@ -210,6 +227,14 @@ def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
     rate = lambda model: np.asarray(model.rate(x, u, jnp.zeros(2)))  # noqa: E731
     added = float(np.sum(np.asarray(term.basis) @ np.asarray(term.grid(x[1:]))))
     np.testing.assert_allclose(rate(moved) - rate(fitted.model), [added, 0.0], rtol=1e-9)
+    (table,) = reported_terms(fitted)
+    assert (table["name"], table["enters"], table["signals"], table["unit"]) == ("f", "a", {"b": "V"}, "V/s")
+    assert len(table["value"]) == len(table["std"]) == 17 and min(table["std"]) > 0
+    labels = [ax.get_xlabel() + ax.get_ylabel() for ax in term_figure(table).axes]
+    assert labels == ["b [V]f [V/s]"]
+    two = table | {"signals": {"b": "V", "u": ""}, "places": [[0, 0], [1, 0], [0, 1]], "value": [1, 2, 3]}
+    labels = [ax.get_xlabel() + ax.get_ylabel() for ax in term_figure(two).axes]
+    assert labels == ["b [V]u", "f [V/s]"]
 
 
 @pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])

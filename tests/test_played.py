@@ -204,15 +204,13 @@ def test_compiled_c_gives_the_torques_of_the_library(tmp_path):
     assert write_c(fitted, tmp_path / "arm.c") == ["dead_zone at joint 1"]
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "arm.c", "-o", "arm.so", "-lm"]
     subprocess.run(["gcc", *flags], cwd=tmp_path, check=True)
-    compiled, model = ctypes.CDLL(str(tmp_path / "arm.so")), torques(fitted)
+    compiled, (_, feedforward, _) = ctypes.CDLL(str(tmp_path / "arm.so")), torques(fitted)
     rng, array = np.random.default_rng(0), lambda values: (ctypes.c_double * len(values))(*values)
     for _ in range(20):
         q, v, acceleration = rng.normal(size=(3, 2))
         out = array([0.0, 0.0])
         compiled.arm_feedforward(array(q), array(v), array(acceleration), array([0.3]), out)
-        np.testing.assert_allclose(
-            out, model.feedforward(a(q), a(v), a(acceleration), a([0.3]))[0], rtol=1e-9, atol=1e-9
-        )
+        np.testing.assert_allclose(out, feedforward(a(q), a(v), a(acceleration), a([0.3]))[0], rtol=1e-9, atol=1e-9)
         compiled.arm_friction(array(v), out)
         np.testing.assert_allclose(out, fitted.model.unknown(a(v)), rtol=1e-9, atol=1e-9)
 
@@ -220,9 +218,7 @@ def test_compiled_c_gives_the_torques_of_the_library(tmp_path):
 def test_the_feed_forward_torque_gives_its_acceleration(tmp_path):
     fitted, _ = _fit(tmp_path, (HOUSED["payload"][0], HOUSED["cogging"][0], *HOMELESS["eddy_brake"]))
     q, v, wanted = np.random.default_rng(1).normal(size=(3, 2))
-    tau = torques(fitted).feedforward(a(q), a(v), a(wanted), jnp.zeros(1))[0] / a(
-        [1.0, 2.0]
-    )  # the second has a gear of 2
+    tau = torques(fitted)[1](a(q), a(v), a(wanted), jnp.zeros(1))[0] / a([1.0, 2.0])  # the second has a gear of 2
     model = fitted.model
     u = jax.tree.map(
         lambda x: x[0], model.inputs(Dataset(np.zeros(1), np.asarray(tau)[None], np.zeros((1, 2)), np.ones(1, bool)))

@@ -278,7 +278,7 @@ def parser() -> argparse.ArgumentParser:
     _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")
     export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
     _file(export, "--urdf", "FILE", "write such a machine as URDF")
-    _file(export, "--c", "FILE", "write friction and feed-forward torque as C99")
+    _file(export, "--c", "FILE", "friction and feed-forward torque, or equations, as C99")
     _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
     _file(export, "--fmu", "FILE", "write that estimator as an FMU (FMI 3.0)")
     export.add_argument("--float", action="store_true", help="numbers of 32 bits in these two")

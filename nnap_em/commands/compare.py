@@ -9,7 +9,7 @@ from ..data.rig import RigError
 from ..fit.store import model_file, read
 from ..report.comparison import table, write_comparison
 from ..storage.log import Log
-from .common import logs_of
+from .common import logs_of, require_joints
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
@@ -27,6 +27,7 @@ def _explained(args: argparse.Namespace, comparison: Comparison, log: Log) -> Co
     """The comparison with what changed by the recordings, where they are at hand."""
     files = [model_file(path) for path in args.fits]
     try:
+        require_joints(comparison.fits[0].fitted.rig, "recordings")
         logs = [logs_of(file, read(file), [], False) for file in files]
     except (DataError, RigError) as error:
         log(f"{error}; what changed is not searched in recordings")

@@ -1,6 +1,7 @@
 """nnap-em export: the model for other programs."""
 
 import argparse
+from functools import partial
 
 import jax
 
@@ -20,21 +21,18 @@ from .common import require_joints
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
-    for option in ("mjcf", "urdf", "c", "observer", "fmu"):
+    for option in ("mjcf", "urdf", "observer", "fmu"):
         if getattr(args, option) is not None:
             require_joints(fitted.rig, f"--{option}")
-    if args.mjcf is not None:
-        for line in write_mjcf(fitted, args.mjcf, alone=args.alone):
-            log(f"{args.mjcf} has no place for {line}")
-        log(f"wrote {args.mjcf}")
-    if args.urdf is not None:
-        for line in write_urdf(fitted, args.urdf):
-            log(f"{args.urdf} has no place for {line}")
-        log(f"wrote {args.urdf}")
-    if args.c is not None:
-        for line in write_c(fitted, args.c):
-            log(f"{args.c} leaves out {line}")
-        log(f"wrote {args.c}")
+    for path, write, problem in (
+        (args.mjcf, partial(write_mjcf, alone=args.alone), "has no place for"),
+        (args.urdf, write_urdf, "has no place for"),
+        (args.c, write_c, "leaves out"),
+    ):
+        if path is not None:
+            for line in write(fitted, path):
+                log(f"{path} {problem} {line}")
+            log(f"wrote {path}")
     if args.observer is not None:
         write_observer(fitted, args.observer, single=args.float)
         log(f"wrote {args.observer} and {args.observer.with_suffix('.h').name}")

@@ -12,7 +12,7 @@ from ..fit.predict import smooth
 from ..fit.store import load, model_file
 from ..numerics.digits import counted
 from ..recordings.mcap_writer import Channel, require_mcap, write_mcap
-from ..residual.residual import names_of, residual
+from ..residual.residual import residual
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
 
@@ -45,14 +45,14 @@ def _line(other: Branch, fitted: Identified, logs: Logs) -> str:
 
 def _write_channels(path: Path, fitted: Identified, logs: Logs, smoothed: Channel) -> None:
     """The log, smoothed states, their prediction from the rows before, and the missing force, side by side."""
-    names, left = names_of(fitted), residual(fitted, logs.data)
-    states = names.coordinates + names.rates
-    forces = {name: names.force_unit(joint) for joint, name in enumerate(names.coordinates, 1)}
+    system, left = fitted.model.system, residual(fitted, logs.data)
+    places = system.ports[: left.force.shape[-1]]
+    forces = {name: system.port_unit(port) for port, name in enumerate(places, 1)}
     forces |= {f"{name}_std": unit for name, unit in forces.items()}
     channels = {
         "/log": log_of(fitted, logs),
         "/smoothed": smoothed,
-        "/one_row_ahead": Channel({name: names.unit(name) for name in states}, left.predicted),
+        "/one_row_ahead": Channel({name: system.unit(name) for name in system.states}, left.predicted),
         "/missing_force": Channel(forces, np.concatenate([left.force, left.force_std], axis=-1)),
     }
     write_mcap(path, logs, channels)

@@ -330,6 +330,8 @@ def _check(one: Fit, two: Fit) -> None:
         if declared.std == other.std == 0 and declared.mean != other.mean:
             values = f"{declared.mean:.6g} in {one.name} and {other.mean:.6g} in {two.name}"
             raise CompareError(f"the trusted {name} is {values}; {hint}, or declare it as uncertain in both")
+    if a.rig.equations != b.rig.equations:
+        raise CompareError(f"the equations of {one.name} and {two.name} differ; {hint}")
     if a.rig.machine and _body(a) != _body(b):
         raise CompareError(f"the machine files of {one.name} and {two.name} differ; {hint}")
     if all(np.array_equal(x, y) for x, y in zip(_identity(a), _identity(b), strict=True)):
@@ -415,11 +417,7 @@ def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
 
 
 def number(
-    name: str,
-    unit: str,
-    value: Float[np.ndarray, " fit"],
-    std: Float[np.ndarray, " fit"],
-    prior_std: float = np.inf,
+    name: str, unit: str, value: Float[np.ndarray, " fit"], std: Float[np.ndarray, " fit"], prior_std: float = np.inf
 ) -> Number:
     """A number, tested and pooled over the fits that estimate it."""
     has = np.isfinite(value) & np.isfinite(std) & (std > 0)

@@ -60,10 +60,8 @@ class Case(NamedTuple):
     of: simulated.Simulated
     loss: float
     """Log of the posterior density, less."""
-    removed: float = math.nan
-    """Share of the squared error that they remove."""
     share: float = math.nan
-    """The same on parts left out."""
+    """Share of the squared error on parts left out that they remove."""
     left: float = math.nan
     """Squared error on parts left out."""
     folds: tuple[float, ...] = ()
@@ -338,13 +336,9 @@ def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
     worths = [case.share * case.odds for case in passing]
     top = passing[int(np.argmax(worths))]
     errors = simulated.independent(top.of)
-    alike = [case for case in (passing[i] for i in even(worths)) if _nats(case, top, errors) < EQUIVALENT_NATS]
+    nats = [0.5 * errors * math.log(case.left / top.left) for case in passing]  # likelihood that each loses to the best
+    alike = [passing[i] for i in even(worths) if nats[i] < EQUIVALENT_NATS]
     return min(alike, key=lambda case: (case.numbers, case.left)), alike
-
-
-def _nats(case: Case, top: Case, errors: float) -> float:
-    """Log-likelihood that a case loses to another one on parts left out, of so many independent errors."""
-    return 0.5 * errors * math.log(case.left / top.left)
 
 
 def _report(search: Search, case: Case) -> None:

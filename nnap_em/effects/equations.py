@@ -5,6 +5,7 @@ Each is a `Flow`: one formula for all of them, so that a search compiles one pro
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import equinox as eqx
@@ -25,17 +26,10 @@ LEVELS = (0.3, 0.6, 0.8)
 
 
 FORMS = (
-    "",
-    " in proportion to {0}",
-    " in proportion to {0} - {1}",
-    " in proportion to {0} {1}",
-    " with the square of {0}",
-    "",
-    " of {1}",
-)
+    "", " in proportion to {0}", " in proportion to {0} - {1}", " in proportion to {0} {1}", " with the square of {0}",
+    "", " of {1}",
+)  # fmt: skip
 """Words of the forms of a flow, with the names of its signals."""
-FLOW_FORMS = 7
-"""Forms of a flow."""
 
 
 class Flow(AbstractEffect):
@@ -75,6 +69,8 @@ class PortEffect(AbstractEffect):
     """True where it leaves its port."""
     reports: ClassVar[tuple[str, ...]] = ("strength",)
     """Numbers that it has and reports; the others stay as they are."""
+    count: ClassVar[int] = 1
+    """Number of its signals, where they may be any."""
 
     reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
     """Names of its signals."""
@@ -95,7 +91,7 @@ class PortEffect(AbstractEffect):
         first, second = (one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
         source = (-1.0 if self.leaves else 1.0) * one_of(ports, self.channel)
         target = (1.0 if self.leaves else -1.0) * one_of(ports, self.to)
-        kind = np.eye(FLOW_FORMS)[self.kind]
+        kind = np.eye(len(FORMS))[self.kind]
         kind, first, second, source, target = (jnp.asarray(a, float) for a in (kind, first, second, source, target))
         return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
 
@@ -137,14 +133,27 @@ class PortEffect(AbstractEffect):
 
     def is_physical(self) -> bool:
         """A flow that leaves a state has a positive strength, and no more of it arrives than leaves, but for errors."""
-        return (not self.leaves or float(self.strength) > 0) and ("share" not in self.reports or self._shared())
+        shared = "share" not in self.reports or 0.0 < float(self.share) < 1.5
+        return shared and (not self.leaves or float(self.strength) > 0)
 
-    def _shared(self) -> bool:
-        return 0.0 < float(self.share) < 1.5
+    @classmethod
+    def places(cls, around: SearchScales) -> Sequence[tuple[str, tuple[str, ...], str | None]]:
+        """Ports where it may be, its signals there, and the port that a share enters."""
+        signals = list(itertools.combinations(around.sizes, cls.count))
+        return [(port, of, None) for port in around.system.open_ports for of in signals]
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for port, of, to in cls.places(around):
+            low, high = around.sizes[of[0]] if "level" in cls.reports else (0.0, 0.0)
+            levels = [low + share * (high - low) for share in (LEVELS if "level" in cls.reports else (0.0,))]
+            out += [cls.at(around, port, of, to, level) for level in levels]
+        return out
 
     @classmethod
     def at(
-        cls, around: SearchScales, port: str, of: tuple[str, ...], to: str | None = None, level: float | None = None
+        cls, around: SearchScales, port: str, of: tuple[str, ...], to: str | None = None, level: float = 0.0
     ) -> Candidate:
         """The law at a port, of signals, from a level on, with strengths of the size of what moves the port."""
         rate = float(around.torque[around.system.ports.index(port)])
@@ -158,16 +167,10 @@ class PortEffect(AbstractEffect):
             return cls(strength=strength, level=level, share=share, edge=edge, channel=port, reads=of, to=to)
 
         has, none = cls.reports, 1e-12
-        start = make(0.0, level or 0.0, 0.7 if "share" in has else 1.0)
-        probe = make(0.04 * spread, level or 0.0, 0.7 if "share" in has else 1.0)
+        start = make(0.0, level, 0.7 if "share" in has else 1.0)
+        probe = make(0.04 * spread, level, 0.7 if "share" in has else 1.0)
         wide = make(spread, 0.3 * width[0] if "level" in has else none, 0.3 if "share" in has else none)
         return Candidate(start, (probe,), wide)
-
-
-def _levels(around: SearchScales, name: str) -> list[float]:
-    """Levels at which a search begins."""
-    low, high = around.sizes[name]
-    return [low + share * (high - low) for share in LEVELS]
 
 
 class ConstantFlow(PortEffect):
@@ -176,10 +179,7 @@ class ConstantFlow(PortEffect):
     name: ClassVar[str] = "constant_flow"
     confirm: ClassVar[str] = "Leave all inputs at zero and watch the state drift."
     kind: ClassVar[int] = 0
-
-    @classmethod
-    def candidates(cls, around):
-        return [cls.at(around, port, ()) for port in around.system.open_ports]
+    count: ClassVar[int] = 0
 
 
 class LinearFlow(PortEffect):
@@ -189,10 +189,6 @@ class LinearFlow(PortEffect):
     confirm: ClassVar[str] = "Hold all else still, change this signal alone, and watch the rate of the state."
     kind: ClassVar[int] = 1
 
-    @classmethod
-    def candidates(cls, around):
-        return [cls.at(around, port, (name,)) for port in around.system.open_ports for name in around.sizes]
-
 
 class SquareFlow(PortEffect):
     """strength p |p|."""
@@ -201,10 +197,6 @@ class SquareFlow(PortEffect):
     confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
     kind: ClassVar[int] = 4
 
-    @classmethod
-    def candidates(cls, around):
-        return [cls.at(around, port, (name,)) for port in around.system.open_ports for name in around.sizes]
-
 
 class ProductFlow(PortEffect):
     """strength p q."""
@@ -212,11 +204,7 @@ class ProductFlow(PortEffect):
     name: ClassVar[str] = "product_flow"
     confirm: ClassVar[str] = "Change one of the two signals while the other is zero: the rate must stay."
     kind: ClassVar[int] = 3
-
-    @classmethod
-    def candidates(cls, around):
-        pairs = [tuple(pair) for pair in itertools.combinations(around.sizes, 2)]
-        return [cls.at(around, port, pair) for port in around.system.open_ports for pair in pairs]
+    count: ClassVar[int] = 2
 
 
 class ThresholdFlow(PortEffect):
@@ -226,11 +214,6 @@ class ThresholdFlow(PortEffect):
     confirm: ClassVar[str] = "Raise this signal slowly and watch where the rate of the state begins to change."
     kind: ClassVar[int] = 5
     reports: ClassVar[tuple[str, ...]] = ("strength", "level")
-
-    @classmethod
-    def candidates(cls, around):
-        places = [(port, name) for port in around.system.open_ports for name in around.sizes]
-        return [cls.at(around, port, (n,), level=level) for port, n in places for level in _levels(around, n)]
 
 
 class Exchange(PortEffect):
@@ -242,8 +225,8 @@ class Exchange(PortEffect):
     leaves: ClassVar[bool] = True
 
     @classmethod
-    def candidates(cls, around):
-        return [cls.at(around, one, (one, other), to=other) for one, other in around.pairs]
+    def places(cls, around):
+        return [(one, (one, other), other) for one, other in around.pairs]
 
 
 class Transfer(PortEffect):
@@ -256,9 +239,8 @@ class Transfer(PortEffect):
     reports: ClassVar[tuple[str, ...]] = ("level", "share", "strength")
 
     @classmethod
-    def candidates(cls, around):
-        each = [(one, other, level) for one, other in around.ordered for level in _levels(around, one)]
-        return [cls.at(around, one, (one,), to=other, level=level) for one, other, level in each]
+    def places(cls, around):
+        return [(one, (one,), other) for one, other in around.ordered]
 
 
 class Overflow(PortEffect):
@@ -271,11 +253,8 @@ class Overflow(PortEffect):
     reports: ClassVar[tuple[str, ...]] = ("level", "share", "strength")
 
     @classmethod
-    def candidates(cls, around):
-        each = [(one, other, level) for one, other in around.ordered for level in _levels(around, one)]
-        return [
-            cls.at(around, one, (one, u), to=other, level=level) for one, other, level in each for u in around.inputs
-        ]
+    def places(cls, around):
+        return [(one, (one, u), other) for one, other in around.ordered for u in around.inputs]
 
 
 class Bend(SensorEffect):
@@ -318,6 +297,19 @@ def _grid(values: Float[Array, " axis"], low: Any, high: Any) -> Float[Array, " 
     return out
 
 
+@jax.custom_jvp
+def _function(weights: Float[Array, " node"], values: Float[Array, " axis"], low: Any, high: Any) -> Scalar:
+    """Sum of weighted basis functions."""
+    return weights @ _grid(values, low, high)
+
+
+@_function.defjvp
+def _function_jvp(at, moved):
+    """Its slopes by the signals serve all directions, of which a free function has one for each weight."""
+    (weights, *place), nodes = at, _grid(*at[1:])
+    return weights @ nodes, moved[0] @ nodes + weights @ jax.jacfwd(_grid)(*place) @ moved[1]
+
+
 class FreeFlow(AbstractEffect):
     """A free function of the signals that `pick` takes of states and inputs, at the port `at`; one program for all."""
 
@@ -333,7 +325,7 @@ class FreeFlow(AbstractEffect):
 
     def force(self, scene, memory):
         values = self.pick @ jnp.concatenate([scene.q, cast(Array, scene.u)])
-        return (self.weights @ (self.basis @ _grid(values, self.low, self.high))) * self.at
+        return _function(self.weights @ self.basis, values, self.low, self.high) * self.at
 
 
 class UnknownTerm(AbstractEffect):
@@ -362,13 +354,18 @@ class UnknownTerm(AbstractEffect):
 
     def at(self, values: Float[Array, " axis"]) -> Scalar:
         """The function at values of its signals."""
-        return self.weights @ (self.basis @ self.grid(values))
+        return _function(self.weights @ self.basis, values, self.low, self.high)
+
+    def table(self, cov: Float[np.ndarray, "basis basis"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places over the ranges of its signals (place, signal), the function there, and its standard deviation."""
+        count = 2 * NODES[len(self.reads)] - 1
+        axes = np.meshgrid(*np.linspace(self.low, self.high, count).T, indexing="ij")
+        places = np.stack([axis.ravel() for axis in axes], axis=1)
+        rows = np.asarray(jax.vmap(self.grid)(jnp.asarray(places))) @ np.asarray(self.basis).T
+        return places, rows @ np.asarray(self.weights), np.sqrt(np.einsum("pi,ij,pj->p", rows, cov, rows))
 
     def force(self, scene, memory):
-        system: Any = scene.system
-        every = dict(zip((*system.states, *system.inputs), (*scene.q, *cast(Array, scene.u)), strict=True))
-        value = self.at(jnp.stack([every[name] for name in self.reads]))
-        return jnp.zeros_like(scene.drive).at[system.ports.index(self.channel)].set(value)
+        return self.lean(scene.system).force(scene, memory)
 
     def lean(self, system):
         nodes, numbers = self.basis.shape[1], self.weights.shape[0]

@@ -190,9 +190,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
     prior = ParameterPrior(
-        free,
-        jnp.asarray([rig.parameters[n].mean for n in free]),
-        jnp.asarray([rig.parameters[n].std for n in free]),
+        free, jnp.asarray([rig.parameters[n].mean for n in free]), jnp.asarray([rig.parameters[n].std for n in free])
     )
     estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
     least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std

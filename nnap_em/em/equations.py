@@ -1,5 +1,6 @@
 """First model of EM of a plant that is written as equations: scales by its own simulation with the declared numbers."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -121,13 +122,8 @@ def motion(model: StateSpaceModel, data: Dataset) -> Motion:
 
 @eqx.filter_jit
 def _simulated(model: StateSpaceModel, u: Float[Array, "seq time input"]) -> Float[Array, "seq time state"]:
-    def one(u):
-        def step(x, row):
-            return model.transition(x, Inputs.held(row)), x
-
-        return jax.lax.scan(step, model.start.mean, u)[1]
-
-    return jax.vmap(one)(u)
+    step = lambda x, row: (model.transition(x, Inputs.held(row)), x)  # noqa: E731
+    return jax.vmap(lambda u: jax.lax.scan(step, model.start.mean, u)[1])(u)
 
 
 def pace_of(rig: Rig, slowest: float, rows: int) -> float:
@@ -140,13 +136,12 @@ def pace_of(rig: Rig, slowest: float, rows: int) -> float:
 
 def unknown_terms(system: Equations, seen: Motion, names: tuple[str, ...]) -> tuple[UnknownTerm, ...]:
     """The declared unknown terms, zero, free of what a change of the parameters `names` does along the motion."""
-    of, out = system.of, []
+    of, out, every = system.of, [], (*system.states, *system.inputs)
     places = [(name, name, signals) for name, signals in of.terms.items()]
     places += [(name, state, signals) for name, (state, signals) in of.enters.items()]
+    values = np.concatenate([seen.x, seen.u], axis=1)
     for label, port, signals in places:
-        every = dict(zip((*system.states, *system.inputs), np.concatenate([seen.x, seen.u], axis=1).T, strict=True))
-        values = np.stack([every[name] for name in signals], axis=1)
-        low, high = values.min(axis=0), values.max(axis=0)
+        low, high = (f(values[:, [every.index(name) for name in signals]], axis=0) for f in (np.min, np.max))
         out.append(free_term(system, seen, names, port, signals, low, np.maximum(high, low + 1e-9), label))
     return tuple(out)
 
@@ -220,19 +215,12 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
     rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
     scale = np.concatenate([size, np.full(ports - count, size.max())])
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
-    prior = ParameterPrior(
-        free,
-        jnp.asarray([rig.parameters[n].mean for n in free], float),
-        jnp.asarray([rig.parameters[n].std for n in free], float),
-    )
-    model = StateSpaceModel(
-        system=system,
+    pairs = np.array([(rig.parameters[n].mean, rig.parameters[n].std) for n in free]).reshape(-1, 2)
+    prior = ParameterPrior(free, jnp.asarray(pairs[:, 0], float), jnp.asarray(pairs[:, 1], float))
+    model = dataclasses.replace(
+        model,
         unknown=NoFriction(jnp.asarray(scale, float), jointless=True),
-        start=start,
         log_q=jnp.asarray(2 * np.log(size * rig.dt), float),
-        log_r=model.log_r,
-        measured=model.measured,
-        dt=rig.dt,
         substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / EQUATION_STEP, 1.0)))), MOST_STEPS),
         pace=pace_of(rig, seen.slowest, rows),
     )

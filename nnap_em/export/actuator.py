@@ -26,10 +26,7 @@ class Acting(NamedTuple):
 
 
 def actuator(
-    fitted: Identified,
-    model: StateSpaceModel,
-    unplaced: Sequence[tuple[AbstractEffect, str]],
-    motors: Sequence[Any],
+    fitted: Identified, model: StateSpaceModel, unplaced: Sequence[tuple[AbstractEffect, str]], motors: Sequence[Any]
 ) -> Acting:
     """The module of the laws that a written file does not hold; those of bodies and with states of their own aside.
 

@@ -1,8 +1,8 @@
-"""Friction and feed-forward torque of a fitted model as C99, without dependencies but the mathematics library."""
+"""Friction and feed-forward torque, or equations, of a fitted model as C99, with the mathematics library alone."""
 
 import ast
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +13,9 @@ from ..effects import AbstractEffect
 from ..effects.base import OperatingPoint
 from ..fit.identify import Identified
 from ..model import hooks
+from ..model.state_space import Inputs
 from ..storage.files import replace_text
-from .model import ExportError, unrolled
+from .model import ExportError, described, inputs_of, states_of, unrolled
 from .placement import of_command
 from .unroll import Source
 
@@ -40,18 +41,9 @@ OPERATORS: dict[type, str] = {
 """C of Python's operators."""
 
 
-class Torques(NamedTuple):
-    """Torques of a model as JAX functions, and the laws that they leave out."""
-
-    friction: Callable
-    """Friction torque at velocities."""
-    feedforward: Callable
-    """Torque of the drives that gives an acceleration at q, v, a and a time on the clock of the fit."""
-    without: tuple[AbstractEffect, ...]
-
-
-def torques(fitted: Identified) -> Torques:
-    """Friction and inverse dynamics of a fitted model.
+def torques(fitted: Identified) -> tuple[Callable, Callable, tuple[AbstractEffect, ...]]:
+    """Friction at velocities, torque of the drives that gives an acceleration at q, v, a and a time of the fit's clock,
+    and the laws that these leave out.
 
     A law with states of its own counts as settled, and what lies between a command and its torque is left out.
     A law of the drive's torque acts on that of the machine without laws.
@@ -60,22 +52,20 @@ def torques(fitted: Identified) -> Torques:
     without = tuple(effect for effect in model.effects if effect.memory or of_command(effect))
     laws = tuple(effect for effect in model.effects if effect not in without and effect.channel is None)
 
-    def friction(v):
-        return (model.unknown(v),)
-
     def feedforward(q, v, a, time):
         system = model.system
         needed = system.mass(q) @ a + system.bias(q, v) - model.unknown(v)
         scene = OperatingPoint(system, q, v, needed, time[0], model.unknown(v), model.unknown)
         return (needed - hooks.added(laws, scene, jnp.zeros(0, q.dtype), a),)
 
-    return Torques(friction, feedforward, without)
+    return lambda v: (model.unknown(v),), feedforward, without
 
 
 def write_c(fitted: Identified, out: Path | str) -> list[str]:
-    """Write friction and feed-forward torque per joint to a C99 file.
+    """Write friction and feed-forward torque per joint to a C99 file, or rates and readings of equations.
 
-    Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`.
+    Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`;
+    of equations `tanks_rates(x, u, rate)` and `tanks_readings(x, u, y)` for `tanks.c`.
 
     Args:
         fitted: the model.
@@ -88,31 +78,61 @@ def write_c(fitted: Identified, out: Path | str) -> list[str]:
         ExportError: a law has no plain C form; nothing is written.
     """
     out = Path(out)
-    system, functions = fitted.model.system, torques(fitted)
     name = re.sub(r"\W", "_", out.stem)
     name = f"model_{name}" if name[:1].isdigit() else name
-    dof = len(system.coordinates)
-    still = jnp.zeros(dof)
+    functions, sizes, left, lines = (_equations if fitted.rig.equations else _joints)(fitted, name)
+    absent = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in left]
+    first, last = (
+        f"{fitted.rig.name}: written by nnap_em {__version__}.",
+        f"Not in here: {', '.join(absent) or 'nothing'}.",
+    )
+    text = "\n   ".join([f"{first}  Link with -lm.", *lines, last]).replace("*/", "* /")
+    sizes = ", ".join(f"{name.upper()}_{what} = {size}" for what, size in sizes.items())
+    head = f"""/* {text} */
+#include <math.h>
+
+{WHOLE}
+enum {{ {sizes} }};
+"""
+    replace_text(out, head + "\n" + "\n".join(functions))
+    return absent
+
+
+def _joints(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
+    """Functions of friction and feed-forward torque, their sizes, laws that are not in them, and lines about them."""
+    system, (friction, feedforward, without) = fitted.model.system, torques(fitted)
+    still = jnp.zeros(len(system.coordinates))
     sources = [
-        unrolled(f"{name}_friction", functions.friction, v=still),
-        unrolled(f"{name}_feedforward", functions.feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
+        unrolled(f"{name}_friction", friction, v=still),
+        unrolled(f"{name}_feedforward", feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
     ]
     units = ", ".join(
         f"{q} [{system.unit(q)}], torque [{system.force_unit(j)}]" for j, q in enumerate(system.coordinates, 1)
     )
-    left = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in functions.without]
-    head = f"""/* {fitted.rig.name}: written by nnap_em {__version__}.  SI units.  Link with -lm.
-   Joints: {units}.
-   {name}_friction: friction torque at joint rates v.
-   {name}_feedforward: torque of the drives that gives acceleration a at q, v; time is that of the fit's clock.
-   Not in here: {", ".join(left) or "nothing"}. */
-#include <math.h>
+    lines = [
+        f"SI units.  Joints: {units}.",
+        f"{name}_friction: friction torque at joint rates v.",
+        f"{name}_feedforward: torque of the drives that gives acceleration a at q, v; time is that of the fit's clock.",
+    ]
+    return list(map(function, sources)), {"JOINTS": len(still)}, without, lines
 
-{WHOLE}
-enum {{ {name.upper()}_JOINTS = {dof} }};
-""".replace("*/\n   ", "* /\n   ")
-    replace_text(out, head + "\n" + "\n".join(map(function, sources)))
-    return left
+
+def _equations(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
+    """The same of rates and readings of equations, at states, those of laws behind them, and inputs that reach them."""
+    model, x, u = fitted.model, fitted.model.start.mean, jnp.zeros(len(fitted.rig.input_columns))
+    push = jnp.zeros(len(model.system.ports))
+    rates = unrolled(f"{name}_rates", lambda x, u: (model.rate(x, Inputs.held(u), push),), x=x, u=u)
+    readings = unrolled(f"{name}_readings", lambda x, u: (model.emission(x, Inputs.held(u)),), x=x, u=u)
+    units = {column: model.system.unit(column) for column in fitted.rig.measured}
+    lines = [
+        f"States x: {described({n: model.system.unit(n) for n in states_of(model)})}.",
+        f"Inputs u: {described(inputs_of(fitted)) or 'none'}.  Readings y: {described(units)}.",
+        f"{name}_rates: derivatives of the states by time [per second].",
+        f"{name}_readings: what the sensors read, without noise.",
+    ]
+    code = [function(rates, out="rate"), function(readings, out="y")]
+    sizes = {"STATES": len(x), "INPUTS": len(u), "READINGS": len(units)}
+    return code, sizes, [effect for effect in model.effects if of_command(effect)], lines
 
 
 class Dialect(NamedTuple):
@@ -136,11 +156,11 @@ class Dialect(NamedTuple):
 PLAIN = Dialect()
 
 
-def function(source: Source, dialect: Dialect = PLAIN) -> str:
-    """A C function of arrays, whose last argument is the result."""
+def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau") -> str:
+    """A C function of arrays, whose last argument `out` is the result."""
     results, real = [text for result in source.results for text in result], dialect.real
     arrays = [f"const {real} {name}[{size or 1}]" for name, size in source.sizes.items()]
-    lines = [f"{dialect.words} {source.name}({', '.join(arrays)}, {real} tau[{len(results) or 1}])", "{"]
+    lines = [f"{dialect.words} {source.name}({', '.join(arrays)}, {real} {out}[{len(results) or 1}])", "{"]
     code = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
         lines += [
@@ -154,7 +174,7 @@ def function(source: Source, dialect: Dialect = PLAIN) -> str:
         if _whole(node, whole_numbers):
             whole_numbers.add(name)
         lines.append(f"    const {'long' if name in whole_numbers else real} {name} = {_c(node, dialect)};")
-    lines += [f"    tau[{i}] = {_c(ast.parse(text, mode='eval').body, dialect)};" for i, text in enumerate(results)]
+    lines += [f"    {out}[{i}] = {_c(ast.parse(text, mode='eval').body, dialect)};" for i, text in enumerate(results)]
     return "\n".join([*lines, "}", ""])
 
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +19,7 @@ from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..report.tables import write_json
 from ..storage.files import replace_bytes, replace_text
-from ..systems import AbstractSystem
+from ..systems import AbstractPlant
 from . import program as portable
 from .placement import of_command
 from .unroll import Source, UnrollError, unroll
@@ -70,7 +70,7 @@ def write_model(fitted: Identified, out: Path | str) -> str:
 def parameters(fitted: Identified) -> dict[str, Any]:
     """All numbers of the model, with units, as JSON has them."""
     rig, model = fitted.rig, fitted.model
-    system, states = model.system, _states(model)
+    system, states = model.system, states_of(model)
     estimated = parameter_table(fitted)
     values = {name: (pair.mean, pair.std) for name, pair in rig.parameters.items()} | estimated
     return {
@@ -78,10 +78,10 @@ def parameters(fitted: Identified) -> dict[str, Any]:
         "version": __version__,
         "rig": rig.name,
         "system": rig.system,
-        "states": [{"name": n, "unit": system.unit(n)} for n in states[: 2 * len(system.coordinates)]],
+        "states": [{"name": n, "unit": system.unit(n)} for n in system.states],
         "inputs": [
-            {"name": n, "joint": j, "unit": system.force_unit(j)}
-            for n, j in zip(rig.input_columns, rig.input_joints, strict=True)
+            {"name": n, "joint": drive.get("joint"), "unit": unit}
+            for (n, unit), drive in zip(inputs_of(fitted).items(), system.drives, strict=True)
         ],
         "sensors": [{"name": name, "unit": unit} for name, unit in system.sensors.items()],
         "measured": list(rig.measured),
@@ -114,7 +114,7 @@ def stablehlo(model: StateSpaceModel) -> bytes:
     step = jax.vmap(one)
 
     (rows,) = jax.export.symbolic_shape("rows")
-    shapes = [jax.ShapeDtypeStruct((rows, n), model.log_q.dtype) for n in (len(_states(model)), _width(model))]
+    shapes = [jax.ShapeDtypeStruct((rows, n), model.log_q.dtype) for n in (len(states_of(model)), _width(model))]
     return bytes(jax.export.export(jax.jit(step), platforms=("cpu", "cuda"))(*shapes).serialize())
 
 
@@ -131,28 +131,28 @@ def predictor(fitted: Identified) -> str:
             raise ExportError(
                 f"{effect.name!r} acts on the command; use {STABLEHLO_FILE}, whose inputs are what reaches the joints"
             )
-    x, u, z = jnp.zeros(len(_states(model))), jnp.zeros(_width(model)), prior.read(model)
+    x, u, z = jnp.zeros(len(states_of(model))), jnp.zeros(_width(model)), prior.read(model)
     force = jnp.zeros(len(model.system.coordinates))
 
     def rate(x, u, force, z):
-        return (prior.write(model, z).rate(x, _row(model, u), force),)
+        return (prior.write(model, z).rate(x, _row(model, u), model.system.at_ports(force)),)
 
     def reading(x, u, z):
         read = prior.write(model, z).emission
         return read(x, _row(model, u)), jax.jacfwd(read)(x, _row(model, u))
 
     def shown(x, u, force, z):
-        show = prior.write(model, z).shown
-        return show(x, _row(model, u), force), jax.jacfwd(show)(x, _row(model, u), force)
+        show, push = prior.write(model, z).shown, model.system.at_ports(force)
+        return show(x, _row(model, u), push), jax.jacfwd(show)(x, _row(model, u), push)
 
     functions = [
         unrolled("rate", rate, x=x, u=u, force=force, z=z),
         unrolled("reading", reading, x=x, u=u, z=z),
         unrolled("shown", shown, x=x, u=u, force=force, z=z),
     ]
-    weights, bank = fitted.m_step.weights(model), fitted.bank.padded(len(_states(model)))
+    weights, bank = fitted.m_step.weights(model), fitted.bank.padded(len(states_of(model)))
     numbers = {
-        "states": _states(model),
+        "states": states_of(model),
         "measured": rig.measured,
         "inputs": rig.input_columns,
         "sensors": tuple(model.system.sensors),
@@ -168,6 +168,7 @@ def predictor(fitted: Identified) -> str:
         "nodes": weights.nodes,
         "spread": _spread(fitted, weights),
         "parameters": z,
+        "nominal": model.system.simulated,
     }
     fields = "\n".join(f"    {name}={literal(value)}," for name, value in numbers.items())
     body = Path(portable.__file__).read_text(encoding="utf-8").partition('"""\n')[2]
@@ -175,10 +176,9 @@ def predictor(fitted: Identified) -> str:
         "\\", "/"
     )
     usage = "\n\nIt needs NumPy only: python predictor.py LOG.csv --given 1.0 --out prediction.csv\n"
-    states = ", ".join(f"{n} [{model.system.unit(n)}]" for n in _states(model)[: 2 * len(force)])
-    drives = zip(rig.input_columns, map(model.system.force_unit, rig.input_joints), strict=True)
-    inputs = ", ".join(f"{name} [{unit}]" for name, unit in drives) or "none"
-    sensors = ", ".join(f"{name} [{unit}]" for name, unit in model.system.sensors.items())
+    states = described({n: model.system.unit(n) for n in model.system.states})
+    inputs = described(inputs_of(fitted)) or "none"
+    sensors = described(model.system.sensors)
     inputs += f".  Sensors: {sensors}" if sensors else ""
     units = f'States: {states}.  Inputs: {inputs}.\n"""\n'
     model_ = f"MODEL = Model(\n{fields}\n    rate=rate,\n    reading=reading,\n    shown=shown,\n)\n"
@@ -220,15 +220,26 @@ def unrolled(
     return source
 
 
-def _states(model: StateSpaceModel) -> tuple[str, ...]:
-    """Coordinates, rates, and a name for each state of memory."""
-    names = model.system.coordinates + model.system.rates
+def inputs_of(fitted: Identified) -> dict[str, str]:
+    """Inputs and their units."""
+    rig, pairs = fitted.rig, zip(fitted.rig.input_columns, fitted.rig.input_joints, strict=True)
+    return {name: rig.unit(name) if rig.equations else fitted.model.system.force_unit(joint) for name, joint in pairs}
+
+
+def described(units: Mapping[str, str]) -> str:
+    """Names with their units, as far as they have one."""
+    return ", ".join(f"{name} [{unit}]" if unit else name for name, unit in units.items())
+
+
+def states_of(model: StateSpaceModel) -> tuple[str, ...]:
+    """States of the plant, and a name for each state of memory."""
+    names = model.system.states
     return names + tuple(f"memory{i + 1}" for i in range(model.log_q.shape[0] - len(names)))
 
 
 def _width(model: StateSpaceModel) -> int:
     """Columns of an exported row of inputs."""
-    drives = len(model.system.joints)
+    drives = len(model.system.drives)
     return 2 * drives + 2 if model.effects else drives
 
 
@@ -238,7 +249,7 @@ def _row(model: StateSpaceModel, columns: Float[Array, " input"]) -> Inputs:
     """
     if not model.effects:
         return Inputs.held(columns)
-    drives = len(model.system.joints)
+    drives = len(model.system.drives)
     return Inputs(columns[:drives], columns[drives + 1 : -1], columns[drives], columns[-1])
 
 
@@ -285,7 +296,7 @@ def _friction(fitted: Identified) -> dict[str, Any]:
     }
 
 
-def _effect(effect: AbstractEffect, system: AbstractSystem) -> dict[str, Any]:
+def _effect(effect: AbstractEffect, system: AbstractPlant) -> dict[str, Any]:
     units = effect.units_on(system)
     values = {name: float(value) for name, value in effect.values().items()}
     return {

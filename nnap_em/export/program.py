@@ -12,7 +12,7 @@ Affine = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Model(NamedTuple):
-    """A fitted model; states are positions, rates and memory, in SI units."""
+    """A fitted model; states are positions, rates and memory in SI units, or those of equations."""
 
     states: tuple[str, ...]
     measured: tuple[str, ...]
@@ -38,6 +38,8 @@ class Model(NamedTuple):
     rate: Callable[..., Any]
     reading: Callable[..., Any]
     shown: Callable[..., Any]
+    nominal: bool = False
+    """True where the mean is the path of the model itself: of equations."""
     window: int = 60
     inflations: tuple[float, ...] = (1.0, 10.0, 100.0)
 
@@ -111,19 +113,26 @@ def predict(
         deviations = rng.standard_normal((samples, model.spread.shape[1])) @ model.spread.T
         draws = deviations, rng.standard_normal((samples, n)), rng.standard_normal((len(time), samples, n))
     deviations, start, noise = draws
-    tables, z = deviations[:, : dof * nodes].reshape(-1, dof, nodes), model.parameters + deviations[:, dof * nodes :]
+    tables, z = (
+        deviations[:, : dof * nodes].reshape(len(deviations), dof, nodes),
+        model.parameters + deviations[:, dof * nodes :],
+    )
     past, cov = smooth(model, time[: last + 1], u[: last + 1], y[: last + 1])
+    if model.nominal:  # the first path is that of the model itself
+        start, noise = np.array(start), np.array(noise)
+        z[0], start[0], noise[:, 0] = model.parameters, 0.0, 0.0
     inputs = rows_of(model, time, u)
-    mean, std = np.empty((2, len(time), 2 * dof + len(model.sensors)))
     with np.errstate(all="ignore"):
-        mean[: last + 1], rows = _shown(model, past, inputs[: last + 1], np.zeros(dof), model.parameters)
-        std[: last + 1] = np.sqrt(np.einsum("tij,tjk,tik->ti", rows, cov, rows))
+        first, rows = _shown(model, past, inputs[: last + 1], np.zeros(dof), model.parameters)
+        mean, std = np.empty((2, len(time), first.shape[1]))
+        mean[: last + 1], std[: last + 1] = first, np.sqrt(np.einsum("tij,tjk,tik->ti", rows, cov, rows))
         x = past[last] + start @ _cholesky(cov[last] + 1e-16 * np.eye(n)).T
         for k in range(last, len(time)):
             force = _between(model.nodes, tables, x[:, dof : 2 * dof])
             if k > last:
                 shown = _shown(model, x, inputs[k], force, z)[0]
-                mean[k], std[k] = shown.mean(0), shown.std(0)
+                mean[k] = shown[0] if model.nominal else shown.mean(0)
+                std[k] = np.sqrt(np.mean((shown - mean[k]) ** 2, axis=0))
             x = transition(model, x, inputs[k], force, z) + noise[k] * np.exp(0.5 * model.log_q)
     return Prediction(mean, std, np.arange(len(time)) > last)
 
@@ -271,7 +280,7 @@ def main(model: Model) -> None:
         np.array([column(name) for name in names]).T.reshape(len(time), -1) for names in (model.inputs, model.measured)
     )
     prediction = predict(model, time, u, y, args.given, seed=args.seed)
-    names = model.states[: 2 * len(model.nodes)] + model.sensors
+    names = model.states[: prediction.mean.shape[1] - len(model.sensors)] + model.sensors
     with open(args.out, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["time", *names, *(f"{name}_std" for name in names)])

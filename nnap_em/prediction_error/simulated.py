@@ -10,7 +10,7 @@ algorithm", LNM 630; Bock 1983 for many starts]
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -117,9 +117,8 @@ def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begi
     return together([model], [prior], [np.zeros_like(begin.mean)], data, begin)[0]
 
 
-GROUPS = (1, 16, 64)
-"""Numbers of models whose errors are computed at once, a program for each: a simulation is a long loop, whose steps
-take as long for one as for many."""
+GROUPS = (1, 4, 16, 64)
+"""Numbers of models whose errors are computed at once, a program for each; copies of the last model fill one up."""
 
 
 def together(
@@ -133,7 +132,8 @@ def together(
     for first in range(0, len(models), GROUPS[-1]):
         some, begun = numbers[first : first + GROUPS[-1]], list(starts[first : first + GROUPS[-1]])
         size = next(size for size in GROUPS if size >= len(some))
-        stacked = jax.tree.map(_stacked(size, count), *some)
+        filled = [*some, *some[-1:] * (size - len(some))]
+        stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *filled)
         tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
         begun = np.concatenate([*begun, *begun[-1:] * (size - len(begun))])
         error, columns, by_start = each(
@@ -146,20 +146,14 @@ def together(
     return out
 
 
-def _stacked(size: int, count: int) -> Callable[..., np.ndarray]:
-    """Arrays of some models as one of `size`, the last repeated, each for `count` sequences."""
-    return lambda *each_one: np.repeat(
-        np.stack([np.asarray(a) for a in (*each_one, *each_one[-1:] * (size - len(each_one)))]), count, axis=0
-    )
-
-
 def _errors(common, one):
     (static, at, width), (numbers, seq, begin, start) = common, one
     model, prior, z = eqx.combine(numbers, static)
     first = at.row[:, 0]
 
-    def predicted(z, start):
-        changed = prior.write(model, z)
+    def predicted(both):
+        moved, shift = both[: len(z)], both[len(z) :]
+        changed = prior.write(model, moved)
         ready = prepare(changed, seq)
         row = lambda k: jax.tree.map(lambda a: a[k], ready.inputs)  # noqa: E731
 
@@ -167,14 +161,13 @@ def _errors(common, one):
             inputs = row(first + h)
             return jax.vmap(changed.transition)(x, inputs), jax.vmap(changed.emission)(x, inputs)
 
-        _, read = jax.lax.scan(step, begin + start * width[None], jnp.arange(at.rows))
+        _, read = jax.lax.scan(step, begin + (start + shift[None]) * width[None], jnp.arange(at.rows))
         known = jnp.where(ready.observed, ready.y, jnp.nan)
         out = jnp.moveaxis(read[:: at.every], 0, 1)
         return out, known[at.row] - out
 
-    by_start = jax.jacfwd(lambda shift: predicted(z, start + shift[None])[0])(jnp.zeros_like(start[0]))
-    columns, error = jax.jacfwd(predicted, has_aux=True)(z, start)
-    return error, columns, by_start
+    slopes, error = jax.jacfwd(predicted, has_aux=True)(jnp.concatenate([z, jnp.zeros_like(start[0])]))
+    return error, slopes[..., : len(z)], slopes[..., len(z) :]
 
 
 def scale_of(of: Simulated) -> Scale:

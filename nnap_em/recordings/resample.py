@@ -98,12 +98,7 @@ class Resampled(NamedTuple):
 
 
 def resample(
-    path: Path,
-    rig: Rig,
-    states: Sequence[str],
-    plan: Plan,
-    shifts: Mapping[str, float],
-    unwrap: Collection[str] = (),
+    path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str] = ()
 ) -> Resampled:
     """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
 

@@ -13,6 +13,8 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.logs import Logs
 from ..data.servo import TORQUE
+from ..diagnosis.hypothesis import covariances
+from ..effects.equations import UnknownTerm
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
 from ..identifiability.identifiability import identifiability, sentences
@@ -68,6 +70,19 @@ def visited(fitted: Identified, velocity: Float[np.ndarray, "sample dof"], train
 def parameters(fitted: Identified) -> dict[str, Any]:
     """Estimated physical parameters."""
     return {n: {"value": v, "std": s, "unit": fitted.rig.unit(n)} for n, (v, s) in parameter_table(fitted).items()}
+
+
+def unknown_terms(fitted: Identified) -> list[dict[str, Any]]:
+    """Unknown terms of equations as tables over the ranges of their signals, with standard deviations."""
+    system, out = fitted.model.system, []
+    numbers = covariances(fitted.model, fitted.m_step, fitted.state.hessian)
+    for effect, cov in zip(fitted.model.effects, numbers, strict=True):
+        if isinstance(effect, UnknownTerm):
+            table = dict(zip(("places", "value", "std"), (a.tolist() for a in effect.table(cov)), strict=True))
+            unit = system.port_unit(system.ports.index(str(effect.channel)) + 1)
+            signals = {name: system.unit(name) for name in effect.reads}
+            out.append({"name": effect.label, "enters": effect.channel, "signals": signals, "unit": unit} | table)
+    return out
 
 
 def noise(fitted: Identified) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """Pictures of accepted effects: learned functions, and the first screening round."""
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ..effects.base import Curve
@@ -19,6 +21,22 @@ def effect_figure(curve: Curve) -> Figure:
     ax.set(xlim=(curve.x[0], curve.x[-1]), xlabel=f"{signal} [{curve.signal_unit}]")
     ax.set_ylabel(f"force at joint {curve.joint} [{curve.unit}]")
     head(figure, "What was found", [ax])
+    return figure
+
+
+@styled
+def term_figure(term: dict[str, Any]) -> Figure:
+    """An unknown term of equations, as the report has it: with its 90 % band, or of two signals as a surface."""
+    figure = Figure(figsize=(5.4, 3.4), layout="constrained")
+    ax, (places, values) = figure.subplots(), (np.asarray(term[key]) for key in ("places", "value"))
+    names = [f"{symbol(name)} [{unit}]".removesuffix(" []") for name, unit in term["signals"].items()]
+    names.append(f"{term['name']} [{term['unit']}]")
+    if len(names) == 2:
+        band(ax, places[:, 0], values, term["std"], AFTER, "learned")
+    else:
+        figure.colorbar(ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud"), ax=ax, label=names[2])
+    ax.set(xlabel=names[0], ylabel=names[1])
+    head(figure, f"The unknown term {term['name']}", [ax])
     return figure
 
 

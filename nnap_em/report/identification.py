@@ -23,7 +23,8 @@ from ..residual.residual import names_of
 from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure
-from .document import errors, friction_law, noise, parameters, predictions, shared, visited
+from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
+from .effect_plots import term_figure
 from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, picture, write_page
@@ -56,10 +57,16 @@ def write_identification(
         laws = friction_law(fitted, table)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
         figures.append(_draw(out / "friction.png", fitted, table, velocities))
-    bristles = contacts(fitted)
+    bristles = contacts(fitted) if fitted.rig.memory else []
     if bristles:
         caption = "Slow cycles as wide as the presliding distance on either side, with their 90 % band."
         figures.append(picture("found", "Presliding", caption, hysteresis_figure(bristles, names)))
+    terms = unknown_terms(fitted)
+    caption = (
+        "Over the range of its signals in a simulation; the parameters of the equations have all that they can do."
+    )
+    drawn = [term for term in terms if len(term["signals"]) < 3]
+    figures += [picture("found", f"Unknown term {term['name']}", caption, term_figure(term)) for term in drawn]
     sides = {"fit": fitted}
     error = errors(predictions(sides, test), sides, test) if test else None
     if error:
@@ -82,6 +89,7 @@ def write_identification(
         "horizon_note": fitted.horizon_note,
         "friction_law": laws,
         "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
+        "unknown": terms,
         "contacts": [bristle.document() for bristle in bristles],
         "log_likelihood": fitted.state.loglik.tolist(),
         "reached": float(np.nanmean(fitted.state.top)),

@@ -129,10 +129,7 @@ def _environment() -> jinja2.Environment:
     )
     environment.filters["grouped"] = grouped
     names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence", "share")
-    environment.filters |= {name: getattr(wording, name) for name in names} | {
-        "trust": _trust,
-        "highest": _highest,
-    }
+    environment.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "highest": _highest}
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {
         "most": MOST_PICTURES,

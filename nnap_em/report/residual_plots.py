@@ -107,13 +107,7 @@ class _Panel(NamedTuple):
 
 
 @styled
-def residual_figure(
-    residual: Residual,
-    names: Names,
-    after: Residual | None = None,
-    *,
-    bins: int = 24,
-) -> Figure:
+def residual_figure(residual: Residual, names: Names, after: Residual | None = None, *, bins: int = 24) -> Figure:
     """Residual generalised force of each joint against every candidate cause, binned; `after`: with the effects.
 
     A panel is headed by the share of the residual's variance that its cause accounts for.  With three joints or more

@@ -35,14 +35,8 @@ class TwoLinkArm(AbstractSystem):
 
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {
         ("payload", 2): (_payload, lambda arm: arm.m2),
-        ("link_inertia", 1): (
-            lambda arm, dI: replace(arm, I1=arm.I1 + dI),
-            lambda arm: arm.m1 * arm.l1**2,
-        ),
-        ("link_inertia", 2): (
-            lambda arm, dI: replace(arm, I2=arm.I2 + dI),
-            lambda arm: arm.m2 * arm.l2**2,
-        ),
+        ("link_inertia", 1): (lambda arm, dI: replace(arm, I1=arm.I1 + dI), lambda arm: arm.m1 * arm.l1**2),
+        ("link_inertia", 2): (lambda arm, dI: replace(arm, I2=arm.I2 + dI), lambda arm: arm.m2 * arm.l2**2),
         ("link_length", 1): (lambda arm, dl: replace(arm, l1=arm.l1 + dl), lambda arm: arm.l1),
         ("center_of_mass", 1): (lambda arm, dlc: replace(arm, lc1=arm.lc1 + dlc), lambda arm: arm.l1),
         ("center_of_mass", 2): (lambda arm, dlc: replace(arm, lc2=arm.lc2 + dlc), lambda arm: arm.l2),

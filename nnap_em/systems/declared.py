@@ -29,19 +29,20 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
     if of is not None:
         model.check(("type", *of.parameters), ("units", "unknown"))
     terms = {name: _term(unknown, name, states, inputs) for name in unknown.items}
-    known = (*states, *inputs, *parameters, *(name for name, (port, _) in terms.items() if not port))
+    named = {name: signals for name, (port, signals) in terms.items() if not port}
+    known = (*states, *inputs, *parameters, *named)
     rates = {} if of is not None else _rates(model, states, known)
     readings = _readings(root.table("measurement"), states, known)
     if of is None:
         _used(model, (*rates.values(), *readings.values()), parameters, inputs)
-        _used(unknown, (*rates.values(), *readings.values()), [n for n, (port, _) in terms.items() if not port])
+        _used(unknown, (*rates.values(), *readings.values()), named)
     text = Text(
         states,
         inputs,
         {name: formula.text for name, formula in rates.items()},
         {name: formula.text for name, formula in readings.items()},
         tuple(parameters),
-        {name: signals for name, (port, signals) in terms.items() if not port},
+        named,
         {name: (port, signals) for name, (port, signals) in terms.items() if port},
         {**own.units, **_inherited(readings, states), **units},
         own.function,

@@ -160,7 +160,7 @@ class Equations(AbstractPlant):
         """None: there are no joints."""
         return np.zeros(len(self.ports))
 
-    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
+    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node state"]) -> Float[Array, "node state"]:
         """The change itself."""
         return change
 

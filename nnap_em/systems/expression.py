@@ -85,11 +85,10 @@ def parse(text: str, known: Collection[str]) -> Formula:
             case ast.UnaryOp(op=op, operand=one) if type(op) in _OPERATORS:
                 operate, first = _OPERATORS[type(op)], built(one)
                 return lambda values: operate(first(values))
-            case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
-                operate, first, second = _OPERATORS[type(op)], built(left), built(right)
-                return lambda values: operate(first(values), second(values))
-            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATORS:
-                operate, first, second = _OPERATORS[type(op)], built(left), built(right)
+            case ast.BinOp(op=o, left=a, right=b) | ast.Compare(left=a, ops=[o], comparators=[b]) if (
+                type(o) in _OPERATORS
+            ):
+                operate, first, second = _OPERATORS[type(o)], built(a), built(b)
                 return lambda values: operate(first(values), second(values))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
                 if name not in FUNCTIONS:

@@ -124,20 +124,12 @@ class AbstractPlant(eqx.Module):
 
     @abstractmethod
     def slopes(
-        self,
-        q: Float[Array, " dof"],
-        v: Float[Array, " rate"],
-        u: Float[Array, " input"],
-        push: Float[Array, " port"],
+        self, q: Float[Array, " dof"], v: Float[Array, " rate"], u: Float[Array, " input"], push: Float[Array, " port"]
     ) -> tuple[Scalar, ...]:
         """Derivatives of all states, one by one (reason: `integrate`)."""
 
     @abstractmethod
     def sensed(
-        self,
-        q: Float[Array, " dof"],
-        v: Float[Array, " rate"],
-        u: Float[Array, " input"],
-        push: Float[Array, " port"],
+        self, q: Float[Array, " dof"], v: Float[Array, " rate"], u: Float[Array, " input"], push: Float[Array, " port"]
     ) -> tuple[Scalar, ...]:
         """Readings of the `sensors`."""

@@ -132,9 +132,7 @@ def particle_filter(
     times = jnp.arange(y.shape[0], dtype=jnp.int32)
     offset = jax.random.uniform(key_offset, y.shape[:1], dtype)
     _, (x, f, log_w, ahead, ancestors, ess, total) = jax.lax.scan(
-        step,
-        (mean, flat, size),
-        (times, offset, arrive, leave, origin, later[0], u, y, seq.observed, steps, later[1]),
+        step, (mean, flat, size), (times, offset, arrive, leave, origin, later[0], u, y, seq.observed, steps, later[1])
     )
     loglik = jnp.sum(total) + log_ahead[0].astype(exact)
     return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ahead, ancestors, leave, ess, loglik)

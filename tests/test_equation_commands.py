@@ -1,0 +1,233 @@
+"""Commands on a rig that is written as equations: each works, or refuses with one sentence and writes nothing."""
+
+import ctypes
+import dataclasses
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import csv_text
+
+import nnap_em
+from nnap_em.commands.cli import main
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.effects import catalogue
+from nnap_em.export.c99 import write_c
+from nnap_em.export.model import PREDICTOR, STEP, write_model
+from nnap_em.fit.identify import begin, phi_samples
+from nnap_em.fit.predict import predict
+from nnap_em.fit.store import fingerprint, save
+from nnap_em.model.state_space import Inputs
+from nnap_em.systems import specs
+
+RIG = """format = 1
+name = "chain"
+[model]
+type = "equations"
+inputs = { u = "V" }
+states = { a = "V", b = "V" }
+rates = { a = "k*u - a/ta", b = "(a - b)/2" }
+k = { mean = 1.0, std = 0.3 }
+ta = { mean = 4.0, std = 1.0 }
+[sampling]
+dt = 0.5
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = { y = "b + 0.1*u" }
+"""
+ROWS, GIVEN, SAMPLES = 60, 6.0, 8
+LAWS = (
+    catalogue["transfer"](strength=0.2, level=0.4, share=0.6, channel="a", reads=("a",), to="b"),
+    catalogue["sensor_bend"](jnp.asarray(0.2), jnp.asarray(0.5), 4.0, channel="y"),
+    catalogue["dead_zone"].of(0.1, channel="u"),
+)
+
+
+def _bench(folder: Path, seed: int, k: float = 1.0) -> Path:
+    """A data set of Euler steps of a hundredth of a row."""
+    rng, dt = np.random.default_rng(seed), 0.5
+    for part in ("train", "test"):
+        u = np.repeat(rng.uniform(0, 2, ROWS // 10), 10)
+        a, b, y = 1.0, 1.0, []
+        for one in u:
+            y.append(b + 0.1 * one)
+            for _ in range(100):
+                a, b = a + dt / 100 * (k * one - a / 4), b + dt / 100 * (a - b) / 2
+        columns = {"time": dt * np.arange(ROWS), "u": u, "y": np.array(y) + 0.01 * rng.standard_normal(ROWS)}
+        (folder / part).mkdir(parents=True)
+        (folder / part / "log.csv").write_text(csv_text(columns))
+    (folder / "rig.toml").write_text(RIG)
+    return folder
+
+
+def _fit(bench: Path, laws=()):
+    """The declared model before its first epoch, with a curvature."""
+    rig = read_rig(bench / "rig.toml", specs)
+    logs = read_logs(bench / "train", rig)
+    fitted = begin(rig, logs.data, key=jax.random.key(0), effects=laws)
+    size = fitted.state.hessian.shape[0]
+    state = eqx.tree_at(lambda s: s.hessian, fitted.state, 400.0 * jnp.eye(size))
+    return fitted._replace(state=state), logs
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Two data sets, and a fit of each."""
+    root = tmp_path_factory.mktemp("equations")
+    for name, seed in (("monday", 0), ("friday", 1)):
+        fitted, logs = _fit(_bench(root / f"{name}_logs", seed))
+        notes = {"logs": [str(root / f"{name}_logs")]}
+        (root / name).mkdir()
+        save(root / name / "model.npz", fitted, fingerprint=fingerprint(logs.data), notes=notes)
+    return root
+
+
+REFUSED = {
+    "observer": ("export", "monday", "--observer", "out.c"),
+    "fmu": ("export", "monday", "--fmu", "out.fmu"),
+    "mjcf": ("export", "monday", "--mjcf", "out.xml"),
+    "urdf": ("export", "monday", "--urdf", "out.urdf"),
+    "design": ("design", "monday", "--out", "out"),
+    "monitor": ("monitor", "monday", "monday_logs/test", "--out", "out"),
+    "diagnose from": ("diagnose", "friday_logs", "--from", "monday", "--out", "out"),
+}
+
+
+@pytest.mark.parametrize("command", REFUSED.values(), ids=REFUSED)
+def test_what_needs_joints_refuses_with_one_sentence_and_writes_nothing(place, command, monkeypatch, capsys):
+    monkeypatch.chdir(place)
+    before = sorted(place.rglob("*"))
+    assert main(list(command)) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(lines) == 1 and "is written as equations" in lines[0] and "joints" in lines[0]
+    assert sorted(place.rglob("*")) == before
+
+
+def test_identify_reports_its_unknown_terms(place, monkeypatch):
+    monkeypatch.chdir(place)
+    shutil.copytree(place / "monday_logs", place / "unknown_logs")
+    terms = '[model.unknown]\nf = { signals = ["a"], enters = "a" }\ng = { signals = ["b", "u"], enters = "b" }\n'
+    (place / "unknown_logs" / "rig.toml").write_text(RIG.replace("[sampling]", f"{terms}[sampling]"))
+    assert main(["identify", "unknown_logs", "--out", "unknown", "--epochs", "1"]) == 0
+    report = json.loads((place / "unknown" / "report.json").read_text())
+    assert [(term["name"], term["enters"], term["unit"]) for term in report["unknown"]] == [
+        ("f", "a", "V/s"), ("g", "b", "V/s"),
+    ]  # fmt: skip
+    assert report["contacts"] == []
+    page = (place / "unknown" / "report.html").read_text() + (place / "unknown" / "figures.html").read_text()
+    assert "Unknown term f" in page and "Unknown term g" in page
+
+
+def test_two_fits_are_compared_by_their_parameters(place, monkeypatch, capsys):
+    """Parameters far apart in standard deviations; recordings are not searched, which the log states."""
+    monkeypatch.chdir(place)
+    fitted, logs = _fit(place / "friday_logs")
+    system = fitted.model.system.with_parameters({"k": jnp.asarray(1.6)})
+    best = eqx.tree_at(lambda m: m.system, fitted.model, system)
+    (place / "changed").mkdir()
+    state = fitted.state._replace(best=best, model=best)
+    save(place / "changed" / "model.npz", fitted._replace(state=state), fingerprint=fingerprint(logs.data))
+    assert main(["compare", "monday", "changed", "--out", "beside"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("K changed between monday and changed; 1 other quantity did not.")
+    assert "what changed is not searched in recordings" in printed.err
+    document = json.loads((place / "beside" / "compare.json").read_text())
+    assert document["changed"] == ["k"] and document["friction"] == []
+
+
+def test_fits_of_other_equations_are_not_compared(place, monkeypatch, capsys):
+    monkeypatch.chdir(place)
+    other = place / "other_logs"
+    shutil.copytree(place / "monday_logs", other)
+    (other / "rig.toml").write_text(RIG.replace("(a - b)/2", "(a - b)/3"))
+    (place / "other").mkdir()
+    save(place / "other" / "model.npz", _fit(other)[0])
+    assert main(["compare", "monday", "other"]) == 2
+    assert "the equations of monday and other differ; compare fits of one machine" in capsys.readouterr().err
+
+
+def test_smoothed_states_go_to_channels(place, monkeypatch):
+    monkeypatch.chdir(place)
+    assert main(["smooth", "monday", "monday_logs/test", "--out", "smoothed", "--mcap", "smoothed.mcap"]) == 0
+    from mcap.reader import make_reader
+
+    with (place / "smoothed.mcap").open("rb") as file:
+        messages = [(c.topic, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
+    columns = {topic: set(message) - {"file", "time"} for topic, message in messages[:4]}
+    assert columns["/missing_force"] == {"a", "b", "a_std", "b_std"}
+    assert columns["/one_row_ahead"] == {"a", "b"}
+    assert columns["/log"] == {"u", "y"}
+
+
+def test_a_simulation_of_a_fit_is_that_of_its_transition(place):
+    model = dataclasses.replace(nnap_em.load(place / "monday" / "model.npz").model, substeps=10)
+    still = eqx.tree_at(lambda m: (m.log_q, m.log_r), model, (jnp.full(2, -60.0), jnp.full(1, -60.0)))
+    u = jnp.linspace(0.0, 1.0, 12)[None, :, None]
+    logs = nnap_em.simulate(still, jnp.asarray([[0.5, 0.2]]), u, key=jax.random.key(0))
+    x = jnp.asarray([0.5, 0.2])
+    for k in range(12):
+        np.testing.assert_allclose(logs.x[0, k], x, atol=1e-6)
+        np.testing.assert_allclose(logs.data.y[0, k, 0], x[1] + 0.1 * u[0, k, 0], atol=1e-6)
+        x = model.transition(x, Inputs.held(u[0, k]))
+
+
+def test_the_numpy_predictor_agrees_with_predict(place, tmp_path):
+    """With a law of two states and a bent reading, and the same random numbers."""
+    fitted, logs = _fit(place / "monday_logs", LAWS[:2])
+    assert write_model(fitted, tmp_path) == ""
+    space: dict = {"__name__": "predictor"}
+    exec((tmp_path / PREDICTOR).read_text(), space)
+    key = jax.random.key(3)
+    wanted = predict(fitted, logs.data, GIVEN, key=key, samples=SAMPLES)
+    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
+    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
+    draws = (
+        np.asarray(phi_samples(fitted, SAMPLES, key=key_draw)),
+        np.asarray(jax.random.normal(key_start, (SAMPLES, 2))),
+        np.asarray(jax.random.normal(key_noise, (ROWS, SAMPLES, 2))),
+    )
+    t, u, y = (np.asarray(a)[0] for a in (logs.data.t, logs.data.u, logs.data.y))
+    found = space["predict"](space["MODEL"], t, u, y, GIVEN, draws=draws)
+    assert found.mean.shape == (ROWS, 3)
+    np.testing.assert_allclose(found.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.std, wanted.std[0], rtol=1e-6, atol=1e-6)
+    document = json.loads((tmp_path / "parameters.json").read_text())
+    assert document["inputs"] == [{"name": "u", "joint": None, "unit": "V"}]
+    assert [effect["channel"] for effect in document["effects"]] == ["a", "y"]
+
+
+def test_one_step_through_stablehlo_is_the_transition(place, tmp_path):
+    fitted, _ = _fit(place / "monday_logs")
+    write_model(fitted, tmp_path)
+    step = jax.export.deserialize(bytearray((tmp_path / STEP).read_bytes())).call
+    x, u = jnp.asarray([[0.5, 0.2], [1.0, 2.0]]), jnp.asarray([[0.3], [1.5]])
+    ahead, reading = step(x, u)
+    for i in range(2):
+        np.testing.assert_allclose(ahead[i], fitted.model.transition(x[i], Inputs.held(u[i])), rtol=1e-12)
+        np.testing.assert_allclose(reading[i], fitted.model.emission(x[i], Inputs.held(u[i])), rtol=1e-12)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_compiled_rates_and_readings_are_those_of_the_library(place, tmp_path):
+    """With a law of two states and a bent reading; a law of the input is left out, which the file states."""
+    fitted, _ = _fit(place / "monday_logs", LAWS)
+    assert write_c(fitted, tmp_path / "two tanks.c") == ["dead_zone"]
+    text = (tmp_path / "two tanks.c").read_text()
+    assert "a [V], b [V]" in text and "Not in here: dead_zone." in text and "two_tanks_STATES" not in text
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "two tanks.c", "-o", "c.so"]
+    subprocess.run(["gcc", *flags, "-lm"], cwd=tmp_path, check=True)
+    compiled, array = ctypes.CDLL(str(tmp_path / "c.so")), lambda values: (ctypes.c_double * len(values))(*values)
+    for x in np.random.default_rng(0).uniform(0.0, 2.0, (10, 2)):
+        u, rate, reading = Inputs.held(jnp.asarray([0.7])), array([0.0, 0.0]), array([0.0])
+        compiled.two_tanks_rates(array(x), array([0.7]), rate)
+        compiled.two_tanks_readings(array(x), array([0.7]), reading)
+        np.testing.assert_allclose(rate, fitted.model.rate(jnp.asarray(x), u, jnp.zeros(2)), rtol=1e-9)
+        np.testing.assert_allclose(reading, fitted.model.emission(jnp.asarray(x), u), rtol=1e-9)

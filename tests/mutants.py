@@ -918,8 +918,8 @@ MUTANTS = (
     Mutant(
         "friction written back with the other sign",
         "export/friction.py",
-        "-torque * weight)",
-        "torque * weight)",
+        "nearest(v, torque,",
+        "nearest(v, -torque,",
         "test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve",
     ),
     Mutant(

@@ -233,6 +233,15 @@ def test_a_dip_and_a_constant_are_read_off_a_curve():
     np.testing.assert_allclose(form[:6], [0.3, 0.5, 0.15, 0.2, 0.05, 0.02], rtol=0.01)
 
 
+def test_a_dip_that_the_sign_hides_is_none():
+    """Friction that rises over 2 rad/s, a little faster at first: no torque breaks away."""
+    v = np.linspace(-8.0, 8.0, 160)
+    form = friction_form(v, -(0.3 + 0.6 * np.exp(-((v / 0.5) ** 2))) * np.tanh(v / 2.0), np.full(160, 1e-3))
+    assert form.breakaway == form.coulomb
+    form = friction_form(v, 0 * v, np.full(160, 1e-3))
+    assert (form.coulomb, form.breakaway, form.viscous, form.missed) == (0.0, 0.0, 0.0, 0.0)
+
+
 def test_a_built_in_machine_has_no_file(tmp_path):
     rig = declared("acrobot", paper_model())
     t = 0.01 * np.arange(30.0)

@@ -902,10 +902,24 @@ MUTANTS = (
         f"{SENSORS}what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information",
     ),
     Mutant(
+        "a machine's file written with MuJoCo's own six digits",
+        "machines/spec.py",
+        "DIGITS = 15",
+        "DIGITS = 6",
+        "test_written_back.py::test_a_written_file_is_that_of_its_owner",
+    ),
+    Mutant(
+        "a held body placed along the axes of the world",
+        "machines/locked.py",
+        "turns[parent].T @ (places[i] - places[parent])",
+        "places[i] - places[parent]",
+        "test_locked.py::test_mass_and_bias_are_those_of_the_whole_with_joints_held[a tree]",
+    ),
+    Mutant(
         "friction written back with the other sign",
         "export/friction.py",
-        "-torque * weight)",
-        "torque * weight)",
+        "nearest(v, torque,",
+        "nearest(v, -torque,",
         "test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve",
     ),
     Mutant(

@@ -1,17 +1,23 @@
 """A part of a machine file: joints that are held, against MuJoCo's own model of the whole with those joints held."""
 
+import dataclasses
 import re
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from machines import arm
 
+from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import RigError, RigWarning, read_rig, write_rig
 from nnap_em.em.build import build_system
-from nnap_em.machines.mjcf import MachineError, Part, read_machine
+from nnap_em.export.mjcf import write_mjcf
+from nnap_em.fit.identify import begin
+from nnap_em.machines.mjcf import Part, read_machine
+from nnap_em.machines.source import MachineError
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -247,3 +253,26 @@ def test_a_written_rig_holds_the_same_joints(tmp_path):
     rig = read_rig(path, specs)
     write_rig(rig, tmp_path / "again.toml")
     assert read_rig(tmp_path / "again.toml", specs) == rig
+
+
+def test_a_part_is_written_back_as_the_part(tmp_path):
+    """Without the held joints and what hung on them; sites of joined bodies stand where they stood."""
+    line = "locked = { finger1 = 0.0, finger2 = 0.0, wrist = 0.9, elbow = 0.0 }"
+    rig = read_rig(_rig(tmp_path, GRIPPER, line, measured="yaw"), specs)
+    rig = dataclasses.replace(rig, measured=("yaw", "slide", "tool"))
+    t = 0.01 * np.arange(30.0)[None]
+    logs = Dataset(t, np.zeros((1, 30, 0)), np.repeat(np.sin(t)[..., None], 3, axis=2), np.ones((1, 30), bool))
+    fitted = begin(rig, logs, key=jax.random.key(0))
+    write_mjcf(fitted, tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert [model.joint(j).name for j in range(model.njnt)] == ["yaw", "slide", "tool"]
+    assert (model.nbody, model.neq, model.ntendon, model.site("tip").id) == (3, 0, 0, 0)
+    data, whole = mujoco.MjData(model), _whole(GRIPPER)
+    mass, other = np.zeros((3, 3)), mujoco.MjData(whole)
+    data.qpos[:] = other.qpos[[0, 2, 4]] = 0.3, -0.05, 0.7
+    other.qpos[[1, 3, 5, 6]] = 0.0, 0.9, 0.0, 0.0
+    for one, of in ((data, model), (other, whole)):
+        mujoco.mj_forward(of, one)
+    mujoco.mj_fullM(model, data, mass)
+    np.testing.assert_allclose(mass, fitted.model.system.mass(jnp.asarray(data.qpos)), atol=1e-12)
+    np.testing.assert_allclose(data.site("tip").xpos, other.site("tip").xpos, atol=1e-12)

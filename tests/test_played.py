@@ -26,7 +26,8 @@ from nnap_em.export.model import ExportError
 from nnap_em.export.placement import NO_PLACE, PLACES
 from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
-from nnap_em.machines.mjcf import MachineError, read_machine
+from nnap_em.machines.mjcf import read_machine
+from nnap_em.machines.source import MachineError
 from nnap_em.systems import specs
 
 a, c = jnp.asarray, catalogue

@@ -10,7 +10,8 @@ from machines import tree
 
 from nnap_em.data.rig import Declared, RigWarning, read_rig
 from nnap_em.draft.from_machine import draft_machine
-from nnap_em.machines.mjcf import MachineError, Part, read_machine
+from nnap_em.machines.mjcf import Part, read_machine
+from nnap_em.machines.source import MachineError
 from nnap_em.systems import specs
 
 MASS = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -181,6 +182,20 @@ def test_a_message_about_an_included_file_names_it(tmp_path, included):
     (tmp_path / "m.xml").write_text(f"<mujoco>{inner}</mujoco>")
     place = "line 3 of inner.xml" if included else "line 3"
     with pytest.raises(MachineError, match=rf"unrecognized attribute: 'axs' Element 'joint', {place};"):
+        read_machine(tmp_path / "m.xml")
+
+
+def test_an_element_of_an_included_file_is_named_with_it(tmp_path):
+    (tmp_path / "inner.xml").write_text(
+        '<mujoco><worldbody>\n<body name="b"><joint name="a"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "m.xml").write_text('<mujoco>\n\n\n<include file="inner.xml"/></mujoco>')
+    with pytest.raises(MachineError, match=r"Element name 'b', line 2 of inner.xml, id 1; give every body that moves"):
+        read_machine(tmp_path / "m.xml")
+    (tmp_path / "inner.xml").unlink()
+    with pytest.raises(
+        MachineError, match=r"'inner.xml' Element 'include', line 4; put the included file where the main"
+    ):
         read_machine(tmp_path / "m.xml")
 
 

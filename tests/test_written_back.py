@@ -131,6 +131,79 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     assert again.joint_sensors == machine.joint_sensors
 
 
+OWNED = """<mujoco model="owned">
+<!-- the arm by the window -->
+<compiler meshdir="meshes"/>
+<default><joint damping="0.3"/><default class="red"><geom rgba="1 0 0 1"/><joint armature="0.0123456789012"/></default></default>
+<asset><mesh name="hull" file="hull.obj"/></asset>
+<worldbody><geom name="floor" type="plane" size="1 1 0.1"/><frame pos="0 0 0.1" euler="0 0 30">
+  <body name="upper" childclass="red"><joint name="a" axis="0 1 0" range="-90 90"/>
+    <geom name="tube" type="capsule" fromto="0 0 0 0.3333333333333 0 0" size="0.02"/>
+    <body name="lower" pos="0.3333333333333 0 0"><joint name="b" axis="0 1 0"/>
+      <inertial pos="0.1 0 0" mass="0.3" diaginertia="0.001 0.002 0.002"/><geom name="shell" type="mesh" mesh="hull"/>
+    </body></body></frame></worldbody>
+<contact><exclude body1="upper" body2="lower"/></contact>
+<actuator><motor name="m" joint="a" gear="2" ctrlrange="-3 3"/></actuator>
+<sensor><jointpos name="encoder" joint="a"/></sensor>
+</mujoco>"""  # noqa: E501
+HULL = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+OWNED_RIG = """format = 1
+name = "owned"
+[model]
+type = "mjcf"
+file = "owned.xml"
+friction = "none"
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["encoder", "b"]
+"""
+
+
+def _owned(folder: Path) -> Identified:
+    """A fit of a machine with shapes, one of them in a file, frames, classes and degrees."""
+    (folder / "meshes").mkdir()
+    for name, text in {"owned.xml": OWNED, "rig.toml": OWNED_RIG, "meshes/hull.obj": HULL}.items():
+        (folder / name).write_text(text)
+    t = 0.01 * np.arange(30.0)[None]
+    read = np.stack([np.sin(t), np.cos(t)], -1)
+    logs = machine_files.Dataset(t, np.sin(t)[..., None], read, np.ones((1, 30), bool))
+    return begin(read_rig(folder / "rig.toml", specs), logs, key=jax.random.key(0))
+
+
+def test_a_written_file_is_that_of_its_owner(tmp_path):
+    """Shapes, classes, frames, limits, the comment; mass matrix and bias to 1e-12 of their size."""
+    (tmp_path / "elsewhere").mkdir()
+    assert write_mjcf(_owned(tmp_path), tmp_path / "elsewhere" / "out.xml") == []
+    text = (tmp_path / "elsewhere" / "out.xml").read_text()
+    for part in ("the arm by the window", 'meshdir="../meshes"', '<default class="red">', "<frame", "<exclude"):
+        assert part in text
+    one, other = (mujoco.MjModel.from_xml_path(str(tmp_path / file)) for file in ("owned.xml", "elsewhere/out.xml"))
+    for field in ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rgba", "jnt_range", "actuator_ctrlrange"):
+        np.testing.assert_allclose(getattr(other, field), getattr(one, field), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose([other.dof_armature, other.dof_damping], [[0.0123456789012] * 2, [0.3] * 2], rtol=1e-14)
+    assert [other.geom(i).name for i in range(other.ngeom)] == ["floor", "tube", "shell"]
+    for q, v in np.random.default_rng(0).uniform(-3.0, 3.0, (5, 2, 2)):
+        for ours, theirs in zip(_physics(other, q, v), _physics(one, q, v), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_a_file_is_written_where_its_meshes_are_gone(tmp_path):
+    fitted = _owned(tmp_path)
+    (tmp_path / "meshes" / "hull.obj").unlink()
+    write_mjcf(fitted, tmp_path / "out.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "tube"]
+
+
+def test_a_fit_that_has_no_machine_file_is_refused(tmp_path):
+    fitted = _begun()
+    with pytest.raises(ExportError, match="before fits held their machine's file; identify again"):
+        write_mjcf(fitted._replace(rig=dataclasses.replace(fitted.rig, file="")), tmp_path / "out.xml")
+
+
 def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_told(tmp_path):
     spring = TorsionalSpring.of(0.8, 0.4, 0.0, 0.0, joint=2)
     effects = (spring, Payload(jnp.asarray(0.1), joint=2), Cogging.of(0.1, 0.0, 6.0, joint=1))
@@ -158,6 +231,15 @@ def test_a_dip_and_a_constant_are_read_off_a_curve():
     level = 0.3 + 0.2 * np.exp(-((v / 0.15) ** 2))
     form = friction_form(v, 0.05 - level * np.tanh(v / 0.02) - 0.2 * v, np.full(160, 0.001))
     np.testing.assert_allclose(form[:6], [0.3, 0.5, 0.15, 0.2, 0.05, 0.02], rtol=0.01)
+
+
+def test_a_dip_that_the_sign_hides_is_none():
+    """Friction that rises over 2 rad/s, a little faster at first: no torque breaks away."""
+    v = np.linspace(-8.0, 8.0, 160)
+    form = friction_form(v, -(0.3 + 0.6 * np.exp(-((v / 0.5) ** 2))) * np.tanh(v / 2.0), np.full(160, 1e-3))
+    assert form.breakaway == form.coulomb
+    form = friction_form(v, 0 * v, np.full(160, 1e-3))
+    assert (form.coulomb, form.breakaway, form.viscous, form.missed) == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_a_built_in_machine_has_no_file(tmp_path):

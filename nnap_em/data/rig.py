@@ -96,6 +96,7 @@ class Declaration(NamedTuple):
     input_kinds: tuple[str, ...] = ()
     input_scales: Mapping[str, Mapping[str, float]] = {}
     equations: str = ""
+    file: str = ""
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Rig:
     equations: str = ""  # of a plant that is written as equations: all of them, as `equations.Text.packed` writes them
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)  # ends of sensors: not read
     horizon: float | None = None  # s; how far predictions are used, of equations; None: by their time constants
+    file: str = dataclasses.field(default="", compare=False)  # MJCF of the machine, with shapes: to be written back
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -227,6 +229,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         equations=declaration.equations,
         ranges=ranges,
         horizon=sampling.positive("horizon") if "horizon" in sampling.items else None,
+        file=declaration.file,
     )
 
 

@@ -3,15 +3,14 @@
 import dataclasses
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..data.formats import write_csv
-from ..fit.identify import Identified, friction_table
+from ..fit.identify import Identified
 from ..fit.predict import drawn_paths
 from ..systems.tree import Tree
-from .friction import FrictionForm, declared_friction, even_nodes, friction_form
+from .friction import FrictionForm, friction_forms
 from .mjcf import write_variant
 
 TABLE = "draws.csv"
@@ -37,7 +36,7 @@ def write_draws(fitted: Identified, out: Path | str, count: int, *, key: PRNGKey
         drawn = paths.prior.write(paths.model, paths.parameters[i])
         if isinstance(drawn.system, Tree):
             drawn = _physical(drawn, paths.model)
-        forms = _forms(fitted, np.asarray(paths.tables[i]))
+        forms = friction_forms(fitted, np.asarray(paths.tables[i]))
         row: dict[str, float] = {"draw": i}
         for name, form in zip(drawn.system.coordinates, forms, strict=True):
             row |= {f"{name}.{what}": getattr(form, what) for what in FrictionForm._fields[:5]}
@@ -55,17 +54,3 @@ def write_draws(fitted: Identified, out: Path | str, count: int, *, key: PRNGKey
 def _physical(drawn, model):
     """A draw whose bodies can be, on the way from those of the fit."""
     return dataclasses.replace(drawn, system=drawn.system.reached_from(model.system))
-
-
-def _forms(fitted: Identified, table: np.ndarray) -> list[FrictionForm]:
-    """Friction of one draw: the learned curve with a deviation at the nodes."""
-    if not fitted.rig.friction:
-        return declared_friction(fitted.model.system)
-    velocity = even_nodes(fitted)
-    learned = friction_table(fitted, jnp.asarray(velocity))
-    nodes = np.asarray(fitted.m_step.weights(fitted.model).nodes)
-    out = []
-    for j, v in enumerate(velocity):
-        torque = np.asarray(learned.torque[j]) + np.interp(v, nodes[j], table[j])
-        out.append(friction_form(v, torque, np.asarray(learned.std[j])))
-    return out

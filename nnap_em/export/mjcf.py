@@ -1,27 +1,28 @@
 """An identified machine written back as MJCF: bodies, friction, and every law that MuJoCo has a place for."""
 
 import math
-import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from .. import __version__
-from ..data.machine import Joint
+from ..data.servo import TORQUE
 from ..effects import AbstractEffect
+from ..effects.presliding import PreslidingFriction
 from ..fit.identify import Identified
+from ..machines.spec import compiled, mujoco, written
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .actuator import actuator
-from .content import Bristle, Contact, Content, Drive, JointContent, SensorContent
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .model import ExportError
-from .placement import file_springs, placed
+from .placement import Drive, OpenFile, acting_on, late, passive, placed, rotor, sensor
 
 LONGEST_STEP = 5e-4
 """Longest time step of a written file [s]."""
@@ -29,12 +30,10 @@ SHORTEST = 5e-5
 """Shortest time step of a written file [s]."""
 LARGEST_RELAXATION = 1.5
 """Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
-SOFT = 1e-4
-"""Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
-ROOM = 10
-"""Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step."""
-MASSLESS = 1e-12
-"""Mass of the body that carries a rotor [kg], whose inertia is the armature of its joint."""
+
+
+Bristle = tuple[float, float]
+"""Stiffness [N m/rad or N/m] and damping [N m s/rad or N s/m] of a LuGre bristle."""
 
 
 class Motor(NamedTuple):
@@ -46,6 +45,8 @@ class Motor(NamedTuple):
     gear: float
     unit: float
     """Command of the fit for a unit of the control."""
+    kind: str = TORQUE
+    """Kind of the actuator in the file that came in, one of `servo.KINDS`."""
 
 
 def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> list[str]:
@@ -79,8 +80,10 @@ def write_variant(
         raise ExportError(
             "its inputs are commands of servos, which MJCF here has no form for; write --urdf or --c instead"
         )
-    content, unplaced = placed(content_of(fitted, model, system, forms), model.effects)
-    content = with_dips(content)
+    if not fitted.rig.file:
+        raise ExportError("it is from before fits held their machine's file; identify again")
+    file, bristles = _opened(fitted, model, system, forms)
+    unplaced = placed(file, model.effects)
     if alone and unplaced:
         effect, reason = unplaced[0]
         raise ExportError(
@@ -97,14 +100,18 @@ def write_variant(
         f"{named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
         for effect, reason in unplaced
     ]
-    root = _model(content, motors_of(fitted, system))
+    _springs(file)
+    _bristled(file, forms, bristles)
+    _noise(file, np.exp(0.5 * np.asarray(model.log_r)))
+    for motor, element in zip(motors_of(fitted, system), list(file.spec.actuators), strict=False):
+        _motor(file, motor, element)
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
-    comment = f" Written by nnap_em {__version__} from {system.machine.file}.  No shapes.  Not in here:{notes} "
-    root.insert(0, ET.Comment(comment.replace("--", "- -")))
-    ET.indent(root)
+    comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
+    file.spec.comment = f"{file.spec.comment}\n {comment.replace('--', '- -')}"
+    file.spec.compile()
     if acting and acting.plays:
         replace_text(beside(out), acting.text)
-    replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
+    replace_text(out, written(file.spec, out.parent))
     return left
 
 
@@ -127,34 +134,12 @@ def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
     return true
 
 
-def content_of(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> Content:
-    """The content of a machine before its laws."""
-    noise = np.exp(0.5 * np.asarray(model.log_r))
-    sensors = {name: SensorContent(noise=float(std)) for name, std in zip(fitted.rig.measured, noise, strict=True)}
-    joints = tuple(JointContent(form=form) for form in forms)
-    drives = {joint: Drive() for joint in system.joints}
-    return file_springs(Content(system, system.machine.gravity, model.dt, joints, drives, sensors))
-
-
-def with_dips(content: Content) -> Content:
-    """The content with a stiff bristle at every joint whose friction dips: MuJoCo has a dip only there."""
-    inertia = 1 / _mobility(content.system)
-    for number, joint in enumerate(content.joints, 1):
-        form = joint.form
-        if joint.bristle is None and form.breakaway > form.coulomb:
-            soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * content.dt)
-            stiffness = min(soft, LARGEST_RELAXATION * _level(form) / (form.fastest * LONGEST_STEP))
-            bristle = Bristle(stiffness, float(np.sqrt(stiffness * inertia[number - 1])))
-            content = content.with_joint(number, bristle=bristle)
-    return content
-
-
 def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
     """Actuators of the file, then those of joints that the rig drives without one."""
     machine = system.machine
     inputs = dict(zip(system.joints, system.gears or (1.0,) * len(system.joints), strict=True))
     motors = [
-        Motor(motor.name, motor.joint, motor.gear, motor.gear / inputs.get(motor.joint + 1, motor.gear))
+        Motor(motor.name, motor.joint, motor.gear, motor.gear / inputs.get(motor.joint + 1, motor.gear), motor.kind)
         for motor in machine.motors
     ]
     driven = {motor.joint + 1 for motor in motors}
@@ -169,40 +154,63 @@ def named(effect: AbstractEffect) -> str:
     return f"{effect.name}{at}{': ' + values if values else ''}"
 
 
-# --- XML
+def _opened(
+    fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]
+) -> tuple[OpenFile, Mapping[int, Bristle]]:
+    """The machine's file with the numbers of the fit, before its laws, and the bristles of its joints."""
+    spec, machine = mujoco().MjSpec.from_string(fitted.rig.file), system.machine
+    simulated = compiled(Path(machine.file), spec)
+    _bodies(simulated, system)
+    mobility, bristles = _mobility(system), {}
+    for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
+        bristles |= _bristle(j, form, model, 1 / mobility[j])
+        simulated.dof_armature[j] = float(system.values.get(f"{joint.name}.armature", joint.armature))
+        simulated.dof_damping[j], simulated.dof_dampingpoly[j] = form.viscous, 0.0
+        simulated.dof_frictionloss[j] = 0.0 if j in bristles else form.coulomb
+    spec.copy_back(simulated)
+    for motor, element in zip(machine.motors, list(spec.actuators), strict=True):
+        element.name = motor.name
+    step = model.dt / math.ceil(model.dt / _longest_step(forms, bristles) - 1e-9)
+    spec.option.timestep, spec.option.integrator = step, int(mujoco().mjtIntegrator.mjINT_RK4)
+    pull = np.zeros((len(forms), 4))
+    for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
+        stiffness = float(system.values.get(f"{joint.name}.stiffness", joint.stiffness))
+        pull[j, :2] = stiffness * joint.rest + form.offset, -stiffness
+    drives = {joint: Drive() for joint in system.joints}
+    file = OpenFile(spec, system, fitted.rig.measured, model.dt, step, mobility, pull, drives)
+    for motor in motors_of(fitted, system)[len(machine.motors) :]:
+        acting_on(file, machine.joints[motor.joint].name, motor.name, motor.gear)
+    return file, bristles
 
 
-def _model(content: Content, motors: Sequence[Motor]) -> ET.Element:
-    machine = content.system.machine
-    root = ET.Element("mujoco", model=Path(machine.file).stem)
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    step = content.dt / math.ceil(content.dt / _longest_step(content) - 1e-9)
-    ET.SubElement(root, "option", timestep=_text(step), integrator="RK4", gravity=_text(*content.gravity))
-    world = ET.SubElement(root, "worldbody")
-    mobility = _mobility(content.system)
-    places = _bodies(world, content, mobility)
-    tendons = ET.Element("tendon")
-    for j, joint in enumerate(content.joints):
-        if joint.rotor is not None:
-            _rotor(world, tendons, machine.joints[j].name, joint, mobility[j])
-    if len(tendons):
-        root.append(tendons)
-    actuators = ET.SubElement(root, "actuator")
-    for motor in motors:
-        _motor(actuators, content, motor, step)
-    for j, joint in enumerate(content.joints):
-        _passive(actuators, machine.joints[j].name, joint)
-    _sensors(ET.SubElement(root, "sensor"), content, places, world, step)
-    return root
+def _bodies(simulated: Any, system: Tree) -> None:
+    """Set mass, centre and inertia of the bodies of MuJoCo's model that have others than in the file."""
+    for i, body in enumerate(system.machine.bodies, 1):
+        mass, centre, inertia = (np.asarray(number, float) for number in system.body_numbers(i - 1))
+        if mass != body.mass or np.any(centre != body.centre) or np.any(inertia != body.inertia):
+            simulated.body_mass[i], simulated.body_ipos[i] = mass, centre
+            simulated.body_inertia[i], axes = np.linalg.eigh(inertia)
+            axes[:, 2] *= np.linalg.det(axes)
+            mujoco().mju_mat2Quat(simulated.body_iquat[i], axes.ravel())
 
 
-def _longest_step(content: Content) -> float:
+def _bristle(j: int, form: FrictionForm, model: StateSpaceModel, inertia: float) -> dict[int, Bristle]:
+    """Bristle of a joint by law or, a stiff one, where its friction dips: MuJoCo has a dip only there."""
+    if form.breakaway <= 0:
+        return {}
+    for effect in model.effects:
+        if isinstance(effect, PreslidingFriction) and effect.joint == j + 1:
+            return {j: (float(np.exp(effect.log_sigma)), max(float(effect.damping), 0.0))}
+    if form.breakaway <= form.coulomb:
+        return {}
+    soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * model.dt)
+    stiffness = min(soft, LARGEST_RELAXATION * _level(form) / (form.fastest * LONGEST_STEP))
+    return {j: (stiffness, float(np.sqrt(stiffness * inertia)))}
+
+
+def _longest_step(forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> float:
     """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
-    rates = [
-        laws.bristle.stiffness * laws.form.fastest / _level(laws.form)
-        for laws in content.joints
-        if laws.bristle is not None and _bristled(laws)
-    ]
+    rates = [stiffness * forms[j].fastest / _level(forms[j]) for j, (stiffness, _) in bristles.items()]
     return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), SHORTEST)
 
 
@@ -211,191 +219,56 @@ def _level(form: FrictionForm) -> float:
     return max(form.coulomb, 1e-2 * form.breakaway)
 
 
-def _mobility(system: Tree) -> np.ndarray:
-    """Acceleration of every joint per force at it, with all joints as declared: MuJoCo scales contacts by it."""
+def _mobility(system: Tree) -> Float[np.ndarray, " dof"]:
     still = jnp.asarray([joint.zero for joint in system.machine.joints], float)
     return np.diagonal(np.linalg.inv(np.asarray(system.mass(still))))
 
 
-def _bodies(world: ET.Element, content: Content, mobility: np.ndarray) -> list[ET.Element]:
-    machine, places = content.system.machine, []
-    for i, body in enumerate(machine.bodies):
-        element = ET.SubElement(
-            places[body.parent] if body.parent >= 0 else world,
-            "body",
-            name=body.name,
-            pos=_text(*body.place),
-            xyaxes=_text(*(row[0] for row in body.turn), *(row[1] for row in body.turn)),
-        )
-        places.append(element)
-        for j, joint in enumerate(machine.joints):
-            if joint.body == i:
-                ET.SubElement(element, "joint", _joint(content, joint, content.joints[j], mobility[j]))
-        mass, centre, inertia = content.system.body_numbers(i)
-        if float(mass) > 0:
-            full = [inertia[a][b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-            ET.SubElement(element, "inertial", pos=_text(*centre), mass=_text(mass), fullinertia=_text(*full))
-        for site in machine.sites:
-            if site.body == i:
-                ET.SubElement(element, "site", name=site.name, pos=_text(*site.place))
-    return places
+def _springs(file: OpenFile) -> None:
+    """Write the pull at every joint: stiffness about a rest, and a constant that has no rest as a passive motor."""
+    for joint, (a, b, c, d) in zip(file.system.machine.joints, file.pull.tolist(), strict=True):
+        element, rest = file.spec.joint(joint.name), _rest(a, b, c, d)
+        slopes = [-(b + rest * (2 * c + 3 * d * rest)), -(c + 3 * d * rest), -d]
+        element.stiffness, element.springref = slopes, rest if any((b, c, d)) else element.springref
+        constant = a + rest * (b + rest * (c + rest * d))
+        if abs(constant) > 1e-12 * abs(a):
+            passive(file, joint.name, "offset", cogging=(constant, 0.0, 0.5 * math.pi))
 
 
-def _joint(content: Content, joint: Joint, laws: JointContent, mobility: float) -> dict[str, str]:
-    """Attributes of a joint, those aside that are MuJoCo's own."""
-    viscous, bristled = laws.form.viscous + laws.viscous, _bristled(laws)
-    attributes = {
-        "name": joint.name,
-        "type": "slide" if joint.slide else "hinge",
-        "axis": _text(*joint.axis),
-        "pos": _text(*joint.anchor),
-        "armature": _text(content.system.values.get(f"{joint.name}.armature", joint.armature)),
-        "damping": _text(viscous, laws.drag) if laws.drag else _text(viscous),
-        "frictionloss": _text(0.0 if bristled else laws.form.coulomb),
-    }
-    attributes |= {"ref": _text(joint.zero)} if joint.zero else {}
-    attributes |= _spring(laws)
-    if laws.stop is not None:
-        return attributes | {"range": _text(laws.stop.low, laws.stop.high)} | _contact(laws.stop, mobility, "limit")
-    return attributes | ({"range": _text(*joint.range)} if joint.range else {})
-
-
-def _spring(laws: JointContent) -> dict[str, str]:
-    """Stiffness and rest of a pull; a constant that has no rest goes to `_passive`."""
-    rest = _rest(laws)
-    if not any(laws.pull[1:]):
-        return {}
-    _, b, c, d = laws.pull
-    slopes = -(b + rest * (2 * c + 3 * d * rest)), -(c + 3 * d * rest), -d
-    return {"stiffness": _text(*(slopes if c or d else slopes[:1])), "springref": _text(rest)}
-
-
-def _rest(laws: JointContent) -> float:
-    """Stable equilibrium of the springs, the stiffest if there are several; 0 where there is none."""
-    a, b, c, d = laws.pull
+def _rest(a: float, b: float, c: float, d: float) -> float:
+    """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
     real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])
     return float(min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0))
 
 
-def _contact(contact: Contact, mobility: float, of: str) -> dict[str, str]:
-    """Solver parameters of a limit that is a spring and a damper."""
-    return {
-        f"solref{of}": _text(-contact.stiffness * mobility, -contact.damping * mobility),
-        f"solimp{of}": _text(SOFT, SOFT, 1.0, 0.5, 1.0),
-    }
+def _bristled(file: OpenFile, forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> None:
+    for j, bristle in bristles.items():
+        numbers = (*bristle, _level(forms[j]), forms[j].breakaway, forms[j].stribeck)
+        passive(file, file.system.machine.joints[j].name, "bristle", lugre=numbers)
 
 
-def _rotor(world: ET.Element, tendons: ET.Element, name: str, laws: JointContent, mobility: float) -> None:
-    """The motor as a wheel of its own, joined to its joint by a tendon."""
-    rotor = laws.rotor
-    assert rotor is not None
-    body = ET.SubElement(world, "body", name=f"{name}_rotor")
-    ET.SubElement(body, "joint", name=f"{name}_rotor", type="hinge", axis="0 0 1", armature=_text(rotor.inertia))
-    tiny = _text(MASSLESS)
-    ET.SubElement(body, "inertial", pos="0 0 0", mass=tiny, diaginertia=f"{tiny} {tiny} {tiny}")
-    attributes = {"name": f"{name}_transmission"}
-    if rotor.play is None:
-        attributes |= {"stiffness": _text(rotor.stiffness), "damping": _text(rotor.damping), "springlength": "0"}
-    else:
-        attributes |= {"range": _text(rotor.play.low, rotor.play.high)}
-        attributes |= _contact(rotor.play, mobility + 1 / (rotor.inertia + MASSLESS), "limit")
-    tendon = ET.SubElement(tendons, "fixed", attributes)
-    ET.SubElement(tendon, "joint", joint=f"{name}_rotor", coef="1")
-    ET.SubElement(tendon, "joint", joint=name, coef="-1")
+def _noise(file: OpenFile, noise: Float[np.ndarray, " obs"]) -> None:
+    for column, std in reversed(list(zip(file.measured, noise.tolist(), strict=True))):  # the first of a sensor stays
+        if (element := sensor(file, column)) is not None:
+            element.noise = std
 
 
-def _motor(actuators: ET.Element, content: Content, motor: Motor, step: float) -> None:
-    name, joint = content.system.machine.joints[motor.joint].name, content.joints[motor.joint]
-    attributes = {"name": motor.name, "joint": f"{name}_rotor" if joint.rotor else name, "gear": _text(motor.gear)}
-    drive = content.drives.get(motor.joint + 1, Drive())
-    options = _drive(drive, abs(motor.unit), step)
-    ET.SubElement(actuators, "general" if {"gainprm", "dyntype"} & set(options) else "motor", attributes | options)
-
-
-def _drive(drive: Drive, unit: float, step: float) -> dict[str, str]:
-    """Attributes of the way from a control to a force; the state of a lag is held over a step, half a step late."""
-    attributes = {}
+def _motor(file: OpenFile, motor: Motor, element: Any) -> None:
+    """The way from a control to a force; the state of a lag is held over a step, half a step late."""
+    joint, unit = file.system.machine.joints[motor.joint], abs(motor.unit)
+    drive = file.drives.get(motor.joint + 1, Drive())
+    if motor.kind != TORQUE:
+        element.set_to_motor()
+    if file.spec.joint(rotor(joint.name)) is not None:
+        element.target = rotor(joint.name)
     if math.isfinite(drive.before):
-        attributes["ctrlrange"] = _text(-drive.before / unit, drive.before / unit)
+        element.ctrllimited, element.ctrlrange = True, [-drive.before / unit, drive.before / unit]
     if math.isfinite(drive.after):
-        attributes["forcerange"] = _text(-drive.after / unit, drive.after / unit)
-    if drive.delay > 0:
-        attributes |= _late(drive.delay, step)
+        after = drive.after * abs(element.gainprm[0]) / unit
+        element.forcelimited, element.forcerange = True, [-after, after]
+    late(element, drive.delay, file.step)
     if drive.lag:
-        attributes |= {"dyntype": "filterexact", "dynprm": _text(max(drive.lag - 0.5 * step, 0.05 * step))}
-    if drive.gain != 1:
-        attributes["gainprm"] = _text(drive.gain)
-    return attributes
-
-
-def _late(delay: float, step: float) -> dict[str, str]:
-    """Attributes of a delay, interpolated between steps; MuJoCo's shortest is one step."""
-    late = max(delay + 0.5 * step, step)  # interpolation begins to rise half a step early, on average
-    return {"delay": _text(late), "nsample": str(ROOM * (math.ceil(delay / step) + 1)), "interp": "linear"}
-
-
-def _passive(actuators: ET.Element, name: str, laws: JointContent) -> None:
-    """Torques of a joint that MuJoCo has as those of a passive motor: cogging, a bristle, a constant."""
-    still = {"joint": name, "input": "none", "motorconst": "0", "resistance": "1"}
-
-    def add(what: str, **attributes: str) -> None:
-        ET.SubElement(actuators, "dcmotor", {"name": f"{name}_{what}", **still, **attributes})
-
-    for i, (amplitude, k, phase) in enumerate(laws.tones, 1):  # poles are whole numbers: k is a gear
-        add(f"cogging{i}", gear=_text(k), cogging=_text(amplitude / k, 1.0, phase))
-    constant = laws.form.offset + _unheld(laws)
-    if constant:
-        add("offset", cogging=_text(constant, 0.0, 0.5 * math.pi))
-    if _bristled(laws):
-        form, bristle = laws.form, laws.bristle
-        assert bristle is not None
-        add("bristle", lugre=_text(*bristle, _level(form), form.breakaway, form.stribeck))
-
-
-def _unheld(laws: JointContent) -> float:
-    """Constant pull that no rest holds."""
-    a, b, c, d = laws.pull
-    rest = _rest(laws)
-    return a + rest * (b + rest * (c + rest * d)) if abs(a) > 0 else 0.0
-
-
-def _bristled(laws: JointContent) -> bool:
-    return laws.bristle is not None and laws.form.breakaway > 0
-
-
-def _sensors(
-    sensors: ET.Element, content: Content, bodies: Sequence[ET.Element], base: ET.Element, step: float
-) -> None:
-    machine = content.system.machine
-    named = {sensor.name for sensor in machine.joint_sensors}
-    for sensor in machine.joint_sensors:
-        kind = "jointvel" if sensor.rate else "jointpos"
-        attributes = {"name": sensor.name, "joint": machine.joints[sensor.joint].name}
-        ET.SubElement(sensors, kind, attributes | _reading(content.sensors.get(sensor.name), step))
-    dof = len(machine.joints)
-    for name, sensor in content.sensors.items():
-        if name in named or name not in machine.states or not sensor.delay:
-            continue
-        place = machine.states.index(name)
-        kind = "jointvel" if place >= dof else "jointpos"
-        attributes = {"name": name, "joint": machine.joints[place % dof].name}
-        ET.SubElement(sensors, kind, attributes | _reading(sensor, step))
-    for name, sensor in {one.name.rpartition(".")[0]: one for one in machine.sensors}.items():
-        axes = _text(*(row[0] for row in sensor.turn), *(row[1] for row in sensor.turn))
-        where = bodies[sensor.body] if sensor.body >= 0 else base
-        ET.SubElement(where, "site", name=f"{name}_site", pos=_text(*sensor.place), xyaxes=axes)
-        at = {"objtype": "site", "objname": f"{name}_site"} if sensor.kind == "framepos" else {"site": f"{name}_site"}
-        reading = next((content.sensors[f"{name}.{x}"] for x in "xyz" if f"{name}.{x}" in content.sensors), None)
-        ET.SubElement(sensors, sensor.kind, {"name": name, **at, **_reading(reading, step)})
-
-
-def _reading(sensor: SensorContent | None, step: float) -> dict[str, str]:
-    """Noise and delay of a sensor."""
-    if sensor is None:
-        return {}
-    return {"noise": _text(sensor.noise)} | (_late(sensor.delay, step) if sensor.delay > 0 else {})
-
-
-def _text(*values) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)
+        element.dyntype = mujoco().mjtDyn.mjDYN_FILTEREXACT
+        element.dynprm[0] = max(drive.lag - 0.5 * file.step, 0.05 * file.step)
+    element.gainprm[0] *= drive.gain

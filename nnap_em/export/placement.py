@@ -1,32 +1,76 @@
-"""The table from a law to its place in MuJoCo: one entry a law, each a function that adds it to a file's content."""
+"""The table from a law to its place in MuJoCo: one entry a law, each a function that writes it to a file."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import AbstractEffect
+from ..machines.spec import mujoco
 from ..systems.frames import laid
-from .content import Bristle, Contact, Content, Rotor, added, spring
+from ..systems.tree import Tree
+
+SOFT = 1e-4
+"""Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
+ROOM = 10
+"""Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step."""
+MASSLESS = 1e-12
+"""Mass of the body that carries a rotor [kg], whose inertia is the armature of its joint."""
 
 
 class NoPlace(Exception):
     """A law that no element of MuJoCo holds: the message is the reason."""
 
 
-Place = Callable[[Content, Any], Content]
+class Drive(NamedTuple):
+    """The way from a command to a torque: limit, delay, lag, gain, limit, in this order."""
+
+    before: float = math.inf
+    """Limit of the command, in its unit."""
+    delay: float = 0.0
+    """[s]"""
+    lag: float = 0.0
+    """Time constant [s]."""
+    gain: float = 1.0
+    after: float = math.inf
+    """Limit of what the gain gives, in the unit of the command."""
 
 
-class Placed(NamedTuple):
-    """The content with all laws that MuJoCo holds, and the others with the reason, in the order of the model."""
+class OpenFile(NamedTuple):
+    """The file of a machine while laws are written to it."""
 
-    content: Content
-    unplaced: tuple[tuple[AbstractEffect, str], ...]
+    spec: Any
+    system: Tree
+    """The machine with its estimated numbers, as it is at the first moment of the clock."""
+    measured: tuple[str, ...]
+    """Columns of the readings."""
+    dt: float
+    """Sample interval of the fit [s]."""
+    step: float
+    """Time step of the file [s]."""
+    mobility: Float[np.ndarray, " dof"]
+    """Acceleration of every joint per force at it, with all joints as declared: MuJoCo scales contacts by it."""
+    pull: Float[np.ndarray, "dof 4"]
+    """Force of springs at every joint as a cubic of its coordinate, the constant first [N m or N]."""
+    drives: dict[int, Drive]
+    """Drives by joint, counted from 1."""
+
+    def joint(self, number: int) -> Any:
+        """Joint of the file by its number, counted from 1."""
+        return self.spec.joint(self.system.machine.joints[number - 1].name)
+
+    def with_drive(self, joint: int, **changes: float) -> None:
+        """Change the drive of one joint."""
+        self.drives[joint] = self.drives[joint]._replace(**changes)
 
 
-def placed(content: Content, effects: Sequence[AbstractEffect]) -> Placed:
-    """The content with laws added.
+Place = Callable[[OpenFile, Any], None]
+
+
+def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[AbstractEffect, str], ...]:
+    """Write laws to a file; those without a place, with the reason, in the order of the model.
 
     A law of the command without a place acts before all that the file does with it, so that laws of the command
     which come before it have none either; delays may change places with it.
@@ -37,10 +81,10 @@ def placed(content: Content, effects: Sequence[AbstractEffect]) -> Placed:
         try:
             if follower is not None:
                 raise NoPlace(f"it acts before {follower.name}, which has no place")
-            content = _place(effect)(content, effect)
+            _place(effect)(file, effect)
         except NoPlace as reason:
             unplaced.append((effect, str(reason)))
-    return Placed(content, tuple(unplaced))
+    return tuple(unplaced)
 
 
 def _place(effect: AbstractEffect) -> Place:
@@ -71,140 +115,197 @@ def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect |
 # --- forces at a joint
 
 
-def _spring(content: Content, effect: Any) -> Content:
+def _spring(file: OpenFile, effect: Any) -> None:
     """`stiffness` (a cubic) and `springref` of the joint; since MuJoCo 3.7."""
     pull = float(effect.moment), -float(effect.slope), -float(effect.square), -float(effect.cube)
-    return content.with_joint(effect.joint, pull=added(content.joint(effect.joint).pull, pull))
+    file.pull[effect.joint - 1] += pull
 
 
-def _offset(content: Content, effect: Any) -> Content:
+def _offset(file: OpenFile, effect: Any) -> None:
     """Passive `<dcmotor>`, `cogging` without poles, since MuJoCo 4.0; with a spring its `springref`."""
-    constant = float(effect.value), 0.0, 0.0, 0.0
-    return content.with_joint(effect.joint, pull=added(content.joint(effect.joint).pull, constant))
+    file.pull[effect.joint - 1, 0] += float(effect.value)
 
 
-def _cogging(content: Content, effect: Any) -> Content:
+def _cogging(file: OpenFile, effect: Any) -> None:
     """Passive `<dcmotor cogging=...>`, its `gear` the periods per turn; since MuJoCo 4.0."""
-    k, pairs = float(effect.k), ((effect.sine, effect.cosine), (effect.sine2, effect.cosine2))
-    tones = [
-        (math.hypot(sine, cosine), turn * k, math.atan2(cosine, sine)) for turn, (sine, cosine) in enumerate(pairs, 1)
-    ]
-    tones = [tone for tone in tones if tone[0] > 0]
-    return content.with_joint(effect.joint, tones=(*content.joint(effect.joint).tones, *tones))
+    joint = file.joint(effect.joint).name
+    for turn, sine, cosine in ((1, effect.sine, effect.cosine), (2, effect.sine2, effect.cosine2)):
+        amplitude, k, phase = math.hypot(sine, cosine), turn * float(effect.k), math.atan2(cosine, sine)
+        if amplitude > 0:  # poles are whole numbers: k is a gear
+            number = 1 + sum(one.name.startswith(f"{joint}_cogging") for one in file.spec.actuators)
+            passive(file, joint, f"cogging{number}", gear=k, cogging=(amplitude / k, 1.0, phase))
 
 
-def _stop(content: Content, effect: Any) -> Content:
+def passive(file: OpenFile, joint: str, what: str, gear: float = 1.0, **numbers: Sequence[float]) -> None:
+    """A torque that MuJoCo has as that of a motor without input: cogging, a bristle, a constant."""
+    motor = acting_on(file, joint, f"{joint}_{what}", gear)
+    motor.set_to_dcmotor(
+        motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=int(mujoco().mjtCtrlInput.mjINPUT_NONE), **numbers
+    )
+
+
+def acting_on(file: OpenFile, joint: str, name: str, gear: float) -> Any:
+    """A new motor of a joint, with nothing of the classes of the file."""
+    motor = file.spec.add_actuator(name=name, target=joint, trntype=mujoco().mjtTrn.mjTRN_JOINT)
+    motor.set_to_motor()
+    motor.gear = [gear, 0.0, 0.0, 0.0, 0.0, 0.0]
+    motor.ctrllimited = motor.forcelimited = motor.actlimited = False
+    return motor
+
+
+def _stop(file: OpenFile, effect: Any) -> None:
     """`range` of the joint, a spring and damper that only push; the law also holds back a joint that leaves."""
-    if content.joint(effect.joint).stop is not None:
+    joint = file.joint(effect.joint)
+    if joint.solimp_limit[0] == SOFT:
         raise NoPlace("a joint has one range")
-    numbers = effect.lower, effect.upper, np.exp(effect.stiffness), np.exp(effect.damping)
-    return content.with_joint(effect.joint, stop=Contact(*map(float, numbers)))
+    stiffness, damping = np.exp(effect.stiffness), np.exp(effect.damping)
+    _contact(joint, (effect.lower, effect.upper), stiffness, damping, file.mobility[effect.joint - 1])
 
 
-def _back_emf(content: Content, effect: Any) -> Content:
+def _contact(limited: Any, ends: tuple[Any, Any], stiffness: Any, damping: Any, mobility: Any) -> None:
+    """Limit a joint or tendon by a spring and a damper that push back beyond either end, and never pull."""
+    limited.limited, limited.range = True, [float(end) for end in ends]
+    limited.solref_limit = [-float(stiffness * mobility), -float(damping * mobility)]
+    limited.solimp_limit = [SOFT, SOFT, 1.0, 0.5, 1.0]
+
+
+def _back_emf(file: OpenFile, effect: Any) -> None:
     """`damping` of the joint."""
-    return content.with_joint(effect.joint, viscous=content.joint(effect.joint).viscous + float(effect.b))
+    file.joint(effect.joint).damping[0] += float(effect.b)
 
 
-def _drag(content: Content, effect: Any) -> Content:
+def _drag(file: OpenFile, effect: Any) -> None:
     """`damping` of the joint, quadratic, at a joint; since MuJoCo 3.7."""
     if effect.joint is None:
         raise NoPlace("the drag of one point is no drag of a body")
-    return content.with_joint(effect.joint, drag=content.joint(effect.joint).drag + float(effect.c))
+    file.joint(effect.joint).damping[1] += float(effect.c)
 
 
-def _bristle(content: Content, effect: Any) -> Content:
-    """Passive `<dcmotor input="none" lugre=...>`; since MuJoCo 4.0."""
-    return content.with_joint(
-        effect.joint, bristle=Bristle(float(np.exp(effect.log_sigma)), max(float(effect.damping), 0.0))
-    )
+def _bristle(file: OpenFile, effect: Any) -> None:
+    """Passive `<dcmotor input="none" lugre=...>`; since MuJoCo 4.0."""  # with the friction of its joint
 
 
 # --- bodies and base
 
 
-def _in_bodies(content: Content, effect: Any) -> Content:
+def _in_bodies(file: OpenFile, effect: Any) -> None:
     """Mass, centre and inertia of the body, where the machine of the file has such a variation."""
-    if (effect.name, effect.joint) not in content.system.variations:
+    if (effect.name, effect.joint) not in file.system.variations:
         raise NoPlace("the machine does not vary so")
-    return content
 
 
-def _tilt(content: Content, effect: Any) -> Content:
+def _tilt(file: OpenFile, effect: Any) -> None:
     """`gravity`, where the first joint carries the whole machine."""
-    frames, machine = laid(content.system.text).frames, content.system.machine
+    frames, machine = laid(file.system.text).frames, file.system.machine
     if frames[0].slide or any(frame.before < 0 for frame in frames[1:]):
         raise NoPlace("the first joint does not carry the whole machine")
     axis, angle = np.asarray(frames[0].turn)[:, 2], -float(effect.angle)
     cross = np.cross(np.eye(3), axis)
     turn = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     first = machine.joints[0]
-    stiffness = float(content.system.values.get(f"{first.name}.stiffness", first.stiffness))
-    moved = stiffness * -float(effect.angle), 0.0, 0.0, 0.0  # the law turns the spring of the file, too
-    x, y, z = map(float, turn @ np.asarray(content.gravity))
-    return content.with_joint(1, pull=added(content.joint(1).pull, moved))._replace(gravity=(x, y, z))
+    stiffness = float(file.system.values.get(f"{first.name}.stiffness", first.stiffness))
+    file.pull[0, 0] += stiffness * -float(effect.angle)  # the law turns the spring of the file, too
+    file.spec.option.gravity = turn @ file.spec.option.gravity
 
 
 # --- between command and torque
 
 
-def _gain(content: Content, effect: Any) -> Content:
+def _gain(file: OpenFile, effect: Any) -> None:
     """`gainprm` of the motor."""
-    drive, gain = content.drives[effect.joint], 1 + float(effect.excess)
-    return content.with_drive(effect.joint, gain=drive.gain * gain, after=drive.after * abs(gain))
+    drive, gain = file.drives[effect.joint], 1 + float(effect.excess)
+    file.with_drive(effect.joint, gain=drive.gain * gain, after=drive.after * abs(gain))
 
 
-def _saturation(content: Content, effect: Any) -> Content:
+def _saturation(file: OpenFile, effect: Any) -> None:
     """`ctrlrange` of the motor or, behind a lag, `forcerange`."""
-    drive, limit = content.drives[effect.joint], float(effect.limit)
+    drive, limit = file.drives[effect.joint], float(effect.limit)
     if drive.lag:
-        return content.with_drive(effect.joint, after=min(drive.after, limit))
-    return content.with_drive(effect.joint, before=min(drive.before, limit / abs(drive.gain)))
+        return file.with_drive(effect.joint, after=min(drive.after, limit))
+    return file.with_drive(effect.joint, before=min(drive.before, limit / abs(drive.gain)))
 
 
-def _delay(content: Content, effect: Any) -> Content:
+def _delay(file: OpenFile, effect: Any) -> None:
     """`delay`, `nsample` and `interp="linear"` of the motor; since MuJoCo 3.5."""
-    return content.with_drive(effect.joint, delay=content.drives[effect.joint].delay + max(float(effect.delay), 0.0))
+    file.with_drive(effect.joint, delay=file.drives[effect.joint].delay + max(float(effect.delay), 0.0))
 
 
-def _lag(content: Content, effect: Any) -> Content:
+def _lag(file: OpenFile, effect: Any) -> None:
     """`dyntype="filterexact"` of the motor."""
-    drive = content.drives[effect.joint]
+    drive = file.drives[effect.joint]
     if drive.lag or math.isfinite(drive.after):
         raise NoPlace("an actuator has one state, and no limit before it but that of the command")
-    return content.with_drive(effect.joint, lag=max(float(effect.tau), 0.05 * content.dt))
+    file.with_drive(effect.joint, lag=max(float(effect.tau), 0.05 * file.dt))
 
 
-def _flexibility(content: Content, effect: Any) -> Content:
+def _flexibility(file: OpenFile, effect: Any) -> None:
     """Rotor joined by a `<fixed>` tendon, its spring; the model has one joint more."""
-    inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
-    return _with_rotor(content, effect.joint, Rotor(inertia, k, damping))
+    tendon = _rotor(file, effect.joint, float(np.exp(effect.log_inertia)))
+    tendon.stiffness[0], tendon.damping[0] = float(np.exp(effect.log_k)), float(np.exp(effect.log_damping))
+    tendon.springlength = [0.0, 0.0]
 
 
-def _backlash(content: Content, effect: Any) -> Content:
+def _backlash(file: OpenFile, effect: Any) -> None:
     """Rotor joined by a `<fixed>` tendon, its `range`; the model has one joint more."""
-    inertia, k, damping = (float(np.exp(x)) for x in (effect.log_inertia, effect.log_k, effect.log_damping))
-    half = 0.5 * max(float(effect.gap), 1e-9)
-    return _with_rotor(content, effect.joint, Rotor(inertia, play=Contact(-half, half, k, damping)))
+    inertia, half = float(np.exp(effect.log_inertia)), 0.5 * max(float(effect.gap), 1e-9)
+    tendon, mobility = _rotor(file, effect.joint, inertia), file.mobility[effect.joint - 1] + 1 / (inertia + MASSLESS)
+    _contact(tendon, (-half, half), np.exp(effect.log_k), np.exp(effect.log_damping), mobility)
 
 
-def _with_rotor(content: Content, joint: int, rotor: Rotor) -> Content:
-    if content.joint(joint).rotor is not None:
+def _rotor(file: OpenFile, number: int, inertia: float) -> Any:
+    """The tendon between a joint and its motor, a wheel of its own."""
+    joint = file.joint(number).name
+    name = rotor(joint)
+    if file.spec.joint(name) is not None:
         raise NoPlace("a joint has one motor")
-    return content.with_joint(joint, rotor=rotor)
+    body = file.spec.worldbody.add_body(name=name, mass=MASSLESS, inertia=[MASSLESS] * 3, ipos=[0.0] * 3)
+    body.explicitinertial = True
+    still = {"damping": [0.0] * 3, "stiffness": [0.0] * 3, "frictionloss": 0.0, "limited": False}
+    body.add_joint(name=name, axis=[0.0, 0.0, 1.0], armature=inertia, **still)
+    tendon = file.spec.add_tendon(name=f"{joint}_transmission", armature=0.0, **still)
+    tendon.wrap_joint(name, 1.0)
+    tendon.wrap_joint(joint, -1.0)
+    return tendon
+
+
+def rotor(joint: str) -> str:
+    """Name of the rotor of a joint."""
+    return f"{joint}_rotor"
 
 
 # --- readings
 
 
-def _sensor_delay(content: Content, effect: Any) -> Content:
+def _sensor_delay(file: OpenFile, effect: Any) -> None:
     """`delay`, `nsample` and `interp="linear"` of the sensor; since MuJoCo 3.5."""
-    return content.with_sensors(effect.channel, delay=max(float(effect.delay), 0.0))
+    for column in file.measured:
+        if effect.channel in (column, "all") and (one := sensor(file, column) or _joint_sensor(file, column)):
+            late(one, max(float(effect.delay), 0.0), file.step)
 
 
-def _quantisation(content: Content, effect: Any) -> Content:
+def sensor(file: OpenFile, column: str) -> Any:
+    """The sensor of a column in the file, if it has one."""
+    return file.spec.sensor(column) or file.spec.sensor(column.rpartition(".")[0])
+
+
+def _joint_sensor(file: OpenFile, column: str) -> Any:
+    """A new sensor of a joint, by the name of its state."""
+    machine, kinds = file.system.machine, mujoco().mjtSensor
+    rate, place = divmod(machine.states.index(column), len(machine.joints))
+    kind = kinds.mjSENS_JOINTVEL if rate else kinds.mjSENS_JOINTPOS
+    joint = machine.joints[place].name
+    return file.spec.add_sensor(name=column, type=kind, objtype=mujoco().mjtObj.mjOBJ_JOINT, objname=joint)
+
+
+def late(element: Any, delay: float, step: float) -> None:
+    """Delay a motor or a sensor, interpolated between steps; MuJoCo's shortest delay is one step."""
+    if delay > 0:
+        element.delay = max(delay + 0.5 * step, step)  # interpolation begins to rise half a step early, on average
+        element.nsample, element.interp = ROOM * (math.ceil(delay / step) + 1), 1
+
+
+def _quantisation(file: OpenFile, effect: Any) -> None:
     """`noise` of the sensor, as the fitted noise of the reading has the rounding already."""
-    return content
 
 
 PLACES: Mapping[str, Place] = {
@@ -247,11 +348,3 @@ NO_PLACE: Mapping[str, str] = {
     **dict.fromkeys(("change", "coulomb_change", "viscous_change"), "it is a change since a fit: identify --from"),
 }
 """Reasons against a place for each other law, by name."""
-
-
-def file_springs(content: Content) -> Content:
-    """The content with the springs of the file."""
-    for number, joint in enumerate(content.system.machine.joints, 1):
-        stiffness = float(content.system.values.get(f"{joint.name}.stiffness", joint.stiffness))
-        content = content.with_joint(number, pull=added(content.joint(number).pull, spring(stiffness, joint.rest)))
-    return content

@@ -12,10 +12,9 @@ from ..fit.identify import Identified
 from ..model.servo import Servo
 from ..storage.files import replace_text
 from ..systems.tree import Tree
-from .content import Content, Drive, JointContent
-from .friction import REPORTED_MISS, friction_forms
-from .mjcf import MASSLESS, as_it_is, content_of, named
-from .placement import placed
+from .friction import REPORTED_MISS, FrictionForm, friction_forms
+from .mjcf import as_it_is, named
+from .placement import MASSLESS
 
 URDF_LAWS = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
 """Laws that URDF holds, by name: in the numbers of the bodies and in the damping."""
@@ -39,7 +38,6 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
     out = Path(out)
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
-    content, _ = placed(content_of(fitted, fitted.model, system, forms), fitted.model.effects)
     left = [_of_servo(servo) for servo in fitted.model.servos or () if servo.feeds_back]
     left += [named(effect) for effect in fitted.model.effects if effect.name not in URDF_LAWS]
     for joint, form in zip(system.machine.joints, forms, strict=True):
@@ -52,13 +50,25 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
         ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} ")
     )
     ET.SubElement(root, "link", name=_base(system))
+    numbers = _joints(fitted, forms)
     frames: list[tuple[str, np.ndarray]] = []
     for i, body in enumerate(system.machine.bodies):
         parent, pose = frames[body.parent] if body.parent >= 0 else (_base(system), np.eye(4))
-        frames.append(_body(root, content, i, parent, pose @ _pose(body.turn, body.place)))
+        frames.append(_body(root, system, numbers, i, parent, pose @ _pose(body.turn, body.place)))
     ET.indent(root)
     replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
     return left
+
+
+def _joints(fitted: Identified, forms: list[FrictionForm]) -> list[tuple[float, float, float]]:
+    """Viscous and Coulomb friction of every joint, and the limit of its torque."""
+    numbers = []
+    for j, form in enumerate(forms, 1):
+        laws = [(effect.name, effect.values()) for effect in fitted.model.effects if effect.joint == j]
+        back_emf = sum(float(values["b"]) for name, values in laws if name == "motor_back_emf")
+        limits = [float(values["limit"]) for name, values in laws if name == "saturation"]
+        numbers.append((form.viscous + back_emf, form.coulomb, min(limits, default=NO_LIMIT)))
+    return numbers
 
 
 def _of_servo(servo: Servo) -> str:
@@ -75,9 +85,9 @@ def _armature(system: Tree, joint: Joint) -> float:
     return float(system.values.get(f"{joint.name}.armature", joint.armature))
 
 
-def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
+def _body(root: ET.Element, system: Tree, laws: list, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
     """Links and joints of one body at `pose` in the frame of its parent link; its link, and its frame in there."""
-    machine = content.system.machine
+    machine = system.machine
     body = machine.bodies[i]
     joints = [j for j, joint in enumerate(machine.joints) if joint.body == i]
     for k, j in enumerate(joints):
@@ -89,8 +99,9 @@ def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndar
         ET.SubElement(element, "parent", link=parent)
         ET.SubElement(element, "child", link=link)
         ET.SubElement(element, "axis", xyz=_text(*joint.axis))
-        _limits(element, joint, content.drives.get(j + 1, Drive()))
-        _dynamics(element, content.joints[j])
+        viscous, dry, effort = laws[j]
+        _limits(element, joint, effort)
+        ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(dry))
         parent, pose = link, np.linalg.inv(anchor)
         if not last:
             _inertial(ET.SubElement(root, "link", name=link), MASSLESS, np.zeros(3), MASSLESS * np.eye(3))
@@ -101,7 +112,7 @@ def _body(root: ET.Element, content: Content, i: int, parent: str, pose: np.ndar
         ET.SubElement(element, "child", link=body.name)
         pose = np.eye(4)
     link = ET.SubElement(root, "link", name=body.name)
-    mass, centre, inertia = content.system.body_numbers(i)
+    mass, centre, inertia = system.body_numbers(i)
     if float(mass) > 0:
         place = pose @ np.array([*map(float, centre), 1.0])
         _inertial(link, float(mass), place[:3], np.array([[float(x) for x in row] for row in inertia]))
@@ -112,17 +123,11 @@ def _kind(joint: Joint) -> str:
     return "prismatic" if joint.slide else "revolute" if joint.range else "continuous"
 
 
-def _limits(element: ET.Element, joint: Joint, drive: Drive) -> None:
+def _limits(element: ET.Element, joint: Joint, effort: float) -> None:
     if not (joint.range or joint.slide):
         return
     low, high = joint.range or (-NO_LIMIT, NO_LIMIT)
-    effort = drive.before if math.isfinite(drive.before) else NO_LIMIT
     ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(NO_LIMIT))
-
-
-def _dynamics(element: ET.Element, laws: JointContent) -> None:
-    viscous = laws.form.viscous + laws.viscous
-    ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(laws.form.coulomb))
 
 
 def _inertial(link: ET.Element, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:

@@ -18,7 +18,7 @@ from ..model.state_space import StateSpaceModel
 from ..smoother.gaussian import CubatureSmoother
 from .identify import Identified, MakeSmoother, Watch, begin, identify, unwatched
 
-OF_LOGS = ("name", "start", "limits", "ranges")
+OF_LOGS = ("name", "start", "limits", "ranges", "file")
 """Keys of a rig that belong to its logs; all others are those of the fit."""
 SAME_KEYS = ("system", "friction", "input_columns", "input_joints", "dt", "measured", "machine", "equations")
 """Keys that must be the same, or the fit is of another machine."""

@@ -11,7 +11,7 @@ from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, flat, kind
 from ..data.servo import TORQUE, Drive, read_drives, scaled
 from ..data.servo import keys as drive_keys
 from ..data.servo import named as drive_numbers
-from .mjcf import Part, read_machine
+from .mjcf import Part, read_file
 
 OF_JOINT = ("armature", "stiffness")
 _FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
@@ -25,7 +25,7 @@ def declare(root: Any) -> Declaration:
     if not isinstance(model.items.get("file"), str) or not model.items["file"]:
         model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
     part = _part(model)
-    machine = read_machine(root.path.parent / str(model.items["file"]), part)
+    machine, file = read_file(root.path.parent / str(model.items["file"]), part)
     possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
     machine = machine._replace(
         file=str(model.items["file"]),
@@ -44,7 +44,7 @@ def declare(root: Any) -> Declaration:
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
     scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
-    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives), scales)
+    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives), scales, file=file)
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:

@@ -2,24 +2,28 @@
 
 import re
 import warnings
-import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site
 from ..data.rig import RigWarning, nearest
 from ..data.servo import TORQUE
-from .locked import NOTHING, Follows, Part, groups, holding, lock, matrix, vector
-from .source import MachineError, in_own_lines, included, parse, refuse, text
-from .urdf import Gear, bare, mimics, refuse_urdf, transmissions
-
-_FREE, _BALL, _SLIDE, _HINGE = range(4)
-
+from .locked import NOTHING, Follows, Part, hold, holding, matrix, vector
+from .source import parse, refuse
+from .spec import compiled, mujoco, opened, written
+from .urdf import Gear, refuse_urdf, transmissions
 
 _WHOLE = Part()
+
+
+class MachineFile(NamedTuple):
+    """A machine, and its file as MJCF, a part of it where only a part moves."""
+
+    machine: Machine
+    text: str
 
 
 def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
@@ -28,27 +32,32 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
     Joints that are held without a value stand where the file has them, or where the joint that they follow puts them.
     Raises MachineError at what has no place in a model of a tree with a fixed base.
     """
+    return read_file(path, part).machine
+
+
+def read_file(path: Path, part: Part = _WHOLE) -> MachineFile:
+    """`read_machine` with the file itself."""
     root = parse(path)
-    follows = mimics(root)
-    gears = transmissions(path, root) if root.tag == "robot" else {}
-    model = _compiled(path, root, part)
-    _refuse_unknown(path, model, part)
-    _refuse_all(path, model, part)
-    bodies = _bodies(model)
-    numbers = [j for j in range(model.njnt) if int(model.jnt_type[j]) in (_SLIDE, _HINGE)]
-    joints = tuple(_joint(model, j, gears) for j in numbers)
-    driven = [motor for motor in _motors(model, part) if motor.joint in numbers]
-    machine = Machine(
+    urdf = root.tag == "robot"
+    gears = transmissions(path, root) if urdf else {}
+    if urdf:
+        refuse_urdf(path, root, part)
+    spec = opened(path, urdf)
+    model = compiled(path, spec) if part.whole else _part(path, spec, part)
+    _refuse_all(path, model, _WHOLE)
+    machine = _machine(path, model, gears)
+    _refuse_names(path, machine)
+    return MachineFile(machine, written(spec))
+
+
+def _machine(path: Path, model: Any, gears: Mapping[str, Gear]) -> Machine:
+    return Machine(
         file=path.name,
-        gravity=vector(model.opt.gravity * (model.opt.disableflags & _flag("mjDSBL_GRAVITY") == 0)),
-        bodies=bodies,
-        joints=joints,
-        motors=tuple(motor._replace(joint=numbers.index(motor.joint)) for motor in driven),
-        joint_sensors=tuple(
-            sensor._replace(joint=numbers.index(sensor.joint))
-            for sensor in _joint_sensors(model)
-            if sensor.joint in numbers
-        ),
+        gravity=vector(model.opt.gravity * (model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY) == 0)),
+        bodies=_bodies(model),
+        joints=tuple(_joint(model, j, gears) for j in range(model.njnt)),
+        motors=tuple(_motors(model)),
+        joint_sensors=tuple(_joint_sensors(model)),
         sites=tuple(
             Site(model.site(i).name, int(model.site_bodyid[i]) - 1, vector(model.site_pos[i]))
             for i in range(model.nsite)
@@ -56,34 +65,39 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
         ),
         sensors=tuple(_sensors(model)),
     )
-    if not part.whole:
-        joined = range(len(bodies)) if root.tag == "robot" else {int(i) - 1 for i in model.jnt_bodyid}
-        machine = _part(path, machine, part, {**follows, **_couplings(model)}, joined)
-    _refuse_names(path, machine)
-    return machine
 
 
-def _part(path: Path, machine: Machine, part: Part, follows: Mapping[str, Follows], joined: Collection[int]) -> Machine:
-    """The machine with its other joints held; warns of bodies without mass that join another."""
-    values = {joint.name: part.locked.get(joint.name, joint.zero) for joint in machine.joints if part.holds(joint.name)}
+def _part(path: Path, spec: Any, part: Part) -> Any:
+    """MuJoCo's model with joints held, and `spec` without them; warns of bodies without mass that join another."""
+    bounds = spec.compiler.boundmass, spec.compiler.boundinertia
+    spec.compiler.boundmass, spec.compiler.boundinertia = (max(bound, 0.1 * NOTHING) for bound in bounds)
+    joined, spec.compiler.fusestatic = spec.compiler.fusestatic, False
+    model = compiled(path, spec)
+    _refuse_unknown(path, model, part)
+    _refuse_all(path, model, part)
+    single = [j for j in range(model.njnt) if _kind("mjtJoint", model.jnt_type[j]) in ("slide", "hinge")]
+    zeros = {model.joint(j).name: float(model.qpos0[model.jnt_qposadr[j]]) for j in single}
+    values = {name: part.locked.get(name, zero) for name, zero in zeros.items() if part.holds(name)}
+    follows = _couplings(model)
     for _ in follows:  # a joint may follow one that follows another
         for name, law in follows.items():
             if name in values and law.joint in values and name not in part.locked:
                 values[name] = law.value(values[law.joint])
-    for joint in machine.joints:
-        body = machine.bodies[joint.body]
-        if joint.name in values and (body.mass <= NOTHING or np.trace(body.inertia) <= 10 * NOTHING):
-            problem = f"body {body.name!r} hangs on the locked joint {joint.name!r} and has no mass or no inertia"
+    for name in values:
+        body = model.body(int(model.joint(name).bodyid[0]))
+        if body.mass[0] <= NOTHING or np.sum(body.inertia) <= 10 * NOTHING:
+            problem = f"body {body.name!r} hangs on the locked joint {name!r} and has no mass or no inertia"
             warnings.warn(f"{path}: {problem}; it is joined to the body that carries it", RigWarning, 2)
-    machine = lock(machine, values, joined)
-    group = groups(machine, {joint.body for joint in machine.joints}.__contains__)
-    for i in sorted({joint.body for joint in machine.joints}):
-        group_bodies = [body for k, body in enumerate(machine.bodies) if group[k] == i + 1]
-        if sum(body.mass for body in group_bodies) <= NOTHING:
-            joint = next(joint.name for joint in machine.joints if joint.body == i)
-            hint = f"give it an <inertial>, or hold its joint: {holding(joint)}"
-            refuse(path, f"body {machine.bodies[i].name!r} moves and has no mass", hint)
-    return machine
+    spec.compiler.fusestatic = joined
+    hold(spec, model, part, values)
+    model = compiled(path, spec)
+    mass = np.bincount(model.body_weldid, model.body_mass)
+    for j in range(model.njnt):
+        if mass[model.jnt_bodyid[j]] <= NOTHING:
+            hint = f"give it an <inertial>, or hold its joint: {holding(model.joint(j).name)}"
+            refuse(path, f"body {model.body(model.jnt_bodyid[j]).name!r} moves and has no mass", hint)
+    spec.compiler.boundmass, spec.compiler.boundinertia = bounds
+    return compiled(path, spec)
 
 
 def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
@@ -94,111 +108,25 @@ def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
             if name not in names:
                 refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
     for j, name in enumerate(names):
-        if name in part.locked and int(model.jnt_type[j]) not in (_SLIDE, _HINGE):
+        if name in part.locked and _kind("mjtJoint", model.jnt_type[j]) not in ("slide", "hinge"):
             refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
-def _mujoco() -> Any:
-    try:
-        import mujoco
-    except ImportError:
-        raise MachineError(
-            'type = "mjcf" needs MuJoCo\'s parser, which is not installed; pip install "nnap-em[robots]"'
-        ) from None
-    return mujoco
-
-
-def _flag(name: str) -> int:
-    return int(getattr(_mujoco().mjtDisableBit, name))
-
-
-def _build(spec: Any, part: Part) -> Any:
-    """MuJoCo's model of a file; that of a part may have bodies without mass, on joints that are held."""
-    if not part.whole:
-        spec.compiler.boundmass = max(spec.compiler.boundmass, 0.1 * NOTHING)
-        spec.compiler.boundinertia = max(spec.compiler.boundinertia, 0.1 * NOTHING)
-        spec.compiler.fusestatic = False
-    return spec.compile()
-
-
-def _compiled(path: Path, root: ET.Element, part: Part) -> Any:
-    """MuJoCo's model; where only meshes or textures are missing, without the shapes of bodies that have an inertial."""
-    mujoco, message = _mujoco(), ""
-    if root.tag == "robot":
-        refuse_urdf(path, root, part)
-        root = bare(root)
-    else:
-        try:
-            return _build(mujoco.MjSpec.from_file(str(path)), part)
-        except ValueError as error:
-            message = " ".join(str(error).split())
-        root = included(path, root)
-    missing = re.search(r"opening file|resource|not found|reading file", message, re.I)
-    if missing:
-        _strip(path, root)
-    try:
-        model = _build(mujoco.MjSpec.from_string(text(root)), part)
-        if missing or not message:
-            return model
-    except ValueError as error:
-        again = " ".join(str(error).split())
-        if missing or not message or re.sub(r"line \d+", "", again) == re.sub(r"line \d+", "", message):
-            message = in_own_lines(again, root)  # MuJoCo counts no lines of included files
-    refuse(path, f"MuJoCo's compiler refuses it: {message}", _hint(message))
-
-
-def _hint(message: str) -> str:
-    """Remedies for the commonest errors of the compiler."""
-    hints = {
-        r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
-        r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
-        r"inertia.*(positive|negative)|(positive|negative).*inertia": "masses and inertias are above 0: correct it",
-        r"repeated name|already|duplicate": "give every body, joint, motor and sensor a name of its own",
-        r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
-        r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
-    }
-    matching = (hint for pattern, hint in hints.items() if re.search(pattern, message, re.I))
-    return next(matching, "correct the file; MuJoCo's viewer shows the same error")
+def _kind(of: str, value: Any) -> str:
+    """The name of a kind of MuJoCo's: "slide" of `mjJNT_SLIDE`, of the enumeration `mjtJoint`."""
+    return getattr(mujoco(), of)(int(value)).name.rpartition("_")[2].lower()
 
 
 def _couplings(model: Any) -> dict[str, Follows]:
-    """The joints of an MJCF file that an equality constraint couples to another."""
-    kind, out = int(_mujoco().mjtEq.mjEQ_JOINT), {}
+    """The joints that an equality constraint couples to another."""
+    out = {}
     for i in range(model.neq):
         first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-        if int(model.eq_type[i]) == kind and second >= 0:
+        if _kind("mjtEq", model.eq_type[i]) == "joint" and second >= 0:
             zeros = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second))
             law = tuple(float(c) for c in model.eq_data[i][:5])
             out[model.joint(first).name] = Follows(model.joint(second).name, law, *zeros)
     return out
-
-
-def _strip(path: Path, root: ET.Element) -> None:
-    """Take away shapes of bodies that have an inertial, and all assets; refuse shapes that are needed and not there."""
-    if (compiler := root.find("compiler")) is not None and compiler.get("inertiafromgeom") == "true":
-        refuse(path, 'inertiafromgeom = "true", but its meshes are missing', "put them beside the file")
-    for world in root.findall("worldbody"):
-        _strip_body(path, world, "world", weighed=True)
-    for tag in ("asset", "contact", "keyframe", "visual", "deformable"):
-        for part in root.findall(tag):
-            root.remove(part)
-
-
-def _strip_body(path: Path, body: ET.Element, name: str, weighed: bool) -> None:
-    weighed = weighed or body.find("inertial") is not None
-    for child in list(body):
-        if child.tag == "body":
-            _strip_body(path, child, str(child.get("name")), False)
-        elif child.tag == "frame":
-            _strip_body(path, child, name, weighed)
-        elif child.tag == "geom" and not weighed and child.get("mesh"):
-            problem = f"body {name!r} has no <inertial>, and its mesh {child.get('mesh')!r} is missing"
-            refuse(path, problem, "put the mesh beside the file, or give the body an <inertial>")
-        elif child.tag in ("geom", "camera", "light"):
-            if weighed or child.tag != "geom":
-                body.remove(child)
-            else:
-                child.attrib.pop("material", None)
 
 
 # --- what has no place here
@@ -211,30 +139,27 @@ def _refuse_all(path: Path, model: Any, part: Part) -> None:
 
 def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
     """Obstacles by name, each with its remedy."""
-    held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
-    for j in range(model.njnt):
-        if held[j]:
-            continue
-        name, kind = model.joint(j).name or f"number {j + 1}", int(model.jnt_type[j])
-        if kind == _FREE:
+    held = {j for j in range(model.njnt) if part.holds(model.joint(j).name)}
+    for j in sorted({*range(model.njnt)} - held):
+        name, kind = model.joint(j).name or f"number {j + 1}", _kind("mjtJoint", model.jnt_type[j])
+        if kind == "free":
             yield f"joint {name!r} is free", "the base is fixed here: take the free joint out"
-        if kind == _BALL:
+        if kind == "ball":
             yield f"joint {name!r} is a ball joint", "write it as three hinges of one body"
-        if _any(model, "jnt_stiffnesspoly", j) or _any(model, "jnt_springyield", j):
+        if np.any(model.jnt_stiffnesspoly[j]) or np.any(model.jnt_springyield[j]):
             yield f"the spring of joint {name!r} is not linear", "leave the linear part; diagnose finds what is missing"
     if model.njnt == 0:
         yield "nothing moves: it has no joint", "give the bodies hinges or slides"
-    elif all(held):
+    elif len(held) == model.njnt:
         yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
     if closed := list(_closed(model, held)):
-        lines = list(dict.fromkeys(name for names in closed for name in names))
+        lines = [model.joint(j).name for j in dict.fromkeys(j for joints in closed for j in sorted(joints))]
         hint = "a loop or coupling is no tree: take <equality> out"
         hint += f", or hold the joints that it closes: {holding(*lines)}" if lines else ""
         yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
-    loose = [i for i in range(model.ntendon) if not _still(model, i, held)]
-    if loose:
-        yield f"it has {len(loose)} tendons", "put their springs and motors on joints, and take <tendon> out"
-    for i in range(getattr(model, "nactuator", model.nu)):
+    if loose := sum(not _still(model, i, held) for i in range(model.ntendon)):
+        yield f"it has {loose} tendons", "put their springs and motors on joints, and take <tendon> out"
+    for i in range(model.nactuator):
         if _moves(model, i, held):
             yield from _actuator(model, i)
     if model.opt.density or model.opt.viscosity:
@@ -242,78 +167,64 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
     if np.any(model.body_gravcomp):
         name = model.body(int(np.flatnonzero(model.body_gravcomp)[0])).name
         yield f"body {name!r} has gravcomp", "log the torque that compensates its weight as an input, and take it out"
-    if getattr(model, "nflex", 0):
+    if model.nflex:
         yield "it has flexible bodies", "bodies are rigid here: take them out"
 
 
-def _closed(model: Any, held: list[bool]) -> Iterator[list[str]]:
+def _closed(model: Any, held: set[int]) -> Iterator[set[int]]:
     """The joints that move of each equality constraint that is not between parts that are held against each other."""
-    mujoco = _mujoco()
-    parents = [int(model.body_parentid[i]) for i in range(model.nbody)]
-    moving = [
-        [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) == i and not held[j]] for i in range(model.nbody)
-    ]
-
-    def above(body: int) -> set[int]:
-        joints: set[int] = set()
-        while body > 0:
-            joints |= set(moving[body])
-            body = parents[body]
-        return joints
-
     for i in range(model.neq):
-        kind, ends = int(model.eq_type[i]), (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
-        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
-            free = {j for j in ends if j >= 0 and not held[j]}
-        elif kind in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
-            sites = int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE)
-            one, two = (int(model.site_bodyid[end]) if sites else end for end in ends)
-            free = above(one) ^ above(two)
+        kind, ends = _kind("mjtEq", model.eq_type[i]), (int(model.eq_obj1id[i]), int(model.eq_obj2id[i]))
+        if kind == "joint":
+            joints = {*ends} - {-1}
+        elif kind in ("connect", "weld"):
+            sites = _kind("mjtObj", model.eq_objtype[i]) == "site"
+            one, two = (_above(model, int(model.site_bodyid[end]) if sites else end) for end in ends)
+            joints = one ^ two
         else:
-            yield []
+            yield set()
             continue
-        if free:
-            yield [model.joint(j).name for j in sorted(free)]
+        if joints - held:
+            yield joints - held
 
 
-def _still(model: Any, tendon: int, held: list[bool]) -> bool:
+def _above(model: Any, body: int) -> set[int]:
+    """Joints that move a body."""
+    first = int(model.body_jntadr[body])
+    own = {*range(first, first + int(model.body_jntnum[body]))}
+    return own | _above(model, int(model.body_parentid[body])) if body else set()
+
+
+def _still(model: Any, tendon: int, held: set[int]) -> bool:
     """True for a tendon that runs over joints alone, all of them held."""
-    first, count, kind = (
-        int(model.tendon_adr[tendon]),
-        int(model.tendon_num[tendon]),
-        int(_mujoco().mjtWrap.mjWRAP_JOINT),
-    )
-    wraps = range(first, first + count)
-    return all(int(model.wrap_type[k]) == kind and held[int(model.wrap_objid[k])] for k in wraps)
+    first = int(model.tendon_adr[tendon])
+    wraps = range(first, first + int(model.tendon_num[tendon]))
+    return all(_kind("mjtWrap", model.wrap_type[k]) == "joint" and int(model.wrap_objid[k]) in held for k in wraps)
 
 
-def _moves(model: Any, actuator: int, held: list[bool]) -> bool:
+def _moves(model: Any, actuator: int, held: set[int]) -> bool:
     """True for an actuator that drives something that moves."""
-    kinds, acts, end = _mujoco().mjtTrn, int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
-    if acts in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
-        return not held[end]
-    return not (acts == int(kinds.mjTRN_TENDON) and _still(model, end, held))
+    acts, end = _kind("mjtTrn", model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator][0])
+    return end not in held if acts in _JOINTS else not (acts == "tendon" and _still(model, end, held))
 
 
-def _any(model: Any, field: str, i: int) -> bool:
-    return bool(np.any(getattr(model, field, np.zeros(i + 1))[i]))
+_JOINTS = ("joint", "jointinparent")
 
 
 def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
-    mujoco = _mujoco()
     name = model.actuator(i).name or f"number {i + 1}"
-    gain, bias, state, acts = (
-        int(getattr(model, f"actuator_{kind}type")[i]) for kind in ("gain", "bias", "dyn", "trn")
-    )
+    parts = ("mjtGain", "gain"), ("mjtBias", "bias"), ("mjtDyn", "dyn"), ("mjtTrn", "trn")
+    gain, bias, state, acts = (_kind(of, getattr(model, f"actuator_{part}type")[i]) for of, part in parts)
     hint = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
-    if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or state == int(mujoco.mjtDyn.mjDYN_MUSCLE):
+    if "muscle" in (gain, state):
         yield f"actuator {name!r} is a muscle", hint
-    elif state != int(mujoco.mjtDyn.mjDYN_NONE):
-        lag = "log the goal that it has integrated and make it <position>" if _integrates(model, i) else _LAG
-        yield f"actuator {name!r} has a state of its own", lag
-    elif bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
+    elif state != "none":
+        lag = "take the lag out of it (timeconst, dyntype): the fit can find one, as actuator_lag"
+        goal = "log the goal that it has integrated and make it <position>"
+        yield f"actuator {name!r} has a state of its own", goal if state == "integrator" else lag
+    elif bias not in ("none", "affine"):
         yield f"actuator {name!r} has a bias that is not affine", hint
-    elif gain not in (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)):
+    elif gain not in ("fixed", "affine"):
         yield f"actuator {name!r} has a gain that is neither fixed nor affine", hint
     elif (drive := _drive(model, i)) is None:
         hint = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
@@ -321,7 +232,7 @@ def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
     elif drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
         hint = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
         yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", hint
-    elif acts not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+    elif acts not in _JOINTS:
         yield f"actuator {name!r} drives no joint", "let every motor drive a joint"
 
 
@@ -371,7 +282,7 @@ def _joint(model: Any, j: int, gears: Mapping[str, Gear]) -> Joint:
     return Joint(
         name=model.joint(j).name,
         body=int(model.jnt_bodyid[j]) - 1,
-        slide=int(model.jnt_type[j]) == _SLIDE,
+        slide=_kind("mjtJoint", model.jnt_type[j]) == "slide",
         axis=vector(model.jnt_axis[j]),
         anchor=vector(model.jnt_pos[j]),
         zero=float(model.qpos0[place]),
@@ -385,11 +296,8 @@ def _joint(model: Any, j: int, gears: Mapping[str, Gear]) -> Joint:
     )
 
 
-def _motors(model: Any, part: Part) -> Iterator[Motor]:
-    held = [part.holds(model.joint(j).name) for j in range(model.njnt)]
-    for i in range(getattr(model, "nactuator", model.nu)):
-        if not _moves(model, i, held):
-            continue
+def _motors(model: Any) -> Iterator[Motor]:
+    for i in range(model.nactuator):
         kind, numbers = _drive(model, i) or (TORQUE, {})
         gear = float(model.actuator_gear[i][0])
         if kind == TORQUE:  # its limits are not taken: the log has the torque as it was
@@ -400,26 +308,19 @@ def _motors(model: Any, part: Part) -> Iterator[Motor]:
         yield Motor(name, int(model.actuator_trnid[i][0]), gear, kind, tuple(numbers.items()))
 
 
-_LAG = "take the lag out of it (timeconst, dyntype): the fit can find one, as actuator_lag"
-
-
-def _integrates(model: Any, i: int) -> bool:
-    return int(model.actuator_dyntype[i]) == int(_mujoco().mjtDyn.mjDYN_INTEGRATOR)
-
-
 def _drive(model: Any, i: int) -> tuple[str, dict[str, float]] | None:
     """The kind and numbers of an actuator without a state: force = gain u + bias, both affine in position and rate.
 
     None where the gain is no constant, and not the rate alone (`<damper>`).
     [MuJoCo documentation, Computation, Actuation model]
     """
-    mujoco = _mujoco()
     gain, bias = (np.asarray(getattr(model, f"actuator_{part}prm")[i][:3], float) for part in ("gain", "bias"))
-    if int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED):
+    if _kind("mjtGain", model.actuator_gaintype[i]) == "fixed":
         gain = gain * [1.0, 0.0, 0.0]
-    if int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE):
+    if _kind("mjtBias", model.actuator_biastype[i]) == "none":
         bias = np.zeros(3)
-    extras = _late(model, i) | ({"bias": float(bias[0])} if bias[0] else {})
+    late = float(np.ravel(model.actuator_delay[i])[0])
+    extras = ({"delay": late} if late > 0 else {}) | ({"bias": float(bias[0])} if bias[0] else {})
     kp, kd = (float(0.0 - x) for x in bias[1:])
     if not np.any(gain[1:]):
         if not np.any(bias) and not extras:
@@ -434,12 +335,6 @@ def _drive(model: Any, i: int) -> tuple[str, dict[str, float]] | None:
     return None
 
 
-def _late(model: Any, i: int) -> dict[str, float]:
-    """The delay of an actuator [s], by a buffer of commands."""
-    delay = float(np.ravel(getattr(model, "actuator_delay", np.zeros(i + 1))[i])[0])
-    return {"delay": delay} if delay > 0 else {}
-
-
 def _limits(model: Any, i: int) -> tuple[float, float] | None:
     """Limits of what an actuator gives before its gear: its own, and those of all actuators of its joint."""
     joint, gear = int(model.actuator_trnid[i][0]), float(model.actuator_gear[i][0])
@@ -450,22 +345,19 @@ def _limits(model: Any, i: int) -> tuple[float, float] | None:
 
 
 def _joint_sensors(model: Any) -> Iterator[JointSensor]:
-    kinds = _mujoco().mjtSensor
     for i in range(model.nsensor):
-        kind, rate = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTVEL)
-        if kind in (int(kinds.mjSENS_JOINTPOS), rate):
-            yield JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == rate)
+        kind = _kind("mjtSensor", model.sensor_type[i])
+        if kind in ("jointpos", "jointvel"):
+            yield JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == "jointvel")
 
 
 def _sensors(model: Any) -> Iterator[Sensor]:
     """The components of every sensor that reads no joint."""
-    mujoco = _mujoco()
-    sites, joints = int(mujoco.mjtObj.mjOBJ_SITE), (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL)
     for i in range(model.nsensor):
-        if int(model.sensor_type[i]) in map(int, joints):
+        kind, at = _kind("mjtSensor", model.sensor_type[i]), -1
+        if kind in ("jointpos", "jointvel"):
             continue
-        kind, at = mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_").lower(), -1
-        if int(model.sensor_objtype[i]) == sites and int(model.sensor_refid[i]) < 0:
+        if _kind("mjtObj", model.sensor_objtype[i]) == "site" and int(model.sensor_refid[i]) < 0:
             at = int(model.sensor_objid[i])
         elif kind in SENSE_UNITS:
             kind = f"{kind} of no site, or in no frame of the world"
@@ -476,13 +368,6 @@ def _sensors(model: Any) -> Iterator[Sensor]:
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:
-    w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
-    return matrix(
-        np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-    )
+    turn = np.zeros(9)
+    mujoco().mju_quat2Mat(turn, quaternion / np.linalg.norm(quaternion))
+    return matrix(turn.reshape(3, 3))

@@ -1,11 +1,11 @@
 """The XML of a machine file: every element with its place in the user's own file, which messages name."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 from ..data.rig import RigError
 
@@ -26,18 +26,18 @@ def refuse(path: Path, problem: str, hint: str, at: ET.Element | None = None) ->
 
 class _Element(ET.Element):
     place: str = ""
-    """Line of its tag, and the file where that is an included one."""
+    """Line of its tag."""
 
 
 def place(element: ET.Element) -> str:
-    """Place of an element that `parse` or `included` has read, as "line 33"."""
+    """Place of an element that `parse` has read, as "line 33"."""
     return element.place if isinstance(element, _Element) else ""
 
 
 def parse(path: Path) -> ET.Element:
     """The root of the file, by which MJCF and URDF are distinguished."""
     try:
-        root = _read(path, "")
+        root = _read(path)
     except OSError as error:
         refuse(path, f"cannot be read ({error.strerror})", "file = names an MJCF or URDF file beside rig.toml")
     except expat.ExpatError as error:
@@ -52,12 +52,12 @@ def parse(path: Path) -> ET.Element:
     return root
 
 
-def _read(path: Path, file: str) -> _Element:
+def _read(path: Path) -> _Element:
     """The tree of a file; prefixes of names stay as they are written."""
     builder, parser = ET.TreeBuilder(element_factory=_Element), expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        builder.start(tag, attributes).place = f"line {parser.CurrentLineNumber}{file}"  # pyright: ignore[reportAttributeAccessIssue]
+        builder.start(tag, attributes).place = f"line {parser.CurrentLineNumber}"  # pyright: ignore[reportAttributeAccessIssue]
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
     parser.CharacterDataHandler = builder.data
@@ -77,34 +77,18 @@ def _macro(element: ET.Element) -> tuple[str, ET.Element] | None:
     return next((macro for macro in inner if macro is not None), None)
 
 
-def included(path: Path, node: ET.Element) -> ET.Element:
-    """The whole file, with what it includes in its place."""
-    for child in list(node):
-        if child.tag == "include":
-            at, inner = list(node).index(child), path.parent / str(child.get("file"))
-            node.remove(child)
-            try:
-                parts = _read(inner, f" of {child.get('file')}")
-            except (OSError, expat.ExpatError) as error:
-                refuse(inner, f"cannot be included ({error})", "put the included file where the main file looks for it")
-            for k, part in enumerate(included(path, parts)):
-                node.insert(at + k, part)
-        else:
-            included(path, child)
-    return node
+def included(path: Path, home: Path) -> Iterator[Path]:
+    """The files that a file includes, and those that they include; their places are relative to `home`."""
+    for element in _read(path).iter("include"):
+        inner = home / str(element.get("file"))
+        yield inner
+        yield from included(inner, home)
 
 
-def text(root: ET.Element) -> str:
-    """The elements as XML, every one beginning a line of its own."""
-    attributes = "".join(f" {name}={quoteattr(value)}" for name, value in root.attrib.items())
-    return f"<{root.tag}{attributes}>\n{''.join(map(text, root))}</{root.tag}>"
-
-
-def in_own_lines(message: str, root: ET.Element) -> str:
-    """A message of MuJoCo about `text(root)`, with places in the user's own files, by line or by name."""
-    elements = list(root.iter())
-    if found := re.search(r"\bline (\d+)", message):
-        return message.replace(found[0], place(elements[int(found[1]) - 1]))
-    named = re.search(r"Element name '([^']+)'", message)
-    places = (place(element) for element in elements if named and element.get("name") == named[1])
-    return next((message.replace(named[0], f"{named[0]}, {at}") for at in places if named), message)
+def located(path: Path, name: str) -> str:
+    """Place of the element of this name in a file and in those that it includes, as "line 3 of inner.xml"."""
+    for file in (path, *included(path, path.parent)):
+        for element in _read(file).iter():
+            if element.get("name") == name:
+                return place(element) + (f" of {file.relative_to(path.parent)}" if file != path else "")
+    return ""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 from ..data.rig import RigWarning
-from .locked import Follows, Part, holding
+from .locked import Part, holding
 from .source import place, refuse
 
 _REDUCTION, _INERTIA = ("mechanicalreduction", "gearratio"), ("motorinertia", "rotorinertia")
@@ -63,31 +63,23 @@ def _numbers(path: Path, transmission: ET.Element, names: tuple[str, ...]) -> It
             yield number
 
 
-def mimics(root: ET.Element) -> dict[str, Follows]:
-    """The joints of a URDF file that mimic another."""
-    out = {}
-    for joint in root.findall("joint"):
-        if (mimic := joint.find("mimic")) is not None:
-            law = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
-            out[str(joint.get("name"))] = Follows(str(mimic.get("joint")), law)
-    return out
-
-
 def stuck(root: ET.Element, logged: Collection[str]) -> dict[str, float]:
     """Values for the joints of a URDF file that move no mass, and for couplings of which a log has neither joint."""
     joints = {str(joint.get("name")): joint for joint in root.findall("joint") if joint.get("type") != "fixed"}
     held = {name: 0.0 for name, joint in joints.items() if not _weighs(_link(joint, "child"), root)}
-    for name, follows in mimics(root).items():
-        if not {name, follows.joint} & {*logged}:
-            held |= {follows.joint: 0.0, name: follows.value(0.0)}
+    for joint in root.findall("joint"):
+        if (mimic := joint.find("mimic")) is not None:
+            name, leader = str(joint.get("name")), str(mimic.get("joint"))
+            held |= {} if {name, leader} & {*logged} else {leader: 0.0, name: float(mimic.get("offset", 0.0))}
     return held
 
 
-def _weighs(link: str, root: ET.Element) -> bool:
-    """True if a link or one that it carries has an inertial."""
+def _weighs(link: str, root: ET.Element, kinds: Collection[str] = ()) -> bool:
+    """True if a link has an inertial, or one that it carries, on joints of these kinds or on any."""
     own = any(one.get("name") == link and one.find("inertial") is not None for one in root.findall("link"))
-    carried = (_link(joint, "child") for joint in root.findall("joint") if _link(joint, "parent") == link)
-    return own or any(_weighs(child, root) for child in carried)
+    joints = (joint for joint in root.findall("joint") if not kinds or joint.get("type") in kinds)
+    carried = (_link(joint, "child") for joint in joints if _link(joint, "parent") == link)
+    return own or any(_weighs(child, root, kinds) for child in carried)
 
 
 def refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
@@ -113,7 +105,7 @@ def refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
             if not (held and part.holds(leader)):
                 hint = f"free it of the other: couplings are no tree; or hold both: {holding(leader, str(name))}"
                 refuse(path, f"joint {name!r} mimics another", hint, joint)
-        if kind != "fixed" and not held and links[child].find("inertial") is None and not _carries(child, root):
+        if kind != "fixed" and not held and not _weighs(child, root, ("fixed",)):
             hint = "add <inertial> with <mass> and <inertia>: shapes alone say nothing about weight"
             hint += f"; or hold its joint: {holding(str(name))}"
             refuse(path, f"link {child!r} moves and has no <inertial>", hint, links[child])
@@ -129,42 +121,7 @@ def refuse_urdf(path: Path, root: ET.Element, part: Part) -> None:
             seen.add(at)
 
 
-def _leaves_no_room(limit: ET.Element) -> bool:
-    try:
-        return float(limit.get("lower", 0.0)) == float(limit.get("upper", 0.0))
-    except ValueError:  # MuJoCo's compiler refuses it
-        return False
-
-
 def _link(joint: ET.Element, end: str) -> str:
     """The link at an end of a joint."""
     element = joint.find(end)
     return "" if element is None else str(element.get("link"))
-
-
-def _carries(link: str, root: ET.Element) -> bool:
-    """True if a link without mass carries one that has, fixed to it."""
-    for joint in root.findall("joint"):
-        if joint.get("type") == "fixed" and _link(joint, "parent") == link:
-            name = _link(joint, "child")
-            child = next(one for one in root.findall("link") if one.get("name") == name)
-            if child.find("inertial") is not None or _carries(name, root):
-                return True
-    return False
-
-
-def bare(root: ET.Element) -> ET.Element:
-    """A file without what MuJoCo has no use for here.
-
-    Shapes weigh nothing, and their files are elsewhere; couplings are of joints that are held; MuJoCo prints a line
-    about limits that leave no room, and leaves them out as well.
-    """
-    for link in root.findall("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
-            link.remove(shape)
-    for joint in root.findall("joint"):
-        for limit in filter(_leaves_no_room, joint.findall("limit")):
-            joint.remove(limit)
-        for mimic in joint.findall("mimic"):
-            joint.remove(mimic)
-    return root

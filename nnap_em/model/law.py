@@ -80,7 +80,7 @@ def fit_law(
     return LawFit(*(np.stack(column) for column in zip(*joints, strict=True)))
 
 
-def _curve(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, " node"]:
+def curve(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, " node"]:
     """Torque of the law over velocity [N m], the constant included."""
     coulomb, breakaway, stribeck, viscous, smooth, offset = value
     level = coulomb + (breakaway - coulomb) * np.exp(-((v / stribeck) ** 2))
@@ -88,7 +88,7 @@ def _curve(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) ->
 
 
 def _slopes(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, "node param"]:
-    """Derivatives of `_curve` by its parameters."""
+    """Derivatives of `curve` by its parameters."""
     coulomb, breakaway, stribeck, _, smooth, _ = value
     dip, sign = np.exp(-((v / stribeck) ** 2)), np.tanh(v / smooth)
     level = coulomb + (breakaway - coulomb) * dip
@@ -97,50 +97,70 @@ def _slopes(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -
     return np.stack([-(1 - dip) * sign, -dip * sign, by_stribeck, -v, by_smooth, np.ones_like(v)], axis=1)
 
 
-def _fit_joint(
-    v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], cov: Float[np.ndarray, "node node"]
-) -> LawFit:
-    top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
-    wide = np.array([scale, scale, top, scale / top, top, scale])
-    cov = cov + np.diag(0.01 * np.diag(cov) + (0.005 * scale) ** 2)
-    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
+def nearest(
+    v: Float[np.ndarray, " node"],
+    torque: Float[np.ndarray, " node"],
+    whitener: Float[np.ndarray, "node node"],
+    *,
+    dip: bool = True,
+    constant: bool = True,
+) -> Float[np.ndarray, " param"]:
+    """PARAMETERS of the law nearest to a curve: argmin |whitener (torque - law)|^2, and a weak prior.
 
-    def natural(z):
-        """Logarithms keep the first five positive and the breakaway torque above the Coulomb torque."""
-        value = wide * np.concatenate([np.exp(z[:5]), z[5:]])
-        value[1] += value[0]
-        return value
-
-    def by_z(z):
-        """Derivatives of `natural`."""
-        factors = np.diag(wide * np.concatenate([np.exp(z[:5]), [1.0]]))
-        factors[1, 0] = factors[0, 0]
-        return factors
-
+    Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
+    """
+    wide, free = _range(v, torque), np.array([True, dip, dip, True, True, constant])
     # priors so weak that they only hold what the curve does not determine
     levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
     levels, times = levels / wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 3.0
 
+    def natural(z, start):
+        """Parameters and their derivatives by `z`: logarithms keep the first five and their differences positive."""
+        full = start.copy()
+        full[free] = z
+        factors = np.diag(wide * np.concatenate([np.exp(full[:5]), [1.0]]))
+        factors[1, 0] = factors[0, 0]
+        value = wide * np.concatenate([np.exp(full[:5]), full[5:]])
+        value[1] += value[0]
+        return full, value, factors
+
     def residual(z, start):
-        value = natural(z)
-        return np.concatenate([whitener @ (torque - _curve(value, v)), levels @ value, times @ (z - start)])
+        full, value, _ = natural(z, start)
+        return np.concatenate([whitener @ (torque - curve(value, v)), levels @ value, times @ (full - start)])
 
     def jacobian(z, start):
-        by_value, slopes = by_z(z), _slopes(natural(z), v)
-        return np.concatenate([-whitener @ slopes @ by_value, levels @ by_value, times])
+        _, value, factors = natural(z, start)
+        return np.concatenate([-whitener @ _slopes(value, v) @ factors, levels @ factors, times])[:, free]
 
     fits = []
-    for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]), repeat=2):
-        start = np.array([np.log(0.3), np.log(0.3), knee, np.log(0.3), sharpness - 1.5, 0.0])
+    for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
+        no_dip = -200.0  # its logarithm
+        start = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
         with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-            fits.append(least_squares(residual, start, jacobian, method="lm", xtol=1e-8, args=(start,)))  # type: ignore
-    value = natural(min(fits, key=lambda fit: fit.cost).x)
+            fit = least_squares(residual, start[free], jacobian, method="lm", xtol=1e-8, args=(start,))  # type: ignore
+        fits.append((fit.cost, natural(fit.x, start)[1]))
+    return min(fits, key=lambda fit: fit[0])[1]
+
+
+def _range(v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"]) -> Float[np.ndarray, " param"]:
+    """Sizes of the parameters by the range of a curve."""
+    top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
+    return np.array([scale, scale, top, scale / top, top, scale])
+
+
+def _fit_joint(
+    v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], cov: Float[np.ndarray, "node node"]
+) -> LawFit:
+    wide = _range(v, torque)
+    cov = cov + np.diag(0.01 * np.diag(cov) + (0.005 * wide[0]) ** 2)
+    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
+    value = nearest(v, torque, whitener)
     jac = _slopes(value, v) * wide
     white = whitener @ jac
     posterior = np.linalg.inv(white.T @ white + np.eye(6))
     unexplained = np.diag(cov) - np.sum((jac @ posterior) * jac, axis=1)
     std = wide * np.sqrt(np.diag(posterior))
-    return LawFit(value, std, v, torque - _curve(value, v), np.sqrt(np.maximum(unexplained, (0.005 * scale) ** 2)))
+    return LawFit(value, std, v, torque - curve(value, v), np.sqrt(np.maximum(unexplained, (0.005 * wide[0]) ** 2)))
 
 
 def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> list[str]:

@@ -51,6 +51,7 @@ SECONDS = {
     "test_findings.py": 18,
     "test_residual.py": 18,
     "test_mstep.py": 17,
+    "test_law.py": 45,
     "test_scale.py": 17,
     "test_plots.py": 14,
     "test_inputs.py": 13,

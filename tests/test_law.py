@@ -90,6 +90,21 @@ def test_std_is_the_scatter_of_repeated_tables():
     assert 0.01 < float(np.mean(fits.departs)) < 0.09
 
 
+def test_what_a_curve_hardly_shows_is_within_two_standard_deviations():
+    """The Stribeck peak of a slide within the band of its curve near rest: the posterior of its numbers is bent."""
+    truth, v, n = (1.0, 1.5, 0.05, 2.0, 0.02), _nodes(top=1.4), 24
+    place = np.arcsinh(v[0] / 0.005) / 1.5
+    std = 0.03 + 0.6 * np.exp(-((v[0] / 0.1) ** 2))
+    cov = np.outer(std, std) * np.exp(-0.5 * (place[:, None] - place[None]) ** 2)
+    torque = _torque(v, truth, 0.0)
+    draws = torque + np.random.default_rng(2).normal(size=(n, v.shape[1])) @ np.linalg.cholesky(_nugget(cov, torque)).T
+    fits = fit_law(*map(jnp.asarray, (np.tile(v, (n, 1)), draws, np.tile(cov, (n, 1, 1)))))
+    z = np.abs(np.asarray(fits.value) - (*truth, 0.0)) / np.asarray(fits.std)
+    # 95 % are due, less three binomial standard deviations of 24 draws; the delta method holds 67 and 75 % of two
+    np.testing.assert_array_less(0.95 - 3 * np.sqrt(0.95 * 0.05 / n), np.mean(z <= 2, axis=0))
+    assert np.all(np.median(fits.std, axis=0)[[0, 3]] < (0.05, 0.05))  # Coulomb and viscous friction are determined
+
+
 def test_joints_are_fitted_alone():
     v = np.concatenate([_nodes(), _nodes(top=3.0)])
     torque = np.concatenate([_torque(v[:1]), 2 * _torque(v[1:])])
@@ -107,7 +122,7 @@ def test_other_units_give_the_same_law():
     other = _fit(speed * v, force * _torque(v), force**2 * _kernel(v, 1e-3))
     scale = np.asarray([force, force, speed, force / speed, speed, force])
     np.testing.assert_allclose(other.value[0] / scale, fit.value[0], rtol=1e-4)  # to the solver's tolerance
-    np.testing.assert_allclose(other.std[0] / scale, fit.std[0], rtol=1e-3)
+    np.testing.assert_allclose(other.std[0] / scale, fit.std[0], rtol=0.1)  # as far as draws repeat a std
 
 
 def test_what_the_curve_does_not_show_has_a_large_std():

@@ -154,7 +154,7 @@ def test_uncertain_friction_widens_the_prediction():
 
 
 def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():
-    sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
+    sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1.0))
     blind = sure.data._replace(y=sure.data.y.at[:, 20:].set(jnp.nan))
     certain = posterior_of(sure.fitted, blind).state.cov
     known, wide = (smooth(case.fitted, blind).cov for case in (sure, unsure))

@@ -176,7 +176,9 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
     if rig.friction:
         speed, scale = jnp.asarray(scales.speed), jnp.asarray(0.1 * scales.torque)
         unknown = FrictionNetwork(speed, scale, key=key, resolution=300.0)
-        unknown = eqx.tree_at(lambda f: f.mlp.layers[-1], unknown, replace_fn=_quiet)
+        last = unknown.mlp.layers[-1]  # the first friction is nearly none
+        hushed = 0.01 * last.weight, jax.tree.map(jnp.zeros_like, last.bias)
+        unknown = eqx.tree_at(lambda f: (f.mlp.layers[-1].weight, f.mlp.layers[-1].bias), unknown, hushed)
     model = StateSpaceModel(
         system=system,
         unknown=unknown,
@@ -220,13 +222,6 @@ def _by_acceleration(system: AbstractSystem, scales: Scales) -> Float[np.ndarray
         slope = np.asarray(jax.jit(jax.vmap(jax.jacfwd(sensed), (None, 0)))(still, q))
         out[2 * dof :] = np.sqrt(np.mean(np.sum((slope * scales.acceleration) ** 2, axis=-1), axis=0))
     return out
-
-
-def _quiet(layer: eqx.nn.Linear) -> eqx.nn.Linear:
-    """The output layer, scaled so that the first friction is nearly zero."""
-    return eqx.tree_at(
-        lambda n: (n.weight, n.bias), layer, (0.01 * layer.weight, jax.tree.map(jnp.zeros_like, layer.bias))
-    )
 
 
 MOVED = 0.1

@@ -147,14 +147,11 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
     near = jnp.repeat(jnp.broadcast_to(rule.reach, weights.nodes.shape[:1]) ** -2.0, weights.nodes.shape[1])
     near = jnp.diag(jnp.concatenate([near, jnp.zeros(weights.prior.size, near.dtype)]))
     w = weights.fit(core.unknown, core.w, total.score, total.information + near, rule.iterations)
-    hessian = _definite(total.information + weights.prior_precision(core.unknown))
+    present = core.unknown.with_weights(core.w[: core.w.shape[0] - weights.prior.size])
+    hessian = total.information + weights.prior_precision(present)
+    hessian = hessian + 100 * jnp.finfo(hessian.dtype).eps * jnp.diag(jnp.diag(hessian))  # definite, also rounded
     log_q, log_r = rule.noise(core, total, weights.nodes.shape[0])
     return Core(core.unknown, w, log_q, log_r, rule.first(core.start, first, used)), hessian, used
-
-
-def _definite(precision: Float[Array, "phi phi"]) -> Float[Array, "phi phi"]:
-    """A sum of squares that rounding has not made indefinite."""
-    return precision + 100 * jnp.finfo(precision.dtype).eps * jnp.diag(jnp.diag(precision))
 
 
 RESTING_STEP = 0.1

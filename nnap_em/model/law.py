@@ -1,6 +1,7 @@
 """The engineer's friction law, and how well it describes a learned curve."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,19 +17,15 @@ class StribeckLaw(eqx.Module):
 
         tau_f(v) = -[(coulomb + (breakaway - coulomb) exp(-(v / stribeck)^2)) tanh(v / smooth) + viscous v]
 
-    [Armstrong-Helouvry, Dupont & Canudas de Wit 1994, Automatica 30(7), sec. 2, with a smooth sign]
+    Levels are in N m, velocities in rad/s, viscous friction in N m s/rad. [Armstrong-Helouvry, Dupont & Canudas de Wit
+    1994, Automatica 30(7), sec. 2, with a smooth sign]
     """
 
     coulomb: Float[Array, " dof"]
-    """[N m]"""
     breakaway: Float[Array, " dof"]
-    """[N m]"""
     stribeck: Float[Array, " dof"]
-    """[rad/s]"""
     viscous: Float[Array, " dof"]
-    """[N m s/rad]"""
     smooth: Float[Array, " dof"]
-    """[rad/s]"""
 
     def __call__(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Friction torque at joint velocities [N m]."""
@@ -51,7 +48,8 @@ class LawFit(NamedTuple):
 
     value: Float[np.ndarray, "dof param"]
     std: Float[np.ndarray, "dof param"]
-    """Numbers that the curve leaves undetermined have the standard deviation of the prior: the curve's whole range."""
+    """Half the distance from the value within which 95 % of the posterior lies; where the curve leaves a number
+    undetermined, that of the prior: the curve's whole range."""
     velocity: Float[np.ndarray, "dof node"]
     """[rad/s]"""
     difference: Float[np.ndarray, "dof node"]
@@ -71,7 +69,7 @@ def fit_law(
 ) -> LawFit:
     """Generalised least squares of the Stribeck law to a table of torque [N m] over velocity [rad/s], joint by joint.
 
-        value = argmin |L^-1 (torque - law)|^2,  L L' = cov + nugget,  std by the delta method
+        value = argmin |L^-1 (torque - law)|^2,  L L' = cov + nugget,  std by draws from the posterior
 
     The nugget (a tenth of the torque's standard deviation, half a percent of its range) is what the shape of the
     learned curve itself may err where its covariance is all but singular.
@@ -80,21 +78,11 @@ def fit_law(
     return LawFit(*(np.stack(column) for column in zip(*joints, strict=True)))
 
 
-def curve(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, " node"]:
-    """Torque of the law over velocity [N m], the constant included."""
+def curve(value: Float[np.ndarray, "param ..."], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, "... node"]:
+    """Torque of the law over velocity [N m], the constant included; of several laws with axes (param, law, 1)."""
     coulomb, breakaway, stribeck, viscous, smooth, offset = value
     level = coulomb + (breakaway - coulomb) * np.exp(-((v / stribeck) ** 2))
     return offset - level * np.tanh(v / smooth) - viscous * v
-
-
-def _slopes(value: Float[np.ndarray, " param"], v: Float[np.ndarray, " node"]) -> Float[np.ndarray, "node param"]:
-    """Derivatives of `curve` by its parameters."""
-    coulomb, breakaway, stribeck, _, smooth, _ = value
-    dip, sign = np.exp(-((v / stribeck) ** 2)), np.tanh(v / smooth)
-    level = coulomb + (breakaway - coulomb) * dip
-    by_stribeck = -2 * (breakaway - coulomb) * dip * v**2 / stribeck**3 * sign
-    by_smooth = level * (1 - sign**2) * v / smooth**2
-    return np.stack([-(1 - dip) * sign, -dip * sign, by_stribeck, -v, by_smooth, np.ones_like(v)], axis=1)
 
 
 def nearest(
@@ -109,68 +97,111 @@ def nearest(
 
     Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
     """
-    wide, free = _range(v, torque), np.array([True, dip, dip, True, True, constant])
-    # priors so weak that they only hold what the curve does not determine
-    levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
-    levels, times = levels / wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 3.0
-
-    def natural(z, start):
-        """Parameters and their derivatives by `z`: logarithms keep the first five and their differences positive."""
-        full = start.copy()
-        full[free] = z
-        factors = np.diag(wide * np.concatenate([np.exp(full[:5]), [1.0]]))
-        factors[1, 0] = factors[0, 0]
-        value = wide * np.concatenate([np.exp(full[:5]), full[5:]])
-        value[1] += value[0]
-        return full, value, factors
-
-    def residual(z, start):
-        full, value, _ = natural(z, start)
-        return np.concatenate([whitener @ (torque - curve(value, v)), levels @ value, times @ (full - start)])
-
-    def jacobian(z, start):
-        _, value, factors = natural(z, start)
-        return np.concatenate([-whitener @ _slopes(value, v) @ factors, levels @ factors, times])[:, free]
-
-    fits = []
-    for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
-        no_dip = -200.0  # its logarithm
-        start = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
-        with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-            fit = least_squares(residual, start[free], jacobian, method="lm", xtol=1e-8, args=(start,))  # type: ignore
-        fits.append((fit.cost, natural(fit.x, start)[1]))
-    return min(fits, key=lambda fit: fit[0])[1]
+    posterior = _Posterior(v, torque, whitener)
+    return posterior.natural(posterior.modes(dip, constant)[0][1])
 
 
-def _range(v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"]) -> Float[np.ndarray, " param"]:
-    """Sizes of the parameters by the range of a curve."""
-    top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
-    return np.array([scale, scale, top, scale / top, top, scale])
+class _Posterior(NamedTuple):
+    """The law of a curve, by z: the logarithms of its numbers in the sizes of the curve, and the constant torque.
+
+    Logarithms keep the first five positive and the breakaway torque above the Coulomb torque.
+    """
+
+    v: Float[np.ndarray, " node"]
+    torque: Float[np.ndarray, " node"]
+    whitener: Float[np.ndarray, "node node"]
+
+    @property
+    def wide(self) -> Float[np.ndarray, " param"]:
+        """Sizes of the numbers by the range of the curve."""
+        top, scale = np.max(np.abs(self.v)), max(float(np.max(np.abs(self.torque))), 1e-9)
+        return np.array([scale, scale, top, scale / top, top, scale])
+
+    def natural(self, z: Float[np.ndarray, "... param"]) -> Float[np.ndarray, "... param"]:
+        """PARAMETERS of laws."""
+        value = self.wide * np.concatenate([np.exp(z[..., :5]), z[..., 5:]], axis=-1)
+        value[..., 1] += value[..., 0]
+        return value
+
+    def residual(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, "law row"]:
+        """Residuals of laws, those of a prior behind them that only holds what the curve does not determine."""
+        levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
+        levels, times = levels / self.wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 2.0
+        middle = np.array([0.0, 0.0, np.log(0.1), 0.0, np.log(0.02), 0.0])
+        value = self.natural(z)
+        away = (self.torque - curve(value.T[..., None], self.v)) @ self.whitener.T
+        return np.concatenate([away, value @ levels.T, (z - middle) @ times.T], axis=1)
+
+    def log_density(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, " law"]:
+        """Levels are as likely before as they are wide, not as their logarithms."""
+        return np.sum(z[:, [0, 1, 3]], axis=1) - 0.5 * np.sum(self.residual(z) ** 2, axis=1)
+
+    def modes(self, dip: bool = True, constant: bool = True) -> list[tuple[float, Float[np.ndarray, " param"]]]:
+        """Cost and place of minima from several starts, the best first."""
+        free, fits = np.array([True, dip, dip, True, True, constant]), []
+        for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
+            no_dip = -200.0  # its logarithm
+            full = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
+
+            def residual(z, full=full):
+                full[free] = z
+                return self.residual(full[None])[0]
+
+            with np.errstate(over="ignore"):  # a step too far: the next one is shorter
+                fit = least_squares(residual, full[free].copy(), method="lm", xtol=1e-8)
+            full[free] = fit.x
+            fits.append((float(fit.cost), full))
+        return sorted(fits, key=lambda fit: fit[0])
 
 
 def _fit_joint(
     v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], cov: Float[np.ndarray, "node node"]
 ) -> LawFit:
-    wide = _range(v, torque)
-    cov = cov + np.diag(0.01 * np.diag(cov) + (0.005 * wide[0]) ** 2)
-    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
-    value = nearest(v, torque, whitener)
-    jac = _slopes(value, v) * wide
-    white = whitener @ jac
-    posterior = np.linalg.inv(white.T @ white + np.eye(6))
-    unexplained = np.diag(cov) - np.sum((jac @ posterior) * jac, axis=1)
-    std = wide * np.sqrt(np.diag(posterior))
-    return LawFit(value, std, v, torque - curve(value, v), np.sqrt(np.maximum(unexplained, (0.005 * wide[0]) ** 2)))
+    least = (0.005 * max(float(np.max(np.abs(torque))), 1e-9)) ** 2
+    cov = cov + np.diag(0.01 * np.diag(cov) + least)
+    posterior = _Posterior(v, torque, solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True))
+    costs, places = map(np.asarray, zip(*posterior.modes(), strict=True))
+    likely, random = np.exp(costs[0] - costs), np.random.default_rng(0)
+    begin = places[random.choice(len(places), 48, p=likely / likely.sum())]
+    with np.errstate(over="ignore", invalid="ignore"):  # laws beyond all numbers are not accepted
+        draws = _draws(posterior.log_density, begin + 0.05 * random.standard_normal(begin.shape), random)
+    draws, value = posterior.natural(draws), posterior.natural(places[0])
+    std = 0.5 * np.quantile(np.abs(draws - value), 0.9545, axis=0)  # of a normal distribution within two
+    unexplained = np.diag(cov) - np.var(curve(draws[::48].T[..., None], v), axis=0)
+    return LawFit(value, std, v, torque - curve(value, v), np.sqrt(np.maximum(unexplained, least)))
+
+
+def _draws(
+    log_density: Callable[[Float[np.ndarray, "walker param"]], Float[np.ndarray, " walker"]],
+    walkers: Float[np.ndarray, "walker param"],
+    random: np.random.Generator,
+    moves: int = 600,
+) -> Float[np.ndarray, "draw param"]:
+    """Draws from a density that may bend and have several modes, by moving `walkers` that are near its modes.
+
+    Each is stretched towards or away from one of the other half; the first third is left out, and 48 walkers repeat a
+    standard deviation within 10 %. [Goodman & Weare 2010, Commun. Appl. Math. Comput. Sci. 5(1)]
+    """
+    level, draws = log_density(walkers), []
+    for _ in range(moves):
+        halves = np.array_split(random.permutation(len(walkers)), 2)
+        for moving, still in (halves, halves[::-1]):
+            stretch = (1 + random.uniform(size=len(moving))) ** 2 / 2
+            origin = walkers[random.choice(still, len(moving))]
+            trial = origin + stretch[:, None] * (walkers[moving] - origin)
+            new, bar = log_density(trial), level[moving] + np.log(random.uniform(size=len(moving)))
+            accepted = new + (walkers.shape[1] - 1) * np.log(stretch) > bar
+            walkers[moving[accepted]], level[moving[accepted]] = trial[accepted], new[accepted]
+        draws.append(walkers.copy())
+    return np.concatenate(draws[moves // 3 :])
 
 
 def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> list[str]:
     """One sentence per joint: the numbers of the law, what the curve leaves open, and where it is another curve."""
+    numbers = zip(names, angles, map(np.asarray, fit.value), map(np.asarray, fit.std), strict=True)
     return [
-        f"{name}: "
-        + ", ".join(_terms(np.asarray(fit.value[j]), np.asarray(fit.std[j]), LAW_UNITS[angle]))
-        + "; "
-        + _where(fit, j, LAW_UNITS[angle][2])
-        for j, (name, angle) in enumerate(zip(names, angles, strict=True))
+        f"{name}: {', '.join(_terms(value, std, LAW_UNITS[angle]))}; {_where(fit, j, LAW_UNITS[angle][2])}"
+        for j, (name, angle, value, std) in enumerate(numbers)
     ]
 
 

@@ -98,7 +98,7 @@ def nearest(
     Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
     """
     posterior = _Posterior(v, torque, whitener)
-    return posterior.natural(posterior.modes(dip, constant)[0][1])
+    return posterior.natural(posterior.modes(dip, constant, at_start=True)[0][1])
 
 
 class _Posterior(NamedTuple):
@@ -110,6 +110,7 @@ class _Posterior(NamedTuple):
     v: Float[np.ndarray, " node"]
     torque: Float[np.ndarray, " node"]
     whitener: Float[np.ndarray, "node node"]
+    middle: Float[np.ndarray, " param"] = np.array([0.0, 0.0, np.log(0.1), 0.0, np.log(0.02), 0.0])
 
     @property
     def wide(self) -> Float[np.ndarray, " param"]:
@@ -127,25 +128,28 @@ class _Posterior(NamedTuple):
         """Residuals of laws, those of a prior behind them that only holds what the curve does not determine."""
         levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
         levels, times = levels / self.wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 2.0
-        middle = np.array([0.0, 0.0, np.log(0.1), 0.0, np.log(0.02), 0.0])
         value = self.natural(z)
         away = (self.torque - curve(value.T[..., None], self.v)) @ self.whitener.T
-        return np.concatenate([away, value @ levels.T, (z - middle) @ times.T], axis=1)
+        return np.concatenate([away, value @ levels.T, (z - self.middle) @ times.T], axis=1)
 
     def log_density(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, " law"]:
         """Levels are as likely before as they are wide, not as their logarithms."""
         return np.sum(z[:, [0, 1, 3]], axis=1) - 0.5 * np.sum(self.residual(z) ** 2, axis=1)
 
-    def modes(self, dip: bool = True, constant: bool = True) -> list[tuple[float, Float[np.ndarray, " param"]]]:
-        """Cost and place of minima from several starts, the best first."""
+    def modes(
+        self, dip: bool = True, constant: bool = True, *, at_start: bool = False
+    ) -> list[tuple[float, Float[np.ndarray, " param"]]]:
+        """Cost and place of minima from several starts, the best first; `at_start`: about which the prior is."""
         free, fits = np.array([True, dip, dip, True, True, constant]), []
         for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
             no_dip = -200.0  # its logarithm
             full = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
 
-            def residual(z, full=full):
+            own = self._replace(middle=full.copy()) if at_start else self
+
+            def residual(z, full=full, own=own):
                 full[free] = z
-                return self.residual(full[None])[0]
+                return own.residual(full[None])[0]
 
             with np.errstate(over="ignore"):  # a step too far: the next one is shorter
                 fit = least_squares(residual, full[free].copy(), method="lm", xtol=1e-8)

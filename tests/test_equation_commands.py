@@ -20,7 +20,7 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.export.c99 import write_c
-from nnap_em.export.model import PREDICTOR, STEP, write_model
+from nnap_em.export.model import PREDICTOR_FILE, STABLEHLO_FILE, write_model
 from nnap_em.fit.identify import begin, phi_samples
 from nnap_em.fit.predict import predict
 from nnap_em.fit.store import fingerprint, save
@@ -184,7 +184,7 @@ def test_the_numpy_predictor_agrees_with_predict(place, tmp_path):
     fitted, logs = _fit(place / "monday_logs", LAWS[:2])
     assert write_model(fitted, tmp_path) == ""
     space: dict = {"__name__": "predictor"}
-    exec((tmp_path / PREDICTOR).read_text(), space)
+    exec((tmp_path / PREDICTOR_FILE).read_text(), space)
     key = jax.random.key(3)
     wanted = predict(fitted, logs.data, GIVEN, key=key, samples=SAMPLES)
     key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
@@ -207,7 +207,7 @@ def test_the_numpy_predictor_agrees_with_predict(place, tmp_path):
 def test_one_step_through_stablehlo_is_the_transition(place, tmp_path):
     fitted, _ = _fit(place / "monday_logs")
     write_model(fitted, tmp_path)
-    step = jax.export.deserialize(bytearray((tmp_path / STEP).read_bytes())).call
+    step = jax.export.deserialize(bytearray((tmp_path / STABLEHLO_FILE).read_bytes())).call
     x, u = jnp.asarray([[0.5, 0.2], [1.0, 2.0]]), jnp.asarray([[0.3], [1.5]])
     ahead, reading = step(x, u)
     for i in range(2):

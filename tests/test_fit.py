@@ -124,7 +124,7 @@ def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
         return SimpleNamespace(loglik=np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)]))
 
     monkeypatch.setattr(loop, "_alone", e_step)
-    monkeypatch.setattr(loop, "kept", lambda *_: np.array([True, False]))
+    monkeypatch.setattr(loop, "not_diverged", lambda *_: np.array([True, False]))
     settled = loop._settle_noise(MODEL, DATA, None, jax.random.key(0))
     np.testing.assert_allclose(tried, 2 * np.log([1.0, 0.3, 0.1, 0.03, 0.01]))
     np.testing.assert_allclose(settled.log_q, 2 * np.log(0.1))
@@ -310,7 +310,7 @@ def _finished(monkeypatch, error, white=False):
         each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
-    fakes = {"white_readings": lambda *_: white, "kept": lambda *_: used, "finish": finish, "errors": errors}
+    fakes = {"white_readings": lambda *_: white, "not_diverged": lambda *_: used, "finish": finish, "errors": errors}
     fakes["followed"] = _followed
     fakes["e_step"] = lambda model, *_, **__: SimpleNamespace(state=PATH, loglik=np.full(4, _mass(model)))
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)

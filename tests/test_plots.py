@@ -100,7 +100,7 @@ def test_sequences_for_which_a_page_has_no_room_are_left_out(monkeypatch):
     whole = _prediction_pictures({"before": prediction}, names, logs, GIVEN)
     for count in (1, 3):
         room = sum(len(picture.image) for picture in whole[:count]) + 1
-        monkeypatch.setattr("nnap_em.report.diagnosis.ROOM", room)
+        monkeypatch.setattr("nnap_em.report.diagnosis.PICTURE_BYTES", room)
         assert len(_prediction_pictures({"before": prediction}, names, logs, GIVEN)) == count
 
 

@@ -22,7 +22,7 @@ ROUNDS = 3
 
 
 def rows(quick: bool) -> dict[str, Callable]:
-    """What is timed, by its name: a function that compiles and gives the function that runs."""
+    """Work by its name: each compiles when called, and gives the function that is timed."""
     from common_work import Size, filter_case, particle_default, paths_case, smoother_case, wide_bank
 
     from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother

@@ -1,4 +1,4 @@
-"""What does a message of MCAP cost in other readers, and how much of a cut file do they give?
+"""Processor time of a message of MCAP in our reader and others, and the messages that each reads of a cut file.
 
 The log is that of `import_logs.py`, twelve topics at 1 kHz.  Each reader gives six numbers of the messages of two
 topics, or the first number of the messages of all; the best processor time of five [us a message].  Besides the extra

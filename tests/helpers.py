@@ -110,3 +110,24 @@ def slide() -> tuple[StateSpaceModel, ScoringMStep]:
     model = StateSpaceModel(body, NoFriction(jnp.ones(1)), start, jnp.zeros(2), jnp.zeros(2), (0, 1), 0.05)
     prior = ParameterPrior(("m",), jnp.asarray([1.2]), jnp.asarray([0.1]))
     return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q)
+
+
+def chain_rig(columns: str, unknown: str = "") -> str:
+    """rig.toml of two states in a chain, written as equations, with these `columns` and `unknown` terms."""
+    return f"""format = 1
+name = "chain"
+[model]
+type = "equations"
+inputs = {{ u = "V" }}
+states = {{ a = "V", b = "V" }}
+rates = {{ a = "k*u - a/ta", b = "(a - b)/2" }}
+k = {{ mean = 1.0, std = 0.3 }}
+ta = {{ mean = 4.0, std = 1.0 }}
+{unknown}
+[sampling]
+dt = 0.5
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = {{ {columns} }}
+"""

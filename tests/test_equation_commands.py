@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import csv_text
+from helpers import chain_rig, csv_text
 
 import nnap_em
 from nnap_em.commands.cli import main
@@ -27,22 +27,7 @@ from nnap_em.fit.store import fingerprint, save
 from nnap_em.model.state_space import Inputs
 from nnap_em.systems import specs
 
-RIG = """format = 1
-name = "chain"
-[model]
-type = "equations"
-inputs = { u = "V" }
-states = { a = "V", b = "V" }
-rates = { a = "k*u - a/ta", b = "(a - b)/2" }
-k = { mean = 1.0, std = 0.3 }
-ta = { mean = 4.0, std = 1.0 }
-[sampling]
-dt = 0.5
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = { y = "b + 0.1*u" }
-"""
+RIG = chain_rig('y = "b + 0.1*u"')
 ROWS, GIVEN, SAMPLES = 60, 6.0, 8
 LAWS = (
     catalogue["transfer"](strength=0.2, level=0.4, share=0.6, channel="a", reads=("a",), to="b"),

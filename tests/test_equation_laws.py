@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import chain_rig
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
@@ -160,27 +161,9 @@ def test_the_table_of_an_unknown_term_has_its_values_and_their_spread(reads):
 
 # --- with logs
 
-RIG = """format = 1
-name = "r"
-[model]
-type = "equations"
-inputs = { u = "V" }
-states = { a = "V", b = "V" }
-rates = { a = "k*u - a/ta", b = "(a - b)/2" }
-k = { mean = 1.0, std = 0.3 }
-ta = { mean = 4.0, std = 1.0 }
-UNKNOWN
-[sampling]
-dt = 0.5
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = { y = "b", z = "a" }
-"""
-
 
 def _rig(folder: Path, unknown: str = ""):
-    (folder / "rig.toml").write_text(RIG.replace("UNKNOWN", unknown))
+    (folder / "rig.toml").write_text(chain_rig('y = "b", z = "a"', unknown))
     return read_rig(folder / "rig.toml", specs)
 
 

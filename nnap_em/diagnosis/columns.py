@@ -138,7 +138,7 @@ def _stack_columns(common, track: Track) -> list[Columns]:
 
 
 def _groups(stacks: Sequence[Stack]) -> list[list[Stack]]:
-    """Stacks whose columns one program computes: those of a class, as far as they are no more than BLOCK columns."""
+    """Stacks whose columns one program computes: those of a class, as far as they are no more than COLUMNS_AT_ONCE."""
     groups: list[list[Stack]] = []
     for stack in stacks:
         last = groups[-1] if groups else []
@@ -179,7 +179,7 @@ def candidate_columns(
 
 
 def blocks(columns: Columns) -> Iterator[Columns]:
-    """The columns in blocks of at most BLOCK, whose sizes differ by one: two programs at most."""
+    """The columns in blocks of at most COLUMNS_AT_ONCE, whose sizes differ by one: two programs at most."""
     count = max(1, -(-columns.force.shape[1] // COLUMNS_AT_ONCE))
     for parts in zip(*(np.array_split(np.asarray(a), count, axis=1) for a in columns), strict=True):
         yield Columns(*parts)

@@ -34,8 +34,9 @@ START, START_STD = (math.pi / 2, 0.0, 0.0, 0.0), (0.05, 0.05, 0.05, 0.05)
 """Prior of the first row: the arm held out level, at rest [rad, rad/s]."""
 WIDTH = 16
 one_start = StartBank((1, 1, 1, 1))
+"""The bank that `nnap-em identify` builds for this start."""
 wide_bank = StartBank((1, 13, 1, 1))
-"""The bank that `nnap-em identify` builds for the paper's acrobot."""
+"""The bank that it builds for the paper's acrobot, whose joint 2 is known to 0.5 rad."""
 
 
 class Network(NamedTuple):

@@ -227,8 +227,8 @@ MUTANTS = (
     Mutant(
         "lag-one covariance: gain transposed",
         "smoother/linear.py",
-        "product(spread_next, gain.T)",
-        "product(spread_next, gain)",
+        "product(later, gain.T)",
+        "product(later, gain)",
         SMOOTHER,
     ),
     Mutant(

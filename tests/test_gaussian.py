@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.numerics.gaussian import cholesky, cubature, lower, product, spd_solve, symmetric, upper_solve
+from nnap_em.numerics.gaussian import cholesky, lower, product, spd_solve, symmetric, upper_solve
 
 EPS = np.finfo(float).eps
 
@@ -68,17 +68,6 @@ def test_nothing_asks_lapack(dim):
 
     program = str(jax.make_jaxpr(jax.vmap(all_of_it))(jnp.zeros((3, dim, dim))))
     assert "cholesky[" not in program and "triangular_solve[" not in program
-
-
-@pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
-def test_cubature_has_the_moments_of_a_normal(dim):
-    x = np.asarray(cubature(dim, float))
-    assert x.shape == (2 * dim, dim)
-    np.testing.assert_allclose(x.mean(0), 0.0, atol=4 * EPS)
-    np.testing.assert_allclose(x.T @ x / len(x), np.eye(dim), atol=4 * dim * EPS)
-    np.testing.assert_allclose(
-        np.einsum("ni,nj,nk->ijk", x, x, x), 0.0, atol=4 * dim**1.5 * EPS
-    )  # exact to third order
 
 
 @pytest.mark.parametrize("dim", [4, 12])

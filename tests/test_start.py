@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from common_work import START_STD, one_start, wide_bank
 
+from nnap_em.data.rig import Declared
 from nnap_em.em.build import ALL_STARTS, MOVED, RATE_STARTS, build, measure_scales, read_at_start
 from nnap_em.em.loop import e_step
 from nnap_em.model.simulate import declared, examples, sweep_experiment
@@ -37,6 +39,14 @@ def test_an_angle_that_is_read_late_has_hypotheses():
     _, rig, _, data = _case("pendulum", LATE)
     assert _counts(rig, data).tolist() == [13, 5]
     assert _counts(rig, data._replace(y=jnp.nan_to_num(data.y))).tolist() == [1, 5]
+
+
+@pytest.mark.parametrize(("std", "bank"), [(START_STD[1], one_start), (0.5, wide_bank)])
+def test_the_banks_of_the_benchmark_are_those_of_their_priors(std, bank):
+    """Rows "as the library sets it" of docs/results/throughput.md, and the rows of a start known to 0.5 rad."""
+    _, rig, _, data = _case("acrobot", 0)
+    rig = dataclasses.replace(rig, start=rig.start | {"theta2": Declared(0.0, std)})
+    np.testing.assert_array_equal(build(rig, data, key=KEY).bank.offsets, bank.offsets)
 
 
 @pytest.mark.parametrize(("more", "read"), [(-1, True), (1, False)])

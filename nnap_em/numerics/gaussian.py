@@ -146,9 +146,3 @@ def _eliminated(a: Float[Array, "dim dim"], b: Float[Array, "dim *columns"]) -> 
 def symmetric(a: Float[Array, "*batch dim dim"]) -> Float[Array, "*batch dim dim"]:
     """The symmetric part of a."""
     return 0.5 * (a + jnp.swapaxes(a, -1, -2))
-
-
-def cubature(dim: int, dtype) -> Float[Array, "node dim"]:
-    """The 2 dim equal-weight points that match mean and covariance of N(0, I) [Arasaratnam & Haykin 2009, eq. 32]."""
-    eye = jnp.sqrt(jnp.asarray(dim, dtype)) * jnp.eye(dim, dtype=dtype)
-    return jnp.concatenate([eye, -eye])

@@ -85,7 +85,7 @@ class Cubature(eqx.Module):
         """One step about the whole Gaussian."""
         rows = cholesky(about.cov)
         reach = math.sqrt(len(rows))
-        spread = reach * lower(rows).T  # the points of `cubature` are opposite pairs along the columns of the factor
+        spread = reach * lower(rows).T  # the points are opposite pairs along the columns of the factor
         x = jnp.concatenate([about.mean[None] + spread, about.mean[None] - spread])
         y = jax.vmap(lambda x: model.transition(x, u))(x)
         ahead, behind = jnp.split(y, 2)

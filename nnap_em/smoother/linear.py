@@ -1,35 +1,41 @@
 """The posterior of a model that was linearised about a path."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics.gaussian import cholesky, cubature, lower, product
-from .kalman import Filtered, Smoothed
+from ..numerics.gaussian import cholesky, lower, product
+from .kalman import Affine, Filtered, Smoothed
 from .posterior import Posterior
 
 
 def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
     """The posterior of a model that was linearised about a path."""
-    prev, following = pair_nodes(smoothed)
-    endless = jnp.full_like(filtered.loglik, jnp.inf)
-    affine = jax.tree.map(lambda a: a[:-1, None], filtered.affine)
-    kick = following - (jnp.sum(affine.matrix * prev[..., None, :], axis=-1) + affine.offset)
-    return Posterior(smoothed.state, prev, following, kick, filtered.affine.noise[:-1], filtered.loglik, endless)
-
-
-def pair_nodes(smoothed: Smoothed) -> tuple[Float[Array, "steps node state"], Float[Array, "steps node state"]]:
-    """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) of every step."""
-
-    def one(mean, cov, gain, mean_next, cov_next):
-        n = mean.shape[0]
-        unit = cubature(2 * n, mean.dtype)
-        later = lower(cholesky(cov_next))
-        left = cov - product(product(gain, cov_next), gain.T)
-        factor = lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype)))
-        spread_next = product(unit[:, :n], later.T)
-        following = mean_next[None] + spread_next
-        return mean[None] + product(spread_next, gain.T) + product(unit[:, n:], factor.T), following
-
     mean, cov = smoothed.state
-    return jax.vmap(one)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:])
+    affine = jax.tree.map(lambda a: a[:-1], filtered.affine)
+    nodes = jax.vmap(_pair_nodes)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:], affine)
+    endless = jnp.full_like(filtered.loglik, jnp.inf)
+    return Posterior(smoothed.state, *nodes, affine.noise, filtered.loglik, endless)
+
+
+def _pair_nodes(
+    mean, cov, gain, mean_next, cov_next, affine: Affine
+) -> tuple[Float[Array, "node state"], Float[Array, "node state"], Float[Array, "node state"]]:
+    """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) and their kicks.
+
+    x_{k+1} = m_{k+1} + L z, x_k = m_k + G L z + C w with L L' the covariance of x_{k+1}, C C' that of x_k beyond it.
+    The 2 n points of (z, w) lie on its axes in opposite pairs, so that nodes are columns of these factors.
+    """
+    n = mean.shape[0]
+    reach = math.sqrt(2 * n)
+    left = cov - product(product(gain, cov_next), gain.T)
+    later = reach * lower(cholesky(cov_next)).T
+    alone = reach * lower(cholesky(left + 1e-14 * jnp.eye(n, dtype=mean.dtype))).T
+    before = jnp.concatenate([product(later, gain.T), alone])
+    after = jnp.concatenate([later, jnp.zeros_like(alone)])
+    kick = mean_next - product(affine.matrix, mean) - affine.offset
+    centres_and_axes = (mean, before), (mean_next, after), (kick, after - product(before, affine.matrix.T))
+    prev, following, kicks = (jnp.concatenate([at[None] + axes, at[None] - axes]) for at, axes in centres_and_axes)
+    return prev, following, kicks

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import batches, each
+from ..numerics.profile import stage
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
@@ -201,6 +202,7 @@ HELD_REST = 0.5
 """The same before the M-step is released: likelihoods are compared no more exactly."""
 
 
+@stage("EM")
 def fit(
     state: EMState,
     data: Dataset,

@@ -34,6 +34,7 @@ from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
+from ..numerics.profile import stage
 from ..prediction_error import simulated
 from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..prediction_error.noise import white_readings
@@ -130,6 +131,7 @@ def begin(
     return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
 
 
+@stage("first fit")
 def identify(
     rig: Rig,
     data: Dataset | Logs,

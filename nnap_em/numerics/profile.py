@@ -1,9 +1,10 @@
-"""Time of a run by program: those that were traced, lowered and compiled or loaded."""
+"""Time of a run by stage, and by program: those that were traced, lowered and compiled or loaded."""
 
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import jax
 
@@ -14,17 +15,37 @@ STAGES = {
 }
 """Events of JAX about a program; loading a cached one counts as compiling it."""
 
+STAGE = "/nnap_em/stage"
+_inside: ContextVar[bool] = ContextVar("nnap_em_stage", default=False)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Count the time inside as that of the stage `name` of an answer; a stage within another is part of that."""
+    if _inside.get():
+        yield
+        return
+    token, began = _inside.set(True), time.perf_counter()
+    try:
+        yield
+    finally:
+        _inside.reset(token)
+        jax.monitoring.record_event_duration_secs(STAGE, time.perf_counter() - began, stage=name)
+
 
 class Profile:
-    """The count and the seconds of every stage of every program so far."""
+    """The count and the seconds of every stage of the run, and of every stage of every program, so far."""
 
     def __init__(self) -> None:
+        self.stages: dict[str, list[float]] = defaultdict(list)
         self.spent: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
         self._began = time.perf_counter()
 
     def __call__(self, event: str, duration_secs: float, **labels: str | int) -> None:
         """One event, as `jax.monitoring` reports it."""
-        if event in STAGES:
+        if event == STAGE:
+            self.stages[str(labels["stage"])].append(duration_secs)
+        elif event in STAGES:
             name = str(labels.get("fun_name", "?")).removeprefix("jit(").removesuffix(")").removeprefix("jit_")
             self.spent[name][STAGES[event]].append(duration_secs)
 
@@ -35,8 +56,12 @@ class Profile:
         order = sorted(self.spent.items(), key=lambda one: -sum(map(sum, one[1].values())))
         programs = [(name, stages) for name, stages in order if stages["compile"]]
         every = {stage: [s for _, stages in order for s in stages[stage]] for stage in STAGES.values()}
+        other = elapsed - sum(map(sum, self.stages.values()))
         return "\n".join(
             [
+                row("stage", "count", "s", "", ""),
+                *(row(name, len(spent), f"{sum(spent):.2f}", "", "") for name, spent in self.stages.items()),
+                row("other", "", f"{other:.2f}", "", ""),
                 row("program", "count", "trace s", "lower s", "compile s"),
                 *(row(name, len(stages["compile"]), *seconds(stages)) for name, stages in programs),
                 row(f"all of {len(programs)} names", len(every["compile"]), *seconds(every)),

@@ -24,6 +24,7 @@ import numpy as np
 from .. import __version__
 from ..numerics.digest import digest
 from ..numerics.parallel import everywhere
+from ..numerics.profile import stage
 from .deadline import in_time
 from .files import Kind, read_arrays, refuse, sweep, write_arrays
 from .leaves import describe, name_of, restore
@@ -112,10 +113,14 @@ def keeping(journal: Journal) -> Iterator[None]:
 
 
 def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
-    """Makes a function a step; `form` gives, from the same arguments, the structure of what it returns."""
+    """Makes a function a step; `form` gives, from the same arguments, the structure of what it returns.
+
+    `--profile` counts its time as that of the stage with the name of its file.
+    """
 
     def make(function: _Step) -> _Step:
         @functools.wraps(function)
+        @stage(function.__module__.rpartition(".")[2])
         def remembered(*args, **options):
             journal = _journal.get()
             if journal is None:

@@ -181,9 +181,7 @@ def em_step(
 
 def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
-    return EMState(
-        0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), math.inf
-    )
+    return EMState(0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), np.inf)
 
 
 def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:

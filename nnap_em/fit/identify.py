@@ -178,10 +178,8 @@ def identify(
     state = fit(fitted.state, data, fitted.smoother, fitted.m_step, epochs=epochs, schedule=schedule, watch=watch)
     fitted = fitted._replace(state=state)
     if rig.memory and start is None:
-        remembered = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
-        fitted = fitted._replace(
-            state=remembered.state, m_step=remembered.m_step, memory="\n".join(remembered.sentences)
-        )
+        contacts = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
+        fitted = fitted._replace(state=contacts.state, m_step=contacts.m_step, memory="\n".join(contacts.sentences))
     rise = unsettled(fitted.state, schedule, int(np.max(np.sum(np.asarray(data.valid), axis=1))))
     return finished(fitted._replace(rise=rise), data)
 

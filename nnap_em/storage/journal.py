@@ -113,10 +113,7 @@ def keeping(journal: Journal) -> Iterator[None]:
 
 
 def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
-    """Makes a function a step; `form` gives, from the same arguments, the structure of what it returns.
-
-    `--profile` counts its time as that of the stage with the name of its file.
-    """
+    """Makes a function a step; `form` gives, from the same arguments, the structure of what it returns."""
 
     def make(function: _Step) -> _Step:
         @functools.wraps(function)

@@ -9,17 +9,8 @@ from .fit.observer import Observation, Observer
 from .fit.predict import Prediction
 from .identifiability.check import CheckResult
 
-__all__ = [
-    "CheckResult",
-    "Comparison",
-    "Design",
-    "Finding",
-    "FrictionTable",
-    "Logs",
-    "Observation",
-    "Observer",
-    "Prediction",
-]
+__all__ = ["CheckResult", "Comparison", "Design", "Finding", "FrictionTable", "Logs"]
+__all__ += ["Observation", "Observer", "Prediction"]
 
 
 def __dir__() -> list[str]:

@@ -1,10 +1,12 @@
 """The table of compiled programs."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 
 from nnap_em.numerics.parallel import each
-from nnap_em.numerics.profile import profiling
+from nnap_em.numerics.profile import profiling, stage
 
 
 def test_programs_are_counted_once_for_every_shape_and_by_name():
@@ -39,3 +41,18 @@ def test_a_program_for_every_sequence_is_compiled_once_whether_or_not_its_arrays
         again = each(_scaled, bound, batch)
     assert not profile.spent
     assert jnp.array_equal(first, again)
+
+
+def test_time_counts_for_the_outermost_stage_alone():
+    @stage("refit")
+    def inner():
+        time.sleep(0.02)
+
+    with profiling() as profile:
+        with stage("fit"):
+            inner()
+        inner()
+    (fit,), (refit,) = profile.spent["fit"]["run"], profile.spent["refit"]["run"]
+    assert fit >= 0.02 <= refit
+    rows = {line.split()[0]: line.split() for line in str(profile).splitlines()}
+    assert [rows[name][-1] for name in ("fit", "refit")] == [f"{fit:.2f}", f"{refit:.2f}"]

@@ -244,7 +244,7 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
         fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
-        fits.add_argument("--profile", action="store_true", help="print a table of the programs that were compiled")
+        fits.add_argument("--profile", action="store_true", help="print the seconds of stages and programs")
 
     compare = command("compare", "say what changed between fits of one machine", _COMPARE)
     _file(compare, "fits", "FIT", "model.npz, or the folder that holds it", nargs="+")

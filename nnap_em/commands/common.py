@@ -241,11 +241,8 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
     """
     same = _options(args, *OPTIONS, none=True)
     same = {name: str(value) if isinstance(value, Path) else value for name, value in same.items()}
-    of = {
-        "rig.toml": dataclasses.asdict(bench.rig) | {"file": ""},
-        "training data": fingerprint(bench.train.data),
-        **same,
-    }
+    rig = dataclasses.asdict(bench.rig) | {"file": ""}
+    of = {"rig.toml": rig, "training data": fingerprint(bench.train.data), **same}
     journal = Journal(args.out / UNFINISHED, of)
     if args.resume:
         journal.check()

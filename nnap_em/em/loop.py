@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import batches, each
+from ..numerics.profile import stage
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
@@ -180,9 +181,7 @@ def em_step(
 
 def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
     """The state before the first epoch."""
-    return EMState(
-        0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), math.inf
-    )
+    return EMState(0, model, model, model, m_step.no_hessian(model), np.full(1, -np.inf), 1.0, key, np.zeros(0), np.inf)
 
 
 def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
@@ -201,6 +200,7 @@ HELD_REST = 0.5
 """The same before the M-step is released: likelihoods are compared no more exactly."""
 
 
+@stage("EM")
 def fit(
     state: EMState,
     data: Dataset,

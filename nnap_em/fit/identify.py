@@ -34,6 +34,7 @@ from ..em.scale import holding, not_identifiable
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
+from ..numerics.profile import stage
 from ..prediction_error import simulated
 from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..prediction_error.noise import white_readings
@@ -130,6 +131,7 @@ def begin(
     return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
 
 
+@stage("first fit")
 def identify(
     rig: Rig,
     data: Dataset | Logs,
@@ -176,10 +178,8 @@ def identify(
     state = fit(fitted.state, data, fitted.smoother, fitted.m_step, epochs=epochs, schedule=schedule, watch=watch)
     fitted = fitted._replace(state=state)
     if rig.memory and start is None:
-        remembered = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
-        fitted = fitted._replace(
-            state=remembered.state, m_step=remembered.m_step, memory="\n".join(remembered.sentences)
-        )
+        contacts = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
+        fitted = fitted._replace(state=contacts.state, m_step=contacts.m_step, memory="\n".join(contacts.sentences))
     rise = unsettled(fitted.state, schedule, int(np.max(np.sum(np.asarray(data.valid), axis=1))))
     return finished(fitted._replace(rise=rise), data)
 

@@ -253,13 +253,7 @@ def _smoothed(state: EMState, rule: ScoringMStep, smoother: AbstractSmoother, da
 
 
 def remember(
-    state: EMState,
-    rule: ScoringMStep,
-    smoother: AbstractSmoother,
-    data: Dataset,
-    *,
-    epochs: int,
-    watch: Watch,
+    state: EMState, rule: ScoringMStep, smoother: AbstractSmoother, data: Dataset, *, epochs: int, watch: Watch
 ) -> Remembered:
     """The static fit `state`, or where data show memory a fit with a contact in each joint that shows it.
 
@@ -292,13 +286,7 @@ def remember(
 
 
 def _with(
-    fitted: _Fit,
-    bristle: DynamicFriction,
-    smoother: AbstractSmoother,
-    data: Dataset,
-    *,
-    epochs: int,
-    watch: Watch,
+    fitted: _Fit, bristle: DynamicFriction, smoother: AbstractSmoother, data: Dataset, *, epochs: int, watch: Watch
 ) -> _Fit | None:
     """EM from a fit on, over whole sequences, with a contact more; None where it diverges."""
     model, rule = with_contacts(straight_at_rest(fitted.model, [bristle]), fitted.rule, [bristle])

@@ -17,6 +17,7 @@ from ..diagnosis.outcome import Diagnosis, Step
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import GIVEN, Prediction
+from ..numerics.profile import stage
 from ..residual.innovations import tests
 from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
@@ -30,6 +31,7 @@ from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction, write_json
 
 
+@stage("report")
 def write_diagnosis(
     out: Path,
     diagnosis: Diagnosis,

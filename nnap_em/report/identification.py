@@ -19,6 +19,7 @@ from ..fit.misfit import misfits, moved
 from ..fit.predict import posterior_of
 from ..identifiability.check import dynamics
 from ..numerics.digits import counted
+from ..numerics.profile import stage
 from ..residual.residual import names_of
 from ..storage.files import replace_bytes
 from ..storage.log import Log
@@ -32,6 +33,7 @@ from .tables import visited_nodes, write_friction, write_json
 from .wording import reached, sentence
 
 
+@stage("report")
 def write_identification(
     out: Path,
     fitted: Identified,

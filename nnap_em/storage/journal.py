@@ -24,6 +24,7 @@ import numpy as np
 from .. import __version__
 from ..numerics.digest import digest
 from ..numerics.parallel import everywhere
+from ..numerics.profile import stage
 from .deadline import in_time
 from .files import Kind, read_arrays, refuse, sweep, write_arrays
 from .leaves import describe, name_of, restore
@@ -116,6 +117,7 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
 
     def make(function: _Step) -> _Step:
         @functools.wraps(function)
+        @stage(function.__module__.rpartition(".")[2])
         def remembered(*args, **options):
             journal = _journal.get()
             if journal is None:

@@ -19,7 +19,7 @@ class Slide(AbstractSystem):
     angles: ClassVar[tuple[bool, ...]] = (False,)
 
     variations: ClassVar[dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]] = {
-        ("payload", 1): (lambda slide, mass: replace(slide, m=slide.m + mass), lambda slide: slide.m),
+        ("payload", 1): (lambda slide, mass: replace(slide, m=slide.m + mass), lambda slide: slide.m)
     }
 
     m: Float[Array, ""]

@@ -33,6 +33,8 @@ from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import StateSpaceModel
 from nnap_em.smoother.kalman import CUBATURE
 
+NATIVE = "-march=native"
+
 
 def hidden_error(online: Observer, data: Dataset, x: np.ndarray, settled: int = 100) -> tuple[float, int]:
     """RMS error of theta2 [rad] after the first rows of every sequence, and the number of new starts."""
@@ -81,12 +83,13 @@ def alike(fitted: Identified, truth: StateSpaceModel, rows: int, folder: Path) -
         write_observer(fitted, source, single=bits == 32)
         found = play(source, t, u, y, 4, kind)
         gap, other = np.max(np.abs(found.mean - states.mean) / std), np.sum(found.flags != states.flags)
-        seconds = play(source, t[:4000], u[:4000], clean[:4000], 4, kind).seconds
+        log = t[:4000], u[:4000], clean[:4000], 4, kind
+        seconds = play(source, *log).seconds, play(source, *log, NATIVE).seconds
         yield (
             f"C, {bits} bits, beside Python: {rows} rows with gaps and spikes",
             f"{gap:.1e} standard deviations; {other} rows with other flags",
         )
-        yield f"a step in C, {bits} bits, gcc -O2", f"{1e6 * seconds:.1f} us"
+        yield f"a step in C, {bits} bits, gcc -O2; {NATIVE}", f"{1e6 * seconds[0]:.1f}; {1e6 * seconds[1]:.1f} us"
     yield "a step in Python, jitted, theta2 hidden", f"{1e6 * python_time(online, u[:2000], clean[:2000]):.0f} us"
 
 
@@ -98,7 +101,8 @@ def six_joints(folder: Path) -> Iterator[tuple[str, str]]:
     write_observer(fitted, source)
     t, u, y = (np.asarray(a[0]) for a in (data.t, data.u, data.y))
     lines = source.read_text().count("\n")
-    yield f"a step in C for six joints ({lines} lines)", f"{1e6 * play(source, t, held(u), y, 12).seconds:.0f} us"
+    seconds = [play(source, t, held(u), y, 12, np.float64, *options).seconds for options in ((), (NATIVE,))]
+    yield f"a step in C for six joints ({lines} lines); {NATIVE}", f"{1e6 * seconds[0]:.0f}; {1e6 * seconds[1]:.0f} us"
 
 
 def wild_runs(fitted: Identified, steps: int, folder: Path) -> Iterator[tuple[str, str]]:

@@ -111,9 +111,12 @@ def compiled(source: Path, program: str, out: str, *options: str) -> Path:
     return source.with_name(out)
 
 
-def play(source: Path, t: np.ndarray, u: np.ndarray, y: np.ndarray, states: int, kind: type = np.float64) -> Played:
-    """A log through a written observer; `u` are the inputs held from the row before."""
-    library = ctypes.CDLL(str(compiled(source, LOOP, f"{source.stem}.so", "-shared", "-fPIC")))
+def play(
+    source: Path, t: np.ndarray, u: np.ndarray, y: np.ndarray, states: int, kind: type = np.float64, *options: str
+) -> Played:
+    """A log through a written observer; `u` are the inputs held from the row before, `options` those of gcc."""
+    out = "".join([source.stem, *options, ".so"])
+    library = ctypes.CDLL(str(compiled(source, LOOP, out, "-shared", "-fPIC", *options)))
     rows = len(t)
     mean, cov, innovation = (np.zeros(s, kind) for s in ((rows, states), (rows, states, states), np.shape(y)))
     flags = np.zeros(rows, np.int32)

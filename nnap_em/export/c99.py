@@ -30,7 +30,7 @@ CALLS: dict[str, str] = {
 )}  # fmt: skip
 """C of NumPy's functions."""
 WHOLE = """/* The whole number that a floating one is; 0 where none is. */
-static inline long whole(double x) { return x > -2e9 && x < 2e9 ? (long)x : 0; }
+static inline int whole(double x) { return (int)(x > -2000000000 && x < 2000000000 ? x : 0); }
 """
 OPERATORS: dict[type, str] = {
     ast.Add: "({} + {})", ast.Sub: "({} - {})", ast.Mult: "({} * {})", ast.Div: "({} / {})", ast.Pow: "pow({}, {})",
@@ -156,26 +156,38 @@ class Dialect(NamedTuple):
 PLAIN = Dialect()
 
 
-def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau") -> str:
-    """A C function of arrays, whose last argument `out` is the result."""
+def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points: str = "") -> str:
+    """A C function of arrays, whose last argument `out` is the result.
+
+    With `points` of them the first argument and the result have an axis more; curves are read before the loop over it.
+    """
     results, real = [text for result in source.results for text in result], dialect.real
-    arrays = [f"const {real} {name}[{size or 1}]" for name, size in source.sizes.items()]
-    lines = [f"{dialect.words} {source.name}({', '.join(arrays)}, {real} {out}[{len(results) or 1}])", "{"]
+    along, at, own = (f"[{points}]", "[l]", "restrict ") if points else ("", "", "")
+    loop, inside, first = f"for (int l = 0; l < {points}; l++)", [], next(iter(source.sizes), "")
+    axes = {name: f"[{size or 1}]{along if name == first else ''}" for name, size in source.sizes.items()}
+    arrays = ", ".join(f"const {real} {name}{axis}" for name, axis in axes.items())
+    lines = [f"{dialect.words} {source.name}({arrays}, {real} {out}[{own}{len(results) or 1}]{along})", "{"]
     code = "\n".join((*source.lines, *results))
     for name, size in source.sizes.items():
-        lines += [
-            f"    const {real} {name}{i} = {name}[{i}];" for i in range(size) if re.search(rf"\b{name}{i}\b", code)
-        ]
         lines += [f"    (void){name};"]
+        used = (i for i in range(size) if re.search(rf"\b{name}{i}\b", code))
+        inside += [f"    const {real} {name}{i} = {name}[{i}]{at if name == first else ''};" for i in used]
     whole_numbers: set[str] = set()
     for line in source.lines:
         name, _, text = line.partition(" = ")
+        if points and (call := re.fullmatch(rf"(\w+)\({first}(\d+)\)", text)):
+            lines += [f"    {real} {name}s{along};", f"    {loop} {name}s{at} = {call[1]}({first}[{call[2]}]{at});"]
+            inside.append(f"    const {real} {name} = {name}s{at};")
+            continue
         node = ast.parse(text, mode="eval").body
         if _whole(node, whole_numbers):
             whole_numbers.add(name)
-        lines.append(f"    const {'long' if name in whole_numbers else real} {name} = {_c(node, dialect)};")
-    lines += [f"    {out}[{i}] = {_c(ast.parse(text, mode='eval').body, dialect)};" for i, text in enumerate(results)]
-    return "\n".join([*lines, "}", ""])
+        inside.append(f"    const {'int' if name in whole_numbers else real} {name} = {_c(node, dialect)};")
+    final = (_c(ast.parse(text, mode="eval").body, dialect) for text in results)
+    inside += [f"    {out}[{i}]{at} = {text};" for i, text in enumerate(final)]
+    if points:
+        inside = [f"    {loop} {{", *(f"    {line}" for line in inside), "    }"]
+    return "\n".join([*lines, *inside, "}", ""])
 
 
 def _whole(node: ast.AST, names: set[str]) -> bool:

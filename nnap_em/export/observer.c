@@ -25,41 +25,44 @@ static void triangle(real w[N][3 * N + 1], int columns, real s[N][N])
     }
 }
 
-/* The state one row later, by Runge-Kutta steps. */
-static void transition(const real *in, const real *p, real x[N])
+/* States one row later, by Runge-Kutta steps; points are the last axis, so that a compiler with vectors may use them. */
+static void transition(const real *in, const real *p, real x[N][2 * N])
 {
     static const real ahead[4] = {(real)0.5, (real)0.5, 1, 0}, share[4] = {1, 2, 2, 1};
     const real h = (real)(DT / SUBSTEPS);
     for (int n = 0; n < SUBSTEPS; n++) {
-        real at[N], next[N], slope[N];
-        for (int i = 0; i < N; i++) at[i] = next[i] = x[i];
+        real at[N][2 * N], start[N][2 * N], slope[N][2 * N];
+        for (int i = 0; i < N; i++)
+            for (int j = 0; j < 2 * N; j++) at[i][j] = start[i][j] = x[i][j];
         for (int stage = 0; stage < 4; stage++) {
-            rate(at, in, p, slope);
-            for (int i = 0; i < N; i++) {
-                at[i] = x[i] + h * ahead[stage] * slope[i];
-                next[i] += h / 6 * share[stage] * slope[i];
-            }
+            const real forward = h * ahead[stage], part = h / 6 * share[stage];
+            rate((const real (*)[2 * N])at, in, p, slope);
+            for (int i = 0; i < N; i++)
+                for (int j = 0; j < 2 * N; j++) {
+                    at[i][j] = start[i][j] + forward * slope[i][j];
+                    x[i][j] += part * slope[i][j];
+                }
         }
-        for (int i = 0; i < N; i++) x[i] = next[i];
     }
 }
 
-/* One branch a row later, by cubature. */
+/* One branch a row later, by cubature: the points are opposite pairs along the columns of the root. */
 static void predict(const real *in, const real *p, nnap_branch *b)
 {
-    real points[2][N][N], w[N][3 * N + 1], reach = SQRT((real)N);
-    for (int j = 0; j < N; j++)
-        for (int side = 0; side < 2; side++) {
-            for (int i = 0; i < N; i++) points[side][j][i] = b->mean[i] + (side ? -reach : reach) * b->root[i][j];
-            transition(in, p, points[side][j]);
+    real x[N][2 * N], w[N][3 * N + 1], reach = SQRT((real)N);
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j < N; j++) {
+            x[i][j] = b->mean[i] + reach * b->root[i][j];
+            x[i][N + j] = b->mean[i] - reach * b->root[i][j];
         }
+    transition(in, p, x);
     for (int i = 0; i < N; i++) {
         real sum = 0;
-        for (int j = 0; j < N; j++) sum += points[0][j][i] + points[1][j][i];
+        for (int j = 0; j < N; j++) sum += x[i][j] + x[i][N + j];
         b->mean[i] = sum / (2 * N);
         for (int j = 0; j < N; j++) {
-            w[i][j] = (points[0][j][i] - points[1][j][i]) / (2 * reach);
-            w[i][N + j] = ((points[0][j][i] + points[1][j][i]) / 2 - b->mean[i]) / reach;
+            w[i][j] = (x[i][j] - x[i][N + j]) / (2 * reach);
+            w[i][N + j] = ((x[i][j] + x[i][N + j]) / 2 - b->mean[i]) / reach;
             w[i][2 * N + j] = i == j ? p[PROCESS + i] : 0;
         }
     }

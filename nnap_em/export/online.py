@@ -1,8 +1,10 @@
 """The observer of a fit as C99: the filter of `fit/observer.py` by square roots, and the model in scalars."""
 
 import dataclasses
+import math
 import re
 from pathlib import Path
+from string import Template
 from typing import Any, NamedTuple
 
 import jax
@@ -26,78 +28,60 @@ from .unroll import named
 
 BRANCHES = 16
 """Gaussians at most, where an angle is not read."""
-DEGREE, SEGMENTS, BEYOND = 5, 1024, 1.5
-"""Polynomials of a friction table: their degree, their number at most, and the end of the table over the largest rate
-of interest."""
+DEGREE, HALVINGS, BEYOND = 7, 5, 6.0
+"""Polynomials of a friction table: their degree, the halvings of an octave at most, and the end of the table over the
+largest rate of interest: the first estimates of a machine in motion are that wide."""
 EXACT = {False: 1e-11, True: 1e-6}
 """Largest error of a friction table over the size of the torque, in 64 and 32 bits; else the network is kept."""
 
 
 class Table(NamedTuple):
-    """A friction curve as polynomials on equal parts of asinh(v / knee).
+    """A friction curve as polynomials in s = 1 + |v| / knee, on equal parts of every octave of s, for v >= 0 and v < 0.
 
-    A step of the acrobot takes 6.5 us with it and 34 us with the network.
+    The leading bits of a floating number are those of its octave and part: no logarithm finds the polynomial.
     """
 
     name: str
     knee: float
-    end: float
-    """asinh(v / knee) at the ends."""
-    coefficients: Float[np.ndarray, "segment power"]
+    bits: int
+    """Halvings of an octave."""
+    rows: Float[np.ndarray, "segment entry"]
+    """Coefficients, and the s that they are about."""
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         """Torque at velocities."""
-        w = (np.arcsinh(v / self.knee) / self.end + 1) * (len(self.coefficients) / 2)
-        segment = np.clip(np.floor(w).astype(int), 0, len(self.coefficients) - 1)
-        powers = np.stack([(w - segment) ** k for k in range(DEGREE + 1)], axis=-1)
-        return np.sum(self.coefficients[segment] * powers, axis=-1)
+        half, s = len(self.rows) // 2, 1 + np.abs(v) / self.knee
+        segment = np.clip(np.searchsorted(self.rows[:half, -1], s, "right") - 1, 0, half - 1) + np.where(v < 0, half, 0)
+        powers = np.stack([(s - self.rows[segment, -1]) ** k for k in range(DEGREE + 1)], axis=-1)
+        return np.sum(self.rows[segment, :-1] * powers, axis=-1)
 
     def text(self, dialect: Dialect) -> str:
         """The table and its function in C; beyond its ends is the network."""
-        count = len(self.coefficients)
-        rows = ",\n".join("    {" + ", ".join(dialect.number(float(x)) for x in row) + "}" for row in self.coefficients)
-        horner = f"c[{DEGREE}]"
-        for k in reversed(range(DEGREE)):
-            horner = f"c[{k}] + t * ({horner})"
-        number = dialect.number
-        return f"""static const {dialect.real} {self.name}_rows[{count}][{DEGREE + 1}] = {{
-{rows}}};
-
-static {dialect.real} {self.name}({dialect.real} v)
-{{
-    const {dialect.real} size = FABS(v) * {number(1 / self.knee)};
-    const {dialect.real} w = LOG(size + SQRT(1 + size * size)) * {number(count / 2 / self.end)};
-    const {dialect.real} at = {count // 2} + (v < 0 ? -w : w);
-    if (!(at > 0 && at < {count})) {{
-        {dialect.real} torque;
-        {self.name}_network(&v, &torque);
-        return torque;
-    }}
-    const int i = (int)at;
-    const {dialect.real} t = at - i, *c = {self.name}_rows[i];
-    return {horner};
-}}
-"""
+        half, number = len(self.rows) // 2, dialect.number
+        rows = ",\n".join("    {" + ", ".join(number(float(x)) for x in row) + "}" for row in self.rows)
+        ends = f"{number(1 / self.knee)}, {number(float(2 ** (half >> self.bits)))}, {self.bits}, {half}"
+        return (
+            f"static const real {self.name}_rows[{2 * half}][DEGREE + 2] = {{\n{rows}}};\nTABLE({self.name}, {ends})\n"
+        )
 
 
 def table(curve: Any, name: str, speed: float, knee: float, share: float) -> Table | None:
     """A curve as a table that errs by `share` of its size at most, if one does."""
-    end = float(np.arcsinh(BEYOND * speed / knee))
     unit = 0.5 - 0.5 * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))  # Chebyshev's nodes
-    checks = np.linspace(0.0, 1.0, 13)
+    checks, octaves = np.linspace(0.0, 1.0, 13), math.ceil(math.log2(1 + BEYOND * speed / knee))
+    for bits in range(2, HALVINGS + 1):
+        width = np.repeat(2.0 ** (np.arange(octaves) - bits), 2**bits)
+        edge = 1 + np.cumsum(width) - width
 
-    def values(at: np.ndarray, count: int) -> np.ndarray:
-        w = (np.arange(count)[:, None] + at[None]) * (2 / count) - 1
-        return np.asarray(curve(jnp.asarray(knee * np.sinh(end * w)).ravel())).reshape(w.shape)
+        def values(at: np.ndarray, edge=edge, width=width) -> np.ndarray:
+            size = knee * (edge[:, None] + width[:, None] * at - 1)
+            return np.asarray(curve(jnp.asarray(np.concatenate([size, -size])).ravel())).reshape(-1, len(at))
 
-    count = 32
-    while count <= SEGMENTS:
-        coefficients = np.linalg.solve(np.vander(unit, increasing=True), values(unit, count).T).T
-        truth = values(checks, count)
+        coefficients, truth = np.linalg.solve(np.vander(unit, increasing=True), values(unit).T).T, values(checks)
         error = np.max(np.abs(coefficients @ np.vander(checks, DEGREE + 1, increasing=True).T - truth))
         if error <= share * np.max(np.abs(truth)):
-            return Table(name, knee, end, coefficients)
-        count *= 2
+            scaled = coefficients / np.tile(width, 2)[:, None] ** np.arange(DEGREE + 1)
+            return Table(name, knee, bits, np.column_stack([scaled, np.tile(edge, 2)]))
     return None
 
 
@@ -219,7 +203,8 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
         unrolled("reading", reading, x=x, row=row, p=p),
         unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1), p=p),
     ]
-    return [*texts, *(function(source, dialect) for source in sources)], flat.size
+    texts.append(function(sources[0], dialect, points="2 * N"))
+    return [*texts, *(function(source, dialect) for source in sources[1:])], flat.size
 
 
 def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str], memory: int) -> str:
@@ -231,7 +216,8 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
         "N": n, "M": m, "D": drives, "SCALES": scales, "COLUMNS": drives + scales, "MEMORY": memory,
         "PARAMETERS": len(own.names), "NOISE": len(own.names) - n - m, "PROCESS": len(own.names) - n,
         "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles),
-        "LONGEST_GAP": max(10, round(1 / model.dt)),
+        "LONGEST_GAP": max(10, round(1 / model.dt)), "DEGREE": DEGREE,
+        "DIGITS": 23 if dialect.single else 52, "BIAS": 127 if dialect.single else 1023,
     }  # fmt: skip
     reals = {
         "GATE": observing.GATE, "FORGET": observing.FORGET, "DIVERGED": observing.DIVERGED, "TWIN": observing.TWIN,
@@ -245,8 +231,8 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
     calls = ("sqrt", "fabs", "exp", "log", "fmax")
     lines = [
         f"/* Observer of {_comment(fitted.rig.name)}: written by nnap_em {__version__}.  Link with -lm. */",
-        f'#include "{name}.h"\n\n#include <math.h>\n',
-        f"typedef {name}_real real;",
+        f'#include "{name}.h"\n\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n',
+        f"typedef {name}_real real;\ntypedef uint{32 if dialect.single else 64}_t bits;",
         f"enum {{ {', '.join(f'{key} = {value}' for key, value in sizes.items())} }};",
         f"#define DT {model.dt!r}",
         *(f"#define {key} ({dialect.number(float(value))})" for key, value in reals.items()),
@@ -256,64 +242,40 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
         f"#define BRANCHES {_branches(fitted)}",
         *([f"static const int angles[ANGLES] = {{{', '.join(map(str, angles))}}};"] if angles else []),
     ]
-    template = Path(__file__).with_name("observer.c").read_text(encoding="utf-8").replace("nnap_", f"{name}_")
-    return "\n".join([*lines, "", WHOLE, *functions, template])
+    return "\n".join(
+        [
+            *lines,
+            "",
+            WHOLE.replace("double", dialect.real),
+            _template("table.c", name),
+            *functions,
+            _template("observer.c", name),
+        ]
+    )
 
 
 def _header(fitted: Identified, name: str, dialect: Dialect, memory: int) -> str:
     """Declarations of the C file, with the meaning of every number."""
     rig, system, own = fitted.rig, fitted.model.system, numbers(fitted)
-    names = system.coordinates + system.rates
-    states = ", ".join(f"{x} [{system.unit(x)}]" for x in names)
-    extra = fitted.model.log_q.shape[0] - len(names)
-    columns = (*rig.input_columns, *rig.scale_columns)
-    real, upper = "float" if dialect.single else "double", name.upper()
+    names, columns = system.coordinates + system.rates, (*rig.input_columns, *rig.scale_columns)
+    states, extra = [f"{x} [{system.unit(x)}]" for x in names], fitted.model.log_q.shape[0] - len(names)
     sizes = {
         "STATES": len(names) + extra, "READINGS": len(rig.measured), "INPUTS": len(columns),
         "PARAMETERS": len(own.names), "BRANCHES": _branches(fitted),
     }  # fmt: skip
-    flags = ("MISSING", "OUTLIER", "NO_INPUT", "RESTARTED", "AMBIGUOUS", "JUMP")
-    members = {
-        "mean": "STATES", "std": "STATES", "innovation": "READINGS", "parameter": "PARAMETERS", "u": "INPUTS",
-        "late": "READINGS",
+    words = {
+        "rig": rig.name, "version": __version__, "dt": f"{rig.dt:g}", "columns": ", ".join(columns) or "none",
+        "states": ", ".join(states) + (f", {extra} of laws with memory" if extra else ""),
+        "measured": ", ".join(rig.measured), "parameters": ", ".join(own.names), "gate": f"{observing.GATE:g}",
+        "sizes": ", ".join(f"{name.upper()}_{key} = {size}" for key, size in sizes.items()), "memory": max(memory, 1),
+        "real": "float" if dialect.single else "double", "drives": max(len(system.joints), 1),
     }  # fmt: skip
-    arrays = "\n".join(f"    {name}_real {key}[{upper}_{size} + !{upper}_{size}];" for key, size in members.items())
-    return f"""/* Observer of {_comment(rig.name)}: written by nnap_em {__version__}.
-   SI units, a row every {rig.dt:g} s.  States: {states}{f", {extra} of laws with memory" if extra else ""}.
-   Inputs u, held from the row before to this one: {_comment(", ".join(columns) or "none")}.
-   Readings y; NaN is none: {_comment(", ".join(rig.measured))}.
-   Parameters: {_comment(", ".join(own.names))}.
+    return Template(_template("observer.h", name)).substitute({key: _comment(f"{x}") for key, x in words.items()})
 
-   {name}_start(&s, time), then in every row flags = {name}_step(&s, time, u, y); a time that is NaN is the next row's.
-   s.mean and s.std are the estimate, s.innovation the readings minus their prediction over the standard deviation,
-   s.misfit the mean of their squares (1 where the model is right), s.weight the probability of this branch. */
-#ifndef {upper}_H
-#define {upper}_H
 
-enum {{ {", ".join(f"{upper}_{key} = {size}" for key, size in sizes.items())} }};
-/* A reading is no number; one is beyond {observing.GATE:g} standard deviations and not read; an input is no number and
-   the one before holds; the estimate diverged and starts anew; several branches are left; stamps are not in a row. */
-enum {{ {", ".join(f"{name}_{flag} = {1 << i}" for i, flag in enumerate(flags))} }};
-
-typedef {real} {name}_real;
-typedef struct {{
-    {name}_real mean[{upper}_STATES], root[{upper}_STATES][{upper}_STATES], log_weight;
-    {name}_real innovation[{upper}_READINGS];
-}} {name}_branch;
-typedef struct {{
-{arrays}
-    {name}_real misfit, weight, memory[{max(memory, 1)}], fed[{max(len(system.joints), 1)}];
-    double stamp, odd, time, age;
-    int rows, live;
-    {name}_branch branch[{upper}_BRANCHES + 2];
-}} {name}_state;
-
-void {name}_start({name}_state *s, double time);
-int {name}_step({name}_state *s, double time, const {name}_real *u, const {name}_real *y);
-void {name}_covariance(const {name}_state *s, {name}_real *covariance);
-
-#endif
-"""
+def _template(file: str, name: str) -> str:
+    text = Path(__file__).with_name(file).read_text(encoding="utf-8")
+    return re.sub("nnap_(?!em)", f"{name}_", text).replace("NNAP_", f"{name.upper()}_")
 
 
 def _branches(fitted: Identified) -> int:

@@ -5,6 +5,7 @@ it an online estimate has a gate for outliers, an end of branches that lose, and
 [Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", secs. 3.4 and 5.4]
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,12 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from ..model import hooks
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
-from ..numerics.gaussian import Gaussian, symmetric
+from ..numerics.gaussian import MOST_UNROLLED, Gaussian, symmetric
 from ..smoother.kalman import CUBATURE, Cubature, Tangent, absorbed, linear_reading, moved
 from ..smoother.mixture import WIDE_STD, Components, merged, split
 from .identify import Identified
@@ -57,24 +59,25 @@ class Observation(NamedTuple):
     """Probability of the likeliest branch."""
     flags: Int[Array, ""]
     """Bits of `MISSING`, `OUTLIER`, `NO_INPUT`, `RESTARTED` and `AMBIGUOUS`."""
+    memory: Float[Array, " memory"]
+    """Memory for the next row, `_Memory` as one array: each array of a state costs 5 us a step outside of a loop."""
+
+
+class _Memory(NamedTuple):
+    """State of the filter between rows: all branches with the log of their weights, 0 for the likeliest and -inf for a
+    free place; memory of what lies between commands and drives, inputs that are held and what they set at the drives;
+    readings that wait for the input of their row, NaN where none does; time on the clock of the logs and since the
+    first row, below 0 before it [s]; rows since the last start, up to `SETTLING`."""
+
     branches: Gaussian
-    """All branches, with a leading axis."""
     log_weight: Float[Array, " branch"]
-    """Log of their weights, 0 for the likeliest; -inf for a free place."""
     commands: Any
-    """Memory of what lies between commands and drives."""
     u: Float[Array, " column"]
-    """Inputs that are held."""
     fed: Float[Array, " input"]
-    """Values that the commands set at the drives over the last interval."""
     late: Float[Array, " obs"]
-    """Readings that wait for the input of their row; NaN where none does."""
     time: Float[Array, ""]
-    """Time of the row, on the clock of the logs [s]."""
     age: Float[Array, ""]
-    """Since the first row [s]; below 0 before it."""
-    rows: Int[Array, ""]
-    """Number of rows since the last start."""
+    rows: Float[Array, ""]
 
 
 class Observer(NamedTuple):
@@ -160,6 +163,8 @@ def functions(
     model: StateSpaceModel, angles: tuple[int, ...], again: Gaussian, branches: int, linearise: Tangent | Cubature
 ) -> tuple[Callable[..., Observation], Callable[..., Observation]]:
     """`start` and `step` of a model whose `angles` may be in several places, with the prior of a new start."""
+    if isinstance(model.unknown, FrictionNetwork) and model.log_q.shape[0] <= MOST_UNROLLED:
+        model = dataclasses.replace(model, unknown=model.unknown.by_entry())
     commands = hooks.command_stream(model.effects, model.servos, model.system, model.dt)
     dtype, drives, dof = model.log_q.dtype, len(model.system.joints), len(model.system.coordinates)
     q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
@@ -171,17 +176,18 @@ def functions(
         every = jax.tree.map(lambda a: jnp.broadcast_to(a, (branches, *a.shape)), prior)
         return every, jnp.where(jnp.arange(branches) == 0, zero, -jnp.inf)
 
-    def start(time: float | Float[Array, ""] = 0.0) -> Observation:
-        nothing, time = jnp.zeros(len(waits), dtype), jnp.asarray(time, dtype)
-        every, log_weight = alone(model.start)
-        return Observation(
-            mean=model.start.mean, cov=model.start.cov, innovation=nothing, misfit=zero + 1, weight=zero + 1,
-            flags=jnp.asarray(0), branches=every, log_weight=log_weight, commands=commands.memory,
-            u=jnp.zeros(columns, dtype), fed=jnp.zeros(drives, dtype), late=nothing + jnp.nan, time=time - model.dt,
-            age=zero - model.dt, rows=jnp.asarray(0),
-        )  # fmt: skip
+    nothing = jnp.zeros(len(waits), dtype)
+    blank = _Memory(
+        *alone(model.start), commands.memory, jnp.zeros(columns, dtype), jnp.zeros(drives, dtype),
+        late=nothing + jnp.nan, time=zero, age=zero - model.dt, rows=zero,
+    )  # fmt: skip
+    unpacked = ravel_pytree(blank)[1]
 
-    def taken(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
+    def start(time: float | Float[Array, ""] = 0.0) -> Observation:
+        begun = blank._replace(time=jnp.asarray(time, dtype) - model.dt)
+        return Observation(*model.start, nothing, zero + 1, zero + 1, jnp.asarray(0), ravel_pytree(begun)[0])
+
+    def taken(state: _Memory, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
         first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
         u = jnp.where(first, 0.0, jnp.where(sound, u, state.u))
         memory, fed = commands.step(state.commands, u, state.age < 0.5 * model.dt)
@@ -204,7 +210,8 @@ def functions(
         now = absorbed(ahead, linear_reading(model, ahead.mean, row.here), r, row.y, row.read, row.gate)
         return now[0], before[0] + now[1], before[1] + now[2]
 
-    def step(state: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
+    def step(before: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
+        state = unpacked(before.memory)
         row, live = taken(state, u, y), jnp.isfinite(state.log_weight)
         best = jnp.argmax(state.log_weight)
         every, innovation, log_variance = _every(
@@ -215,7 +222,7 @@ def functions(
         best = jnp.argmax(log_weight)
         count = jnp.sum(row.read) + jnp.sum(jnp.isfinite(state.late))
         square = jnp.sum(jnp.minimum(innovation[best] ** 2, GATE**2)) / jnp.maximum(count, 1).astype(dtype)
-        misfit = state.misfit + jnp.where(count > 0, FORGET, 0.0) * (square - state.misfit)
+        misfit = before.misfit + jnp.where(count > 0, FORGET, 0.0) * (square - before.misfit)
         known = jnp.all(jnp.abs(every.mean[best]) < LARGEST_STATE) & jnp.all(jnp.isfinite(every.cov[best]))
         sane = (misfit < DIVERGED) & known & jnp.isfinite(log_weight[best])
         innovation = jnp.where(sane, innovation[best], 0.0)
@@ -227,11 +234,13 @@ def functions(
         best = jnp.argmax(log_weight)
         (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
         outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
+        after = _Memory(
+            every, log_weight, row.memory, row.u, row.held.u, row.late, row.time, row.age,
+            jnp.where(sane, jnp.minimum(state.rows + 1, SETTLING), 1.0),
+        )  # fmt: skip
         return Observation(
-            mean=mean, cov=cov, innovation=innovation, misfit=jnp.where(sane, misfit, 1.0),
-            weight=1 / jnp.sum(jnp.exp(log_weight)), branches=every, log_weight=log_weight, commands=row.memory,
-            flags=row.flags + _bits({OUTLIER: outlier, RESTARTED: ~sane, AMBIGUOUS: ambiguous}), u=row.u,
-            fed=row.held.u, late=row.late, time=row.time, age=row.age, rows=jnp.where(sane, state.rows + 1, 1),
+            mean, cov, innovation, jnp.where(sane, misfit, 1.0), 1 / jnp.sum(jnp.exp(log_weight)),
+            row.flags + _bits({OUTLIER: outlier, RESTARTED: ~sane, AMBIGUOUS: ambiguous}), ravel_pytree(after)[0],
         )  # fmt: skip
 
     return start, jax.jit(step)

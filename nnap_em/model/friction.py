@@ -41,6 +41,9 @@ def _torque_jvp(primals, tangents):
     return torque, moved
 
 
+_together = eqx.filter_vmap(lambda mlp, features: mlp(features))
+
+
 class FrictionNetwork(AbstractJointMap):
     """tau_f(v): joint velocities [rad/s] to joint torques [N m], a network for each joint.
 
@@ -79,19 +82,22 @@ class FrictionNetwork(AbstractJointMap):
         speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
         return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
 
-    def torque(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        """Friction torque at joint velocities [N m]."""
+    def torque(self, v: Float[Array, " dof"], through: Callable = _together) -> Float[Array, " dof"]:
+        """Friction torque at joint velocities [N m], `through` the networks of all joints."""
         if self.rest is None:
-            return self._network(v)
+            return self._network(v, through)
         edge = jnp.where(self.rest > 0, self.rest, 1.0)
-        high, low = self._network(edge), self._network(-edge)
+        high, low = self._network(edge, through), self._network(-edge, through)
         line = 0.5 * (high + low) + 0.5 * (high - low) * v / edge
-        return jnp.where(jnp.abs(v) < self.rest, line, self._network(v))
+        return jnp.where(jnp.abs(v) < self.rest, line, self._network(v, through))
 
-    def _network(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    def by_entry(self) -> "FixedFriction":
+        """This map in scalars, which fuse: for one state each product of a layer is a program of its own."""
+        return FixedFriction(lambda v: self.torque(v, _in_scalars), self.scale)
+
+    def _network(self, v: Float[Array, " dof"], through: Callable) -> Float[Array, " dof"]:
         top = asinh(self.speed / self.knee)
-        features = jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1)
-        return self.scale * eqx.filter_vmap(lambda mlp, f: mlp(f))(self.mlp, features)
+        return self.scale * through(self.mlp, jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1))
 
     @eqx.filter_jit
     def nodes(self, count: int) -> Float[Array, "dof count"]:
@@ -127,6 +133,17 @@ def _networks(key: PRNGKeyArray, speed: Float[Array, " dof"], width: int, depth:
     """One for every joint, at random."""
     make = lambda key: eqx.nn.MLP(2, "scalar", width, depth, jax.nn.tanh, dtype=speed.dtype, key=key)  # noqa: E731
     return eqx.filter_vmap(make)(jax.random.split(key, speed.shape[0]))
+
+
+def _in_scalars(mlp: eqx.nn.MLP, features: Float[Array, "dof 2"]) -> Float[Array, " dof"]:
+    outputs, layers = [], jax.tree.leaves(eqx.filter(mlp.layers, eqx.is_array))
+    for joint, values in enumerate(features):
+        for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+            rows = zip(weight[joint], jnp.ravel(bias[joint]), strict=True)
+            values = [sum(map(jnp.multiply, row, values), start) for row, start in rows]
+            values = [mlp.activation(x) if bias is not layers[-1] else x for x in values]
+        outputs += values
+    return jnp.stack(outputs)
 
 
 class FixedFriction(eqx.Module):

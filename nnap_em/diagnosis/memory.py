@@ -33,11 +33,11 @@ def identify(rig: Rig, data: Dataset | Logs, *, start: Identified | None = None,
 def with_memory(fitted: Identified, data: Dataset | Logs, log: Log = silent) -> Identified:
     """A fit with a static map, or one with contacts where the search accepts them; with a sentence on each joint."""
     data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
-    before, kinds = fitted._replace(smoother=unbranched(fitted.bank)), (DynamicFriction,)
-    context = SearchContext(before, {}, data, MultiStep(), SEARCH_EFFORT, log, kinds=kinds)
+    before, joints = fitted._replace(smoother=unbranched(fitted.bank)), len(fitted.model.system.coordinates)
+    effort = SEARCH_EFFORT._replace(most=joints, shortlist=joints)
+    context = SearchContext(before, {}, data, MultiStep(), effort, log, kinds=(DynamicFriction,))
     found = search(context, white=white_readings(data, fitted.model), release=finished)
-    joints = range(1, len(fitted.model.system.coordinates) + 1)
-    sentences = "\n".join(f"joint {j}: {_sentence(found, j)}" for j in joints)
+    sentences = "\n".join(f"joint {j + 1}: {_sentence(found, j + 1)}" for j in range(joints))
     outcome = found.after if found.evidence else fitted
     return outcome._replace(smoother=fitted.smoother, memory=sentences)
 

@@ -269,7 +269,7 @@ def test_contacts_are_tried_from_none_to_the_dry_friction_of_the_map():
 def test_a_joint_that_is_refused_is_not_one_without_memory(monkeypatch, steps, sentence):
     """The sentence is that of the last round which judged the joint."""
     law = (DynamicFriction.name, 1, None, ())
-    rounds = [Step(60, ((law, seen),), () if left is None else ((law, left),), None, 4) for seen, left in steps]
+    rounds = tuple(Step(60, ((law, seen),), () if left is None else ((law, left),), None, 4) for seen, left in steps)
     fit = begin(_rig(), _logs(4.0, 0, sequences=2), key=jax.random.key(0))
     monkeypatch.setattr(memories, "search", lambda context, **_: Diagnosis(context.before, context.before, (), rounds))
     assert with_memory(fit, _logs(4.0, 0, sequences=2)).memory == f"joint 1: the static map is kept, {sentence}"

@@ -250,12 +250,12 @@ def _other_code(header, arrays):
 
 
 def _lost_setting(header, arrays):
-    del header["settings"]["/m_step/nodes"]
+    del header["leaves"]["/m_step/nodes"]
 
 
 MISFITS = {
-    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 3"),
-    "newer": (_set(format=4), "format 4"),
+    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4"),
+    "newer": (_set(format=5), "format 5"),
     "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
     "header": (lambda header, _: header.pop("notes"), "lacks something"),
     "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),
@@ -263,7 +263,7 @@ MISFITS = {
     "lost array": (_lost_array, "state/model/log_q: missing in the file"),
     "spare array": (_spare_array, "state/model/extra: unknown here"),
     "code": (_other_code, "'relu' in the file"),
-    "setting": (_lost_setting, "m_step/nodes"),
+    "setting": (_lost_setting, "m_step/nodes: missing in the file"),
 }
 
 

@@ -1,7 +1,6 @@
 """Sensors of a machine file that read no joint: their readings against MuJoCo's own, and what becomes of them."""
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -233,11 +232,6 @@ def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
     write_rig(rig, tmp_path / "again.toml")
     assert read_rig(tmp_path / "again.toml", specs) == rig
     assert unpacked(packed(read := unpacked(rig.machine))) == read
-
-
-def test_texts_of_machines_from_before_sensors_are_read():
-    before = json.dumps(json.loads(packed(read_machine(ROOT / "tests" / "machines" / "branch.xml")))[:-1])
-    assert unpacked(before).sensors == ()
 
 
 BAD = {

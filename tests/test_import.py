@@ -385,7 +385,7 @@ REFUSED = {  # what is wrong with the rig's table, or with the log, and words of
     "unknown joint": (_said("position[joint]", "position[jiont]"), {}, ["did you mean 'position[joint]'"]),
     "not declared": ({"columns": ""}, {}, ["column 'u': nothing is called so", "[import.columns] u =", "/cmd:data[0]"]),
     "unknown key": ({"more": "gaps = 1"}, {}, ["[import] gaps", "unknown", "did you mean 'gap'"]),
-    "unknown column": (_said("theta1 =", "theta2 ="), {}, ["[import.columns] theta2", "no column of this rig"]),
+    "unknown column": (_said("theta1 =", "theta2 ="), {}, ["[import.columns] theta2", "unknown table or key"]),
     "no address": (_said('"/cmd:data[0]"', "3"), {}, ["[import.columns] u", "found 3", "topic:field"]),
     "no scale": (_said('"/cmd:data[0]"', '{ from = "/cmd:data[0]", scale = 0 }'), {}, ["scale is 0"]),
     "input": ({"more": 'input = "holds"'}, {}, ["[import] input", "did you mean 'hold'"]),

@@ -1,12 +1,11 @@
 """The table `[import]` of rig.toml: where each column of the data set comes from, and how a log is cut."""
 
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
-from ..data.rig import RigError, nearest
+from ..data.rig import whole_table
 from .recording import Address, address
 
 INPUTS = ("hold", "mean")
@@ -39,54 +38,39 @@ def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
 
     Raises RigError at the first mistake.
     """
-    table = tomllib.loads(path.read_bytes().decode("utf-8-sig")).get("import", {})
-    if not isinstance(table, dict):
-        _refuse(path, "import", f"found {table!r}", "write a table [import]")
-    for key in table:
-        if key not in _KEYS:
-            _refuse(path, f"[import] {key}", "unknown table or key", nearest(key, _KEYS))
-    mode = table.get("input", INPUTS[0])
-    if mode not in INPUTS:
-        _refuse(path, "[import] input", f"found {mode!r}", nearest(str(mode), INPUTS))
+    table = whole_table(path).table("import", absent={})
+    table.check((), _KEYS)
     return Plan(
-        _addresses(path, table, "columns", columns),
-        _addresses(path, table, "duplicates", columns),
-        mode == INPUTS[1],
-        _seconds(path, table, "gap"),
-        _seconds(path, table, "shortest"),
-        _seconds(path, table, "longest"),
+        _addresses(table, "columns", columns),
+        _addresses(table, "duplicates", columns),
+        "input" in table.items and table.choice("input", INPUTS) == INPUTS[1],
+        *(_seconds(table, key) for key in ("gap", "shortest", "longest")),
     )
 
 
-def _addresses(path: Path, table: Mapping[str, Any], key: str, columns: tuple[str, ...]) -> dict[str, Address]:
-    items = table.get(key, {})
-    if not isinstance(items, dict):
-        _refuse(path, f"[import] {key}", f"found {items!r}", f"write a table [import.{key}]")
-    for name in items:
-        if name not in columns:
-            _refuse(path, f"[import.{key}] {name}", "no column of this rig", nearest(name, columns))
-    return {name: _address(path, f"[import.{key}] {name}", value) for name, value in items.items()}
+def _addresses(table: Any, key: str, columns: tuple[str, ...]) -> dict[str, Address]:
+    if not isinstance(table.items.get(key, {}), dict):
+        table.refuse(key, hint=f"write a table [import.{key}]")
+    inside = table.table(key, absent={})
+    inside.check((), columns)
+    return {name: _address(inside, name) for name in inside.items}
 
 
-def _address(path: Path, where: str, value: Any) -> Address:
-    hint = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.0174533 }'
+def _address(table: Any, name: str) -> Address:
+    value = table.items[name]
     entry = value if isinstance(value, dict) else {"from": value}
     text, scale = entry.get("from"), entry.get("scale", 1.0)
     if not isinstance(text, str) or not address(text)[1] or set(entry) - {"from", "scale"}:
-        _refuse(path, where, f"found {value!r}", hint)
+        hint = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.001 }'
+        table.refuse(name, hint=hint)
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0:
-        _refuse(path, where, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
+        table.refuse(name, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
     return Address(*address(text), float(scale))
 
 
-def _seconds(path: Path, table: Mapping[str, Any], key: str) -> float | None:
-    value = table.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        _refuse(path, f"[import] {key}", f"found {value!r}", f"write seconds above 0, {key} = 0.5")
-    return float(value)
-
-
-def _refuse(path: Path, where: str, problem: str, hint: str) -> NoReturn:
-    raise RigError(f"{path}: {where}: {problem}; {hint}")
+def _seconds(table: Any, key: str) -> float | None:
+    """Seconds, which may be infinite; None where nothing is declared."""
+    value = table.items.get(key)
+    if value is not None and (type(value) not in (int, float) or not value > 0):
+        table.refuse(key, hint=f"write seconds above 0, {key} = 0.5")
+    return None if value is None else float(value)

@@ -10,7 +10,7 @@ from shell import ROOT
 
 import nnap_em
 
-FOLDERS = ("numerics", "storage", "data", "machines", "recordings", "systems", "effects", "model", "smoother", "em",
+FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
            "prediction_error", "fit", "identifiability", "residual", "curves", "diagnosis", "comparison", "experiment",
            "report", "export", "draft", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"

@@ -33,6 +33,7 @@ from nnap_em.export.model import parameters, predictor
 from nnap_em.fit.identify import begin, phi_samples
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
+from nnap_em.import_.recording import Topic
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, NoFriction
@@ -40,7 +41,6 @@ from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.recordings.recording import Topic
 from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.smoother.start import StartBank

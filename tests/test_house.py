@@ -12,7 +12,7 @@ import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
            "prediction_error", "fit", "identifiability", "residual", "curves", "diagnosis", "comparison", "experiment",
-           "report", "export", "draft", "commands")  # fmt: skip
+           "report", "export", "init", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 

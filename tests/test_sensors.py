@@ -21,7 +21,6 @@ from nnap_em import identify
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
 from nnap_em.data.rig import RigError, read_rig, write_rig
-from nnap_em.draft.from_machine import _sensors, draft_machine
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.local import local, readings_at
@@ -34,6 +33,7 @@ from nnap_em.fit.identify import begin, phi_samples
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
 from nnap_em.import_.recording import Topic
+from nnap_em.init.from_machine import _sensors, draft_machine
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, NoFriction

@@ -11,7 +11,7 @@ from shell import ROOT
 import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
-           "prediction_error", "fit", "identifiability", "residual", "curves", "diagnosis", "comparison", "experiment",
+           "prediction_error", "fit", "residual", "curves", "diagnosis", "comparison", "experiment",
            "report", "export", "init", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 

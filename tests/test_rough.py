@@ -18,7 +18,7 @@ from nnap_em.data.missing import interpolated
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
 from nnap_em.data.spikes import noise, spikes
-from nnap_em.identifiability.check import check
+from nnap_em.fit.check import check
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}

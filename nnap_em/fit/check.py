@@ -18,7 +18,6 @@ from ..em.equations import motion
 from ..em.readings import onset, reading_noise, resolution
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
-from ..fit.identify import Identified, begin
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
@@ -27,6 +26,7 @@ from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
+from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, explanations, gains, mistakes, regression
 from .stops import at_stops
 

@@ -11,8 +11,8 @@ from shell import ROOT
 import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
-           "prediction_error", "fit", "residual", "curves", "diagnosis", "comparison", "experiment",
-           "report", "export", "init", "commands")  # fmt: skip
+           "prediction_error", "fit", "residual", "curves", "diagnosis", "comparison", "experiment", "report",
+           "export", "init", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 

@@ -305,8 +305,8 @@ MUTANTS = (
     Mutant(
         "backward weights not normalised",
         "smoother/particle/backward.py",
-        "target = uniform[0] * reach[-1]",
-        "target = uniform[0]",
+        "target = uniform * reach[-1]",
+        "target = uniform",
         "test_particle.py::test_backward_step_draws_from_its_law[ExactBackward(block=5)]",
     ),
     Mutant(

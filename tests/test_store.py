@@ -21,7 +21,7 @@ from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle import Guided, MetropolisBackward, ParticleSmoother
+from nnap_em.smoother.particle import ExactBackward, Guided, ParticleSmoother
 from nnap_em.storage import files
 from nnap_em.storage.files import StoreError
 
@@ -113,7 +113,7 @@ SMOOTHERS = {
     "cubature": lambda bank: CubatureSmoother(bank, window=30, inflations=(1.0, 2.0)),
     "extended": ExtendedKalmanSmoother,
     "particles": lambda bank: ParticleSmoother(
-        CubatureSmoother(bank, iterations=2), Guided(), MetropolisBackward(7), num_particles=31, dtype=float
+        CubatureSmoother(bank, iterations=2), Guided(), ExactBackward(7), num_particles=31, dtype=float
     ),
 }
 

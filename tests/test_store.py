@@ -249,10 +249,6 @@ def _other_code(header, arrays):
     header["leaves"][code]["of"] = "relu"
 
 
-def _lost_setting(header, arrays):
-    del header["leaves"]["/m_step/nodes"]
-
-
 MISFITS = {
     "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4"),
     "newer": (_set(format=5), "format 5"),
@@ -263,7 +259,6 @@ MISFITS = {
     "lost array": (_lost_array, "state/model/log_q: missing in the file"),
     "spare array": (_spare_array, "state/model/extra: unknown here"),
     "code": (_other_code, "'relu' in the file"),
-    "setting": (_lost_setting, "m_step/nodes: missing in the file"),
 }
 
 

@@ -11,11 +11,12 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
+from ..data.noise import reading_noise, resolution
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
 from ..em.equations import motion
-from ..em.readings import onset, reading_noise, resolution
+from ..em.readings import onset
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
 from ..model.base import prepare

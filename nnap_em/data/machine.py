@@ -2,7 +2,7 @@
 
 import json
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .servo import TORQUE
 from .units import state_unit
@@ -160,8 +160,9 @@ def unpacked(text: str) -> Machine:
         "sites": Site,
         "sensors": Sensor,
     }
-    fields = dict(zip(Machine._fields, map(_tuples, json.loads(text)), strict=True))
-    return Machine(**fields | {name: tuple(kind(*one) for one in fields[name]) for name, kind in kinds.items()})
+    fields: dict[str, Any] = dict(zip(Machine._fields, map(_tuples, json.loads(text)), strict=True))
+    fields |= {name: tuple(kind(*one) for one in fields[name]) for name, kind in kinds.items()}
+    return Machine(**fields)
 
 
 def _tuples(value):

@@ -65,7 +65,7 @@ def _address(table: Any, name: str) -> Address:
         table.refuse(name, hint=hint)
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0:
         table.refuse(name, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
-    return Address(*address(text), float(scale))
+    return Address(*address(str(text)), float(scale))
 
 
 def _seconds(table: Any, key: str) -> float | None:

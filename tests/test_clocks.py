@@ -12,12 +12,12 @@ from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, ros2, 
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import read_rig
-from nnap_em.recordings import clock
-from nnap_em.recordings.declared import read_plan
-from nnap_em.recordings.files import reader
-from nnap_em.recordings.resample import Resampled, resample
-from nnap_em.recordings.segments import covered, runs, sent_on_change
-from nnap_em.recordings.signals import Signal
+from nnap_em.import_ import clock
+from nnap_em.import_.declared import read_plan
+from nnap_em.import_.files import reader
+from nnap_em.import_.resample import Resampled, resample
+from nnap_em.import_.segments import covered, runs, sent_on_change
+from nnap_em.import_.signals import Signal
 from nnap_em.systems import specs
 
 DT = 0.01
@@ -57,7 +57,7 @@ DAY = 86400.0
 @pytest.fixture(autouse=True)
 def _no_delays(monkeypatch):
     """Delays between topics, whose tests are in `test_import.py`, take most of the time of an import this short."""
-    monkeypatch.setattr("nnap_em.recordings.resample.pairs", lambda *_: [])
+    monkeypatch.setattr("nnap_em.import_.resample.pairs", lambda *_: [])
 
 
 def _columns(t):

@@ -17,13 +17,13 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.draft.from_machine import draft_machine
-from nnap_em.recordings import text_file
-from nnap_em.recordings.columns import resolve
-from nnap_em.recordings.declared import read_plan
-from nnap_em.recordings.files import reader
-from nnap_em.recordings.recording import Address, Topic, address, last_word, word_of
-from nnap_em.recordings.resample import resample
+from nnap_em.import_ import text_file
+from nnap_em.import_.columns import resolve
+from nnap_em.import_.declared import read_plan
+from nnap_em.import_.files import reader
+from nnap_em.import_.recording import Address, Topic, address, last_word, word_of
+from nnap_em.import_.resample import resample
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
 RIG = f"""

@@ -15,9 +15,9 @@ from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
 from nnap_em.effects import OperatingPoint
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.fit import memory as memories
+from nnap_em.fit.check import Along, memory
 from nnap_em.fit.identify import begin, friction_table, identify
 from nnap_em.fit.store import load, save
-from nnap_em.identifiability.check import Along, memory
 from nnap_em.model.base import prepare
 from nnap_em.model.dynamic_friction import SHAPES, DynamicFriction, hysteresis
 from nnap_em.model.law import StribeckLaw

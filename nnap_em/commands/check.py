@@ -4,7 +4,7 @@ import argparse
 
 import jax
 
-from ..identifiability.check import ERROR, check
+from ..fit.check import ERROR, check
 from ..numerics.digits import counted
 from ..storage.log import Log
 from .common import read_bench

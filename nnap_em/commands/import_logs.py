@@ -9,10 +9,10 @@ from pathlib import Path
 
 from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
+from ..import_.declared import read_plan
+from ..import_.folder import completed, places, write_sequences
+from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted
-from ..recordings.declared import read_plan
-from ..recordings.folder import completed, places, write_sequences
-from ..recordings.resample import Resampled, resample
 from ..report.imported import describe, write_page
 from ..storage.files import replace_text, whole_folder
 from ..storage.log import Log

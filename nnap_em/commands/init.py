@@ -5,12 +5,12 @@ from pathlib import Path
 
 from ..data.dataset import DataError
 from ..data.formats import column_names
-from ..draft.equations import draft_equations
-from ..draft.from_log import draft
-from ..draft.from_machine import draft_machine
-from ..draft.from_topics import draft_recorded
-from ..recordings.recording import last_word
-from ..recordings.text_file import foreign
+from ..import_.recording import last_word
+from ..import_.text_file import foreign
+from ..init.equations import draft_equations
+from ..init.from_log import draft
+from ..init.from_machine import draft_machine
+from ..init.from_topics import draft_recorded
 from ..storage.files import replace_text
 from ..storage.log import Log
 from ..systems import specs

@@ -20,9 +20,9 @@ from ..diagnosis.findings import entry, findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
 from ..em.build import build_system, measure_scales
+from ..fit.check import ERROR, torques
 from ..fit.identify import Identified
 from ..fit.store import model_file, read
-from ..identifiability.check import ERROR, torques
 from ..report.monitored import write_monitor
 from ..storage.log import Log
 from .common import logs_of, require_joints

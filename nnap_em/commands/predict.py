@@ -10,8 +10,8 @@ from ..data.logs import DataWarning, read_logs
 from ..diagnosis.keys import listed
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
+from ..import_.mcap_writer import require_mcap, write_mcap
 from ..numerics.digits import counted
-from ..recordings.mcap_writer import require_mcap, write_mcap
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
 

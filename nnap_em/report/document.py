@@ -15,9 +15,9 @@ from ..data.logs import Logs
 from ..data.servo import TORQUE
 from ..diagnosis.hypothesis import covariances
 from ..effects.equations import UnknownTerm
+from ..fit.identifiability import identifiability, sentences
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
-from ..identifiability.identifiability import identifiability, sentences
 from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law
 from .tables import INNER
 

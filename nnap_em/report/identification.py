@@ -14,10 +14,10 @@ from ..data.logs import Logs
 from ..diagnosis.keys import listed
 from ..em.build import build_system
 from ..em.loop import STEP_REFUSED
+from ..fit.check import dynamics
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import misfits, moved
 from ..fit.predict import posterior_of
-from ..identifiability.check import dynamics
 from ..numerics.digits import counted
 from ..numerics.profile import stage
 from ..residual.residual import names_of

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..data.rig import Rig
+from ..import_.declared import Plan
+from ..import_.delays import Delay
+from ..import_.resample import Resampled, TopicFacts
 from ..numerics.digits import number
-from ..recordings.declared import Plan
-from ..recordings.delays import Delay
-from ..recordings.resample import Resampled, TopicFacts
 from ..storage.files import replace_text
 from .document import versions
 from .import_plot import timeline

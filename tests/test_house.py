@@ -16,7 +16,7 @@ FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "eff
 PACKAGE = ROOT / "nnap_em"
 
 
-LINES, CONSTANTS = 35_428, 577
+LINES, CONSTANTS = 35_428, 579
 """Lines and module constants of the package: they may fall, and then these fall with them."""
 
 
@@ -68,6 +68,21 @@ def test_a_constant_has_one_meaning():
         for name in _constants(path.read_text()):
             homes.setdefault(name, []).append(str(path.relative_to(PACKAGE)))
     assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
+
+
+def test_random_numbers_hang_on_a_key_that_is_passed():
+    """None is made of a constant, but where nothing is drawn: a check, and the blank fit that a file fills."""
+    constant = re.compile(r"random\.(?:key|PRNGKey)\(\d")
+    found = {str(p.relative_to(PACKAGE)) for p in PACKAGE.rglob("*.py") if constant.search(p.read_text())}
+    assert found == {"commands/check.py", "fit/store.py"}
+
+
+def test_the_file_of_numbers_that_decide_names_those_that_are_elsewhere():
+    number = re.compile(r"^[A-Z][A-Z_, ]* = [-(]?\d", re.M)
+    places = [p for folder in ("diagnosis", "residual") for p in (PACKAGE / folder).glob("*.py")]
+    elsewhere = {p.name for p in places if number.search(p.read_text())} - {"verdict.py"}
+    text = ast.get_docstring(ast.parse((PACKAGE / "diagnosis" / "verdict.py").read_text())) or ""
+    assert not {name for name in elsewhere if name not in text}
 
 
 def _constants(source: str) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from nnap_em.model.law import PARAMETERS, StribeckLaw, describe, fit_law
+from nnap_em.model.law import PARAMETERS, LawFit, StribeckLaw, describe, fit_law
 
 TRUTH = (0.03, 0.05, 0.4, 0.007, 0.1)  # coulomb, breakaway, stribeck, viscous, smooth
 OFFSET = 0.004
@@ -147,6 +147,13 @@ def test_departure_is_found_where_it_is():
     assert fit.departs[0, peak] and fit.difference[0, peak] > 0.005
     text = describe(fit, ("x",), (False,))[0]
     assert "departs" in text and text.startswith("x: Coulomb") and "N s/m" in text and "rad" not in text
+
+
+@pytest.mark.parametrize(("nodes", "where"), [([3], "-1.2 rad/s."), ([3, 4, 9], "-1.2 to -0.9, 0.6 rad/s.")])
+def test_a_departure_is_said_where_it_begins_and_ends(nodes, where):
+    v, number = np.linspace(-2.1, 2.1, 15)[None], np.ones((1, len(PARAMETERS)))
+    fit = LawFit(number, 0.1 * number, v, 3.0 * np.isin(np.arange(15), nodes)[None], np.ones((1, 15)))
+    assert describe(fit, ("theta1",), (True,))[0].endswith(f"departs from this law at {where}")
 
 
 def test_sentence_reads_as_written():

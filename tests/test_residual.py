@@ -1,6 +1,7 @@
 """Statistics against cases with a known answer, and the missing force against one that was put in."""
 
 import math
+import re
 
 import equinox as eqx
 import jax
@@ -144,12 +145,16 @@ def test_a_dependence_is_found_and_placed():
     assert not by["dx", "correlation with u"].slight
 
 
-def test_a_slight_but_certain_misfit_is_called_so():
+@pytest.mark.parametrize(("size", "slight"), [(1.07, True), (3.4, False)])
+def test_a_slight_but_certain_misfit_is_called_so(size, slight):
+    """Errors more than twice as large are no percentage of what the model expects."""
     whole = _residual(14)
     e = whole.innovation.copy()
-    e[..., 0] *= 1.07
+    e[..., 0] *= size
     test = next(t for t in run_tests(whole._replace(innovation=e), NAMES) if t[:2] == ("spread", "theta1"))
-    assert test.p_value < FAILS and test.slight and "small" in test.meaning
+    assert test.p_value < FAILS and test.slight == slight and ("small" in test.meaning) == slight
+    times = re.fullmatch(r"Errors in theta1 are ([\d.]+) times as large as the model expects.*", test.meaning)
+    assert times and float(times[1]) == pytest.approx(size, rel=0.06)
 
 
 def test_lost_sequences_take_no_part():

@@ -20,6 +20,7 @@ from ..diagnosis.findings import entry, findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
 from ..em.build import build_system, measure_scales
+from ..em.loop import SEARCHED
 from ..fit.check import ERROR, torques
 from ..fit.identify import Identified
 from ..fit.store import model_file, read
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace, log: Log) -> int:
         log(f"alarm by the chart of {seen.alarm.chart}; what changed is searched in the last {len(since)} recordings")
         logs = {path.stem: read_logs(path, rig, trust=args.trust_readings) for path in since}
         whole = together(logs)
-        diagnosis = diagnose(rig, whole.data, key=jax.random.key(0), log=log, start=fitted, own=own.data)
+        key = jax.random.fold_in(fitted.state.key, SEARCHED)
+        diagnosis = diagnose(rig, whole.data, key=key, log=log, start=fitted, own=own.data)
         accepted = findings(diagnosis)
         document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted, None)}
     write_monitor(args.out, fitted, beside, seen, document, log)

@@ -11,6 +11,7 @@ from ..diagnosis.change import changes
 from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
+from ..em.loop import SEARCHED
 from ..fit.identify import Identified
 from ..fit.known import known
 from ..numerics.digits import number
@@ -32,7 +33,7 @@ def explained(comparison: Comparison, first: Recorded, second: Recorded, log: Lo
     Raises FitError where one of them follows no recording of the other.
     """
     one, two = (fit.fitted for fit in comparison.fits)
-    key = jax.random.key(0)
+    key = jax.random.fold_in(one.state.key, SEARCHED)
     judged = (*_judged(comparison, one, first, two, second), *_judged(comparison, two, second, one, first))
     diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=one, own=first.data)
     accepted = findings(diagnosis)
@@ -49,7 +50,7 @@ def _judged(
     names = {id(each.fitted): each.name for each in comparison.fits}
     beside = along(fit, jax.device_put(own.data), fit.smoother)
     out = levels(left_out(beside.model, beside.m_step, beside.path, beside.data, beside.used))
-    put = known(fit, recorded.rig, recorded.data, key=jax.random.key(0))
+    put = known(fit, recorded.rig, recorded.data, key=jax.random.fold_in(fit.state.key, SEARCHED))
     now = along(put, jax.device_put(recorded.data), put.smoother)
     test = risen(out.level, level(errors_of(now.model, now.m_step, now.path, now.data), out.scale))
     size = f"{number(test.ratio, 2)} times those on its own recordings left out (p = {number(test.p_value, 2)})"

@@ -31,14 +31,8 @@ from .hypothesis import Evidence, Hypothesis
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
-from .verdict import AGREE, DETERMINED, EQUIVALENT_NATS, MULTI_STEP, even, required
+from .verdict import AGREE, DETERMINED, EQUIVALENT_NATS, MULTI_STEP, PAIR, SUSPECT_SHARE, even, required
 
-SHARE = MULTI_STEP.share
-"""Share of the squared error on parts left out that a law must remove, over its prior odds."""
-PAIR = 0.5
-"""Prior odds of a pair of laws to a single one: 120 pairs of the best sixteen laws are tried."""
-SUSPECT_SHARE = 0.08
-"""Share from which on a law is listed as a suspect."""
 FOLDS, BLOCKS = 4, 8
 """Parts that are left out in turn, each of every fourth block of the rows."""
 SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 16, 8
@@ -271,14 +265,14 @@ def _round(
     fresh = [c for c in every if key_of(c.start) not in present]
     log, rows = search.log, search.data.t.shape[1]
     whole, room = search.loss(null.of), search.room(null.of)
-    log(f"{len(fresh)} candidates; {room:.0%} of the squared error is not noise of the readings")
-    if room < SHARE:
+    log(f"{len(fresh)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
+    if room < MULTI_STEP.share:
         return None, (), Step(rows, (), (), None, 0, MEASURE)
     singles = search.screened(lean, fresh)
     short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and _sound(c)][:SHORTLIST]]
     judged = search.judged(lean, short, base)
     passing, tried = [case for case in judged if _passes(case)], [*judged]
-    most = max([SHARE, *(case.share for case in passing)]) / PAIR
+    most = max([MULTI_STEP.share, *(case.share for case in passing)]) / PAIR
     if room > most and time.monotonic() < search.until:  # else no pair and no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
@@ -309,7 +303,7 @@ def _sound(case: Case) -> bool:
 def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
     agree = sum(gain > 0 for gain in case.folds) >= AGREE * len(case.folds)
-    return case.share * case.odds >= SHARE and agree and _sound(case) and _certain(case)
+    return case.share * case.odds >= MULTI_STEP.share and agree and _sound(case) and _certain(case)
 
 
 def _certain(case: Case) -> bool:

@@ -182,13 +182,11 @@ def _log(case: Trial, context: SearchContext) -> None:
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
     share, reason, error = case.screened.share.least, case.rejection, "the squared error"
     name, bar = words(key_of(case.effect)), f"bar {case.screened.bar:.1%}"
+    step = f"{share_of(case.foreseen, error, 1)} along its step"
     if case.refit is None:
-        context.log(
-            f"  {name} {values}: {share_of(share, error, 1)} by the linear screen, {share_of(case.foreseen, error, 1)} "
-            f"along its step; {bar}; not refitted"
-        )
+        context.log(f"  {name} {values}: {share_of(share, error, 1)} by the linear screen, {step}; {bar}; not refitted")
         return
-    nats = f", {case.gain:.0f} nat" if np.isnan(case.foreseen) else f", {case.foreseen:.1%} along its step"
+    nats = f", {case.gain:.0f} nat" if np.isnan(case.foreseen) else f", {step}"
     context.log(
         f"  refitted {name} {values}: {share_of(share, error, 1)} by the linear screen{nats}, "
         f"{share_of(case.removed, error, 1)} after it; {bar}"

@@ -2,8 +2,9 @@
 
 The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
 candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
-Elsewhere, since folders before this one use them: READINGS (`prediction_error/noise.py`) and WHITE
-(`residual/innovations.py`), which choose the loss, and the bars of memory (`fit/memory.py`).
+Elsewhere: READINGS (`prediction_error/noise.py`) and WHITE (`innovations.py`, `statistics.py`), which choose the loss;
+the bars of external disturbances (`interventions.py`, `undisturbed.py`) and memory (`fit/memory.py`); and counts of
+parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py rivals.py equations.py`).
 """
 
 import math
@@ -47,6 +48,10 @@ FORESEEN = 1 / 3
 KEEP = 0.6
 """Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay: a
 refit, which is not linear, differs from the screen by less than the rest."""
+PAIR = 0.5
+"""Prior odds of a pair of laws of equations to a single one: 120 pairs of the best sixteen laws are tried."""
+SUSPECT_SHARE = 0.08
+"""Share from which on a law of equations is listed as a suspect."""
 SUSPECT = 0.5
 """Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
 candidates removed 0.02 and 0.07 of the multi-step error."""

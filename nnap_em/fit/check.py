@@ -107,7 +107,7 @@ def check(
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
     rows = min(data.valid.shape[1], _window(rig.dt) + 1)
     head = _first(data, rows)
-    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
+    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother, problem.state.key), head)))
     return [
         *amount,
         *_sampling(rig, along, scales),
@@ -142,7 +142,7 @@ def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckRe
     yield from _noise(rig, model, data)
     rows = min(data.valid.shape[1], _window(rig.dt, DETERMINED_WITHIN * model.pace) + 1)
     head = _first(data, rows)
-    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother), head)))
+    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother, problem.state.key), head)))
     yield from _observability(model, along, np.asarray(head.valid), rows - 1)
 
 
@@ -154,11 +154,11 @@ def _first(data: Dataset, rows: int) -> Dataset:
     return head._replace(valid=head.valid & inside)
 
 
-def _along(common: tuple[StateSpaceModel, AbstractSmoother], seq: Dataset) -> tuple[Array, ...]:
+def _along(common: tuple[StateSpaceModel, AbstractSmoother, PRNGKeyArray], seq: Dataset) -> tuple[Array, ...]:
     """The parts of Along of one sequence."""
-    model, smoother = common
+    model, smoother, key = common
     prepared, still = prepare(model, seq), jnp.zeros(len(model.system.ports))
-    x, u = smoother(model, prepared, key=jax.random.key(0)).state.mean, prepared.inputs
+    x, u = smoother(model, prepared, key=key).state.mean, prepared.inputs
     slopes = (model.transition, model.emission, lambda x, u: model.rate(x, u, still))
     return x, *(jax.vmap(jax.jacfwd(slope))(x, u) for slope in slopes)
 

@@ -16,10 +16,10 @@ from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em.build import build, build_system
 from ..em.loop import (
-    AFTERWARDS,
     EPOCHS,
     RESTED,
     SCHEDULE,
+    WIDENED,
     EMState,
     Schedule,
     e_step,
@@ -215,7 +215,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     elif white_readings(data, fitted.model):
         return fitted
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, AFTERWARDS))
+    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, WIDENED))
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..effects import fields
 from ..em.local import locals_along
-from ..em.loop import AFTERWARDS, EMState, FitError, Schedule, e_step, fit, later_state
+from ..em.loop import REMEMBERED, EMState, FitError, Schedule, e_step, fit, later_state
 from ..em.mstep import ScoringMStep, not_diverged
 from ..em.prior import ParameterPrior
 from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
@@ -290,7 +290,7 @@ def _with(
 ) -> _Fit | None:
     """EM from a fit on, over whole sequences, with a contact more; None where it diverges."""
     model, rule = with_contacts(straight_at_rest(fitted.model, [bristle]), fitted.rule, [bristle])
-    key = jax.random.fold_in(fitted.state.key, AFTERWARDS + bristle.joint)
+    key = jax.random.fold_in(fitted.state.key, REMEMBERED + bristle.joint)
     begin, before = later_state(model, rule, key=key), fitted.state.epoch
     blank = np.full(len(data.t), -np.inf)
     begin = begin._replace(top=blank, loglik=blank[:1])

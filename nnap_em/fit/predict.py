@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, fill_missing
 from ..data.logs import Logs, sequences_of
-from ..em.loop import e_step
+from ..em.loop import SMOOTHED, e_step
 from ..em.prior import ParameterPrior
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.digits import counted
@@ -169,7 +169,7 @@ def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
         True
     """
     data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
-    key_model, key_force = jax.random.split(jax.random.key(1))
+    key_model, key_force = jax.random.split(jax.random.fold_in(fitted.state.key, SMOOTHED))
     path, phi = posterior_of(fitted, data).state, phi_samples(fitted, DRAWN, key=key_model)
     model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key_force)
     return each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))

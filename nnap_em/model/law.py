@@ -223,5 +223,6 @@ def _where(fit: LawFit, joint: int, unit: str) -> str:
     if not departs.any():
         return "the curve agrees with this law within 2 standard deviations."
     edges = np.flatnonzero(np.diff(np.concatenate([[False], departs, [False]]).astype(int)))
-    runs = [f"{velocity[a]:.2g} to {velocity[b - 1]:.2g}" for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    ends = [(f"{velocity[a]:.2g}", f"{velocity[b - 1]:.2g}") for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    runs = [" to ".join(dict.fromkeys(pair)) for pair in ends]
     return f"the curve departs from this law at {', '.join(runs)} {unit}."

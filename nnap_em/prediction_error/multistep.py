@@ -197,7 +197,7 @@ def _errors(common, one) -> Float[Array, "start horizon obs"]:
 
 
 def sensitivities(
-    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time state"], columns: Columns
+    nodes: Float[Array, "dof count"], linear: Local, middle: Float[Array, "time motion"], columns: Columns
 ) -> tuple[Float[Array, "time state column"], Float[Array, "time obs column"]]:
     """Change of next states and of readings of one sequence by friction nodes, parameters and further `columns`."""
     dof = nodes.shape[0]

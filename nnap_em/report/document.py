@@ -101,9 +101,9 @@ def noise(fitted: Identified) -> dict[str, Any]:
     }
 
 
-def predictions(sides: Mapping[str, Identified], test: Logs | None) -> dict[str, Prediction]:
-    """Predictions of the test sequences, from their first readings, by every model."""
-    key = jax.random.key(0)
+def predictions(sides: Mapping[str, Identified], test: Logs | None, seed: int) -> dict[str, Prediction]:
+    """Predictions of the test sequences, from their first readings, by every model with the same random numbers."""
+    key = jax.random.key(seed)
     return {n: predict(fitted, test.data, given_of(fitted), key=key) for n, fitted in sides.items()} if test else {}
 
 

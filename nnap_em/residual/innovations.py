@@ -109,8 +109,7 @@ def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> s
             ),
             "spread": (
                 f"Errors in {channel} are as large as the model expects.",
-                f"Errors in {channel} are {abs(size):.1%} {'larger' if size > 0 else 'smaller'} than the model "
-                "expects.",
+                f"Errors in {channel} are {1 + size:.3g} times as large as the model expects.",
             ),
             "mean": (
                 f"Errors in {channel} average to zero.",

@@ -10,7 +10,6 @@ from nnap_em.diagnosis.keys import words
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
 from nnap_em.report.page import MOST_PICTURES, Picture, page, write_page
-from nnap_em.report.vocabulary import MEANINGS, WORDS
 from nnap_em.report.wording import label, reached
 from nnap_em.residual.statistics import FAILS
 
@@ -268,8 +267,8 @@ def test_short_test_sequences_have_no_errors_beyond_their_end():
 def test_every_effect_is_explained():
     """Under the name that the report gives it, and no parameter that it does not have."""
     for kind in catalogue.values():
-        assert MEANINGS[kind.key()]
-        assert kind.reported_as or set(WORDS.get(kind.key(), {})) <= set(kind.units)
+        assert catalogue[kind.key()].meaning
+        assert set(kind.words) <= set(kind.units)
 
 
 def test_a_fit_has_a_page_of_its_own():

@@ -41,8 +41,15 @@ class Payload(Variation):
     """
 
     name: ClassVar[str] = "payload"
+    meaning: ClassVar[str] = "A body carries more mass than declared."
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "centre_x": "m", "centre_y": "m", "centre_z": "m"}
+    words: ClassVar[dict[str, str]] = {
+        "mass": "added mass",
+        "centre_x": "its centre along x of the body",
+        "centre_y": "its centre along y",
+        "centre_z": "its centre along z",
+    }
     moment: Float[Array, "3"] | None = None
     """First moment about the point [kg m]; None: the mass is at the tip."""
     point: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
@@ -81,32 +88,40 @@ class LinkInertia(Variation):
     """A moment of inertia off by dI."""
 
     name: ClassVar[str] = "link_inertia"
+    meaning: ClassVar[str] = "A link is harder (or easier) to spin than declared."
     confirm: ClassVar[str] = "Swing the link alone about a known axis and time it."
     units: ClassVar[dict[str, str]] = {"dI": "kg m^2"}
+    words: ClassVar[dict[str, str]] = {"dI": "added inertia"}
 
 
 class LinkLength(Variation):
     """A length off by dl."""
 
     name: ClassVar[str] = "link_length"
+    meaning: ClassVar[str] = "A link is longer (or shorter) than declared."
     confirm: ClassVar[str] = "Measure the distance between the joints."
     units: ClassVar[dict[str, str]] = {"dl": "m"}
+    words: ClassVar[dict[str, str]] = {"dl": "added length"}
 
 
 class CenterOfMass(Variation):
     """A centre of mass off by dlc along the link."""
 
     name: ClassVar[str] = "center_of_mass"
+    meaning: ClassVar[str] = "The centre of mass of a link is not where declared."
     confirm: ClassVar[str] = "Balance the link on an edge."
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
+    words: ClassVar[dict[str, str]] = {"dlc": "shift outwards"}
 
 
 class PayloadStep(JointEffect):
     """A payload that comes on at a moment of the clock; the edge is some samples wide, so that a fit can move it."""
 
     name: ClassVar[str] = "payload_step"
+    meaning: ClassVar[str] = "The payload changed at a moment of the session."
     confirm: ClassVar[str] = "Ask what was mounted or lost at that moment."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "time": "s"}
+    words: ClassVar[dict[str, str]] = {"mass": "added mass", "time": "moment"}
     mass: Scalar
     time: Scalar
     edge: Scalar = known()

@@ -21,6 +21,7 @@ class CoulombChange(JointEffect):
     """Coulomb friction of a joint differs from that of the fit: -change sign(w)."""
 
     name: ClassVar[str] = "coulomb_change"
+    meaning: ClassVar[str] = "Coulomb friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m"}
     change: Scalar
@@ -50,6 +51,7 @@ class ViscousChange(JointEffect):
     """Viscous friction of a joint differs from that of the fit: -change w."""
 
     name: ClassVar[str] = "viscous_change"
+    meaning: ClassVar[str] = "Viscous friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}
     change: Scalar
@@ -74,6 +76,7 @@ class NumberChange(AbstractEffect):
     """An estimated number of the machine differs from that of the fit."""
 
     name: ClassVar[str] = "change"
+    meaning: ClassVar[str] = "A number of the machine is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Measure it."
     units: ClassVar[dict[str, str]] = {"change": "unit of the number"}
     change: Scalar

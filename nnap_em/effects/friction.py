@@ -16,8 +16,10 @@ class PositionDependentFriction(JointEffect):
     """tau_f (1 + depth cos(n theta_j + phase))."""
 
     name: ClassVar[str] = "position_dependent_friction"
+    meaning: ClassVar[str] = "Friction is stronger at some angles than at others."
     confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
+    words: ClassVar[dict[str, str]] = {"depth": "relative depth", "n": "periods per turn", "phase": "phase"}
     cosine: Scalar
     sine: Scalar
     n: Scalar
@@ -44,8 +46,10 @@ class FrictionDrift(JointEffect):
     """tau_f (1 + change (1 - exp(-t / tau)))."""
 
     name: ClassVar[str] = "friction_drift"
+    meaning: ClassVar[str] = "Friction changes with time, as by warming up."
     confirm: ClassVar[str] = "Run the same motion cold and warm."
     units: ClassVar[dict[str, str]] = {"change": "-", "tau": "s"}
+    words: ClassVar[dict[str, str]] = {"change": "relative change", "tau": "time constant"}
     change: Scalar
     pace: Scalar
     """Log of tau."""

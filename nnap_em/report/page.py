@@ -16,11 +16,11 @@ import jinja2
 from matplotlib.figure import Figure
 
 from ..diagnosis.findings import growth
+from ..effects import catalogue
 from ..numerics.digits import finite, number
 from ..residual.statistics import FAILS
 from ..storage.files import replace_text
 from . import wording
-from .vocabulary import MEANINGS, WORDS
 from .wording import ratio, reached
 
 FIGURE_SECTIONS = ("found", "error", "residual", "details")
@@ -133,8 +133,7 @@ def _environment() -> jinja2.Environment:
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {
         "most": MOST_PICTURES,
-        "meanings": MEANINGS,
-        "words": WORDS,
+        "catalogue": catalogue,
         "level": FAILS,
         "at": _at,
         "ratio": ratio,

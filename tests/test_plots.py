@@ -111,7 +111,9 @@ def test_a_rounded_drawing_is_smaller_and_in_the_same_places():
     figure = prediction_figure(residual.t[0], residual.state[0], names, {"before": pair}, 1.0)
     image = io.BytesIO()
     figure.savefig(image, format="svg")
-    plain, rounded = image.getvalue(), picture("error", "", "", figure).image
+    drawn = picture("error", "", "", figure)
+    plain, rounded = image.getvalue(), drawn.image
+    assert f'width="{0.75 * drawn.width:g}pt"'.encode() in plain
     paths, scales = (re.compile(rb'(?s)\b%s="([^"]*)"' % name) for name in (b"d", b"transform"))
     for a, b in zip(paths.findall(plain), paths.findall(rounded), strict=True):
         numbers = (np.asarray(re.findall(rb"-?\d+\.?\d*", d), float) for d in (a, b))

@@ -10,11 +10,9 @@ import numpy as np
 from ..comparison.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Number
 from ..comparison.pooling import JointTest, Pooled
 from ..numerics.digits import number, with_std
-from ..storage.files import replace_text
 from .compare_plots import comparison_figure
 from .document import versions
-from .page import Picture, picture, rendered
-from .tables import write_json
+from .page import Picture, picture, rendered, write_report
 from .wording import p_value
 
 SHOWN = 5
@@ -28,17 +26,10 @@ LEGEND = (
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
     """Write compare.json and compare.html into the folder `out`."""
-    named = comparison.fits[0].fitted.rig.named
-    document = describe(comparison)
-    write_json(out / "compare.json", document, named)
-    text = rendered(
-        "compare.html.j2",
-        document=document,
-        rows=rows(comparison),
-        legend=LEGEND,
-        pictures=[_picture(comparison, curve) for curve in comparison.curves],
-    )
-    replace_text(out / "compare.html", named(text))
+    document, pictures = describe(comparison), [_picture(comparison, curve) for curve in comparison.curves]
+    content = {"document": document, "rows": rows(comparison), "legend": LEGEND, "pictures": pictures}
+    text = rendered("compare.html.j2", **content)
+    write_report(out, "compare", document, text, comparison.fits[0].fitted.rig.named)
 
 
 # --- in numbers

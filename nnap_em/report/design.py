@@ -13,12 +13,10 @@ from ..experiment.criteria import Information, after
 from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
 from ..residual.residual import names_of
-from ..storage.files import replace_text
 from ..storage.log import Log
 from .design_plots import bands_figure, motion_figure
 from .document import versions
-from .page import Picture, picture, rendered
-from .tables import write_json
+from .page import Picture, picture, rendered, write_report
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
@@ -39,10 +37,8 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
         "seconds": time.perf_counter() - began,
         "versions": versions(),
     }
-    named = design.fitted.rig.named
-    write_json(out / "design.json", document, named)
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
-    replace_text(out / "design.html", named(text))
+    write_report(out, "design", document, text, design.fitted.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUT_DIR}")
 

@@ -28,7 +28,7 @@ from .error_plots import error_figure, prediction_figure
 from .friction_plots import friction_figure
 from .page import MOST_PICTURES, PICTURE_BYTES, Picture, picture, write_page
 from .residual_plots import innovation_figure, residual_figure
-from .tables import visited_nodes, write_friction, write_json
+from .tables import visited_nodes, write_friction
 
 
 @stage("report")
@@ -89,9 +89,7 @@ def write_diagnosis(
         "suspects": [suspect._asdict() for suspect in suspects],
         "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
     }
-    named = diagnosis.before.rig.named
-    write_json(out / "report.json", document, named)
-    write_page(out, document, figures, named)
+    write_page(out, document, figures, diagnosis.before.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'report.html'} and report.json")
 

@@ -29,7 +29,7 @@ from .effect_plots import term_figure
 from .error_plots import error_figure
 from .friction_plots import friction_figure
 from .page import Picture, picture, write_page
-from .tables import visited_nodes, write_friction, write_json
+from .tables import visited_nodes, write_friction
 from .wording import reached, sentence
 
 
@@ -102,7 +102,6 @@ def write_identification(
         "model": "model.npz",
     }
     _log_summary(document, log)
-    write_json(out / "report.json", document, fitted.rig.named)
     write_page(out, document, figures, fitted.rig.named)
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
     return not misfit

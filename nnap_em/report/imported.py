@@ -11,11 +11,9 @@ from ..import_.declared import Plan
 from ..import_.delays import Delay
 from ..import_.resample import Resampled, TopicFacts
 from ..numerics.digits import number
-from ..storage.files import replace_text
 from .document import versions
 from .import_plot import timeline
-from .page import picture, rendered
-from .tables import write_json
+from .page import picture, rendered, write_report
 
 NOTABLE = 0.2
 """Share of a row from which on a delay, where it is surely one, is pointed out."""
@@ -53,14 +51,13 @@ def describe(
 
 def write_page(folder: Path, document: Mapping[str, Any]) -> None:
     """Write import.json and import.html."""
-    write_json(folder / "import.json", document)
     caption = (
         "Each bar is a topic while it has messages, its gaps in orange; below, the sequences that were made of it, "
         "and what was dropped. On the right the time from one message to the next: its median, one standard deviation, "
         "and the largest that is no gap; the dashed line is one row of the data set."
     )
     figure = picture("found", "Topics and sequences", caption, timeline(document))
-    replace_text(folder / "import.html", rendered("import.html.j2", document=document, pictures=[figure]))
+    write_report(folder, "import", document, rendered("import.html.j2", document=document, pictures=[figure]))
 
 
 def _log(log: Resampled, files: Iterator[str]) -> dict[str, Any]:

@@ -10,12 +10,10 @@ from matplotlib.figure import Figure
 from ..comparison.monitor import Reference, Trend
 from ..fit.identify import Identified
 from ..numerics.digits import counted
-from ..storage.files import replace_text
 from ..storage.log import Log
 from .document import versions
-from .page import picture, rendered
+from .page import picture, rendered, write_report
 from .style import BLUE, READING, VERMILION, band, head, styled
-from .tables import write_json
 
 
 def write_monitor(
@@ -41,9 +39,6 @@ def write_monitor(
         **found,
         "versions": versions(),
     }
-    named = fitted.rig.named
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "monitor.json", document, named)
     caption = (
         "Above: multi-step errors of each recording over those of the fit on recordings left out. Below: the chart "
     )
@@ -51,7 +46,7 @@ def write_monitor(
     pictures = [picture("found", "Trend", caption, trend_figure(document))]
     skipped = [f"{row['file']}: {row['reason']}" for row in rows if row["reason"]]
     text = rendered("monitor.html.j2", document=document, pictures=pictures, skipped=skipped)
-    replace_text(out / "monitor.html", named(text))
+    write_report(out, "monitor", document, text, fitted.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'monitor.html'} and monitor.json")
 

@@ -89,10 +89,8 @@ class Saturation(InputEffect):
 
     @classmethod
     def candidates(cls, around):
-        grid = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)
-        return [
-            one(partial(cls, **place), 2 * size, s * size, 0.2 * size) for place, size in around.drives for s in grid
-        ]
+        grid, drives = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2), around.drives
+        return [one(partial(cls, **place), 2 * size, s * size, 0.2 * size) for place, size in drives for s in grid]
 
     def drive(self, torque):
         return jnp.clip(torque, -self.limit, self.limit)

@@ -357,9 +357,12 @@ def flat(effect: AbstractEffect) -> Float[Array, " param"]:
     return jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
 
 
-def one(make: Callable[[Scalar], AbstractEffect], none: float, probe: float, spread: float) -> Candidate:
-    """A candidate of one strength: no effect, a small one, its prior standard deviation."""
-    return Candidate(make(a(none)), (make(a(probe)),), make(a(spread)))
+def one(
+    make: Callable[..., AbstractEffect], none: float, probe: float, spread: float, *inner: tuple[float, float]
+) -> Candidate:
+    """A candidate of one strength: no effect, a small one, its prior standard deviation; `inner` as in `pair`."""
+    at, wide = [a(value) for value, _ in inner], [a(std) for _, std in inner]
+    return Candidate(make(a(none), *at), (make(a(probe), *at),), make(a(spread), *wide))
 
 
 def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inner: tuple[float, float]) -> Candidate:

@@ -130,14 +130,10 @@ class PayloadStep(JointEffect):
     def candidates(cls, around):
         if not around.session:
             return []
-        first, last = around.duration
-        out = []
-        for j, size in varieties(around, "payload"):
-            make, interval, edge = partial(cls.of, joint=j), (last - first) / 24, 3 * around.dt
-            for time in (first + interval * i for i in range(1, 24)):
-                probe, spread = make(0.05 * size, time, edge), make(size, interval, edge)
-                out.append(Candidate(make(0.0, time, edge), (probe,), spread))
-        return out
+        first, interval = around.duration[0], (around.duration[1] - around.duration[0]) / 24
+        times = [first + interval * i for i in range(1, 24)]
+        joints = [(partial(cls, edge=3 * around.dt, joint=j), size) for j, size in varieties(around, "payload")]
+        return [one(make, 0.0, 0.05 * size, size, (time, interval)) for make, size in joints for time in times]
 
     def physics(self, system, time):
         return system.vary("payload", self.joint, self.mass * jax.nn.sigmoid((time - self.time) / self.edge))

@@ -30,12 +30,10 @@ class CoulombChange(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        sizes = zip(around.joints, map(float, around.torque), map(float, around.speed), strict=True)
-        return [
-            one(partial(cls, knee=jnp.asarray(SIGN_BEND * speed), joint=j), 0.0, PROBED * torque, PRIOR_STD * torque)
-            for j, torque, speed in sizes
-            if around.moved is not None and around.learned
-        ]
+        learned = around.joints if around.moved is not None and around.learned else ()
+        knees = [partial(cls, knee=SIGN_BEND * float(around.speed[j - 1]), joint=j) for j in learned]
+        sizes = zip(knees, map(float, around.torque), strict=False)
+        return [one(make, 0.0, PROBED * torque, PRIOR_STD * torque) for make, torque in sizes]
 
     def phrase(self, sizes):
         return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"

@@ -59,12 +59,8 @@ class FrictionDrift(JointEffect):
         if not around.learned:
             return []
         span = around.duration[1] - around.duration[0]
-        out = []
-        for j in around.joints:
-            make = partial(cls.of, joint=j)
-            paces = [math.log(share * span) for share in (0.05, 0.15, 0.4, 1.0)]
-            out += [Candidate(make(0.0, pace), (make(0.1, pace),), make(1.0, 1.0)) for pace in paces]
-        return out
+        paces = [math.log(share * span) for share in (0.05, 0.15, 0.4, 1.0)]
+        return [one(partial(cls, joint=j), 0.0, 0.1, 1.0, (pace, 1.0)) for j in around.joints for pace in paces]
 
     def values(self):
         return {"change": self.change, "tau": jnp.exp(self.pace)}
@@ -119,13 +115,11 @@ class LoadFriction(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        out = []
-        for j, _ in around.driven:
-            knee, names = a(0.02 * float(around.speed[j - 1])), (around.column(j), around.system.rates[j - 1])
-            for whole in (False, True):
-                make = partial(cls, knee=knee, whole=whole, names=names, joint=j)
-                out.append(one(make, 0.0, 0.05, 0.5))
-        return out
+        def make(j: int, whole: bool):
+            names = around.column(j), around.system.rates[j - 1]
+            return partial(cls, knee=a(0.02 * float(around.speed[j - 1])), whole=whole, names=names, joint=j)
+
+        return [one(make(j, whole), 0.0, 0.05, 0.5) for j, _ in around.driven for whole in (False, True)]
 
     def richer(self, around):
         two_sided, falls = self.load is not None, self.stribeck is not None

@@ -49,11 +49,8 @@ class BackEmf(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        sizes = around.torque / around.speed
-        return [
-            one(partial(cls, joint=j), 0.0, 0.1 * float(sizes[j - 1]), float(sizes[j - 1]))
-            for j in around.system.joints
-        ]
+        sizes = ((j, float(around.torque[j - 1] / around.speed[j - 1])) for j in around.system.joints)
+        return [one(partial(cls, joint=j), 0.0, 0.1 * size, size) for j, size in sizes]
 
     def force(self, scene, memory):
         return self.at(scene, -self.b * self.own(scene.v))

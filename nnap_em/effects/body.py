@@ -132,7 +132,7 @@ class PayloadStep(JointEffect):
             return []
         first, interval = around.duration[0], (around.duration[1] - around.duration[0]) / 24
         times = [first + interval * i for i in range(1, 24)]
-        joints = [(partial(cls, edge=3 * around.dt, joint=j), size) for j, size in varieties(around, "payload")]
+        joints = [(partial(cls, edge=a(3 * around.dt), joint=j), size) for j, size in varieties(around, "payload")]
         return [one(make, 0.0, 0.05 * size, size, (time, interval)) for make, size in joints for time in times]
 
     def physics(self, system, time):

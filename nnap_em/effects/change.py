@@ -9,7 +9,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .base import AbstractEffect, JointEffect, Scalar, known, one
+from .base import AbstractEffect, JointEffect, Scalar, a, known, one
 
 PROBED, PRIOR_STD = 0.05, 0.5
 """Torque of a probe, and standard deviation of a change, in the typical torque of the joint."""
@@ -31,7 +31,7 @@ class CoulombChange(JointEffect):
     @classmethod
     def candidates(cls, around):
         learned = around.joints if around.moved is not None and around.learned else ()
-        knees = [partial(cls, knee=SIGN_BEND * float(around.speed[j - 1]), joint=j) for j in learned]
+        knees = [partial(cls, knee=a(SIGN_BEND * float(around.speed[j - 1])), joint=j) for j in learned]
         sizes = zip(knees, map(float, around.torque), strict=False)
         return [one(make, 0.0, PROBED * torque, PRIOR_STD * torque) for make, torque in sizes]
 

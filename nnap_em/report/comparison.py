@@ -43,8 +43,8 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         "rig": rig.name,
         "system": rig.system,
         "verdict": comparison.verdict,
-        "cause": None if comparison.cause is None else comparison.cause._asdict(),
-        "changed": list(comparison.changed),
+        "cause": comparison.cause,
+        "changed": comparison.changed,
         "level": CHANGED,
         "least_shared": LEAST_SHARED,
         "fits": [
@@ -52,8 +52,8 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         ],
         "friction": [_curve(curve, names) for curve in comparison.curves],
         "numbers": [_number(each, names) for each in comparison.numbers],
-        "differences": list(comparison.differences),
-        "warnings": list(comparison.warnings),
+        "differences": comparison.differences,
+        "warnings": comparison.warnings,
         "versions": versions(),
     }
 
@@ -67,10 +67,10 @@ def _curve(curve: Curve, names: Sequence[str]) -> dict[str, Any]:
     return {
         "joint": curve.joint,
         "units": {"velocity": curve.units[0], "torque": curve.units[1]},
-        "velocity": curve.velocity.tolist(),
-        "fits": {names[i]: {"torque": t.tolist(), "std": s.tolist(), "cov": c.tolist()} for i, t, s, c in fits},
-        "pooled": {part: np.asarray(values).tolist() for part, values in curve.pooled._asdict().items()},
-        "test": _test(curve.test),
+        "velocity": curve.velocity,
+        "fits": {names[i]: {"torque": t, "std": s, "cov": c} for i, t, s, c in fits},
+        "pooled": curve.pooled,
+        "test": curve.test,
         "changed": curve.changed,
         "law": [_number(each, names) | {"changed": each in curve.parts} for each in curve.law],
     }
@@ -83,13 +83,9 @@ def _number(each: Number, names: Sequence[str]) -> dict[str, Any]:
         "unit": each.unit,
         "fits": {name: {"value": value, "std": std} for name, value, std in rows if math.isfinite(value)},
         "pooled": {part: float(values[0]) for part, values in each.pooled._asdict().items()},
-        "test": None if each.test is None else _test(each.test),
+        "test": each.test,
         "changed": each.changed,
     }
-
-
-def _test(test: JointTest) -> dict[str, Any]:
-    return test._asdict()
 
 
 # --- in a table

@@ -113,12 +113,8 @@ def friction_entries(design: Design) -> list[dict[str, Any]]:
         seen = weight[j] > 0
         near = seen & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
-        curves = {f"std_{side}": std[j][seen].tolist() for side, std in stds.items()}
-        out.append(
-            {"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms}
-            | {"velocity": v[seen].tolist()}
-            | curves
-        )
+        curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}
+        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms} | curves)
     return out
 
 

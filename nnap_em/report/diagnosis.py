@@ -71,9 +71,9 @@ def write_diagnosis(
         outcome, far = changes(diagnosis, accepted, error, rivals, suspects), []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *(one.sentence for one in far)]),
-        "moved": [one._asdict() for one in far],
+        "moved": far,
         "complete": diagnosis.complete,
-        "since_fit": {"risen": diagnosis.risen and diagnosis.risen._asdict()} if diagnosis.change else None,
+        "since_fit": {"risen": diagnosis.risen} if diagnosis.change else None,
         "effects": [entry(f) for f in accepted],
         "interventions": [_disturbance(force, train.files) for force in diagnosis.interventions],
         "error": error,
@@ -84,9 +84,9 @@ def write_diagnosis(
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
-        "disagreements": [d._asdict() for d in disputed],
+        "disagreements": disputed,
         "undecided": [place_of(key) for key in rivals],
-        "suspects": [suspect._asdict() for suspect in suspects],
+        "suspects": suspects,
         "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
     }
     write_page(out, document, figures, diagnosis.before.rig.named)

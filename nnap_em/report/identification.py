@@ -82,7 +82,7 @@ def write_identification(
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), misfit),
         "misfit": misfit,
-        "moved": [one._asdict() for one in moved(fitted)],
+        "moved": moved(fitted),
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),

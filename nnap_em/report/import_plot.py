@@ -5,6 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from ..import_.resample import TopicFacts
 from .style import BLUE, GREEN, READING, TRUTH, VERMILION, ZERO_LINE, head, styled
 
 DRAWN_LOGS = 6
@@ -18,12 +19,12 @@ _SPLITS = {"train": ("training", BLUE), "test": ("test", GREEN), None: ("dropped
 def timeline(document: Mapping[str, Any]) -> Figure:
     """A row for each topic that is used and one for the sequences, and the intervals of the messages beside them."""
     logs = document["logs"][:DRAWN_LOGS]
-    used = [[topic for topic in log["topics"] if topic["columns"] and topic["clock"]] for log in logs]
+    used = [[topic for topic in log["topics"] if topic.columns and topic.clock] for log in logs]
     heights = [len(topics) + 1 for topics in used]
     figure = Figure(figsize=(9.0, 1.1 + 0.42 * sum(heights) + 0.45 * len(logs)), layout="constrained")
     grid = figure.subplots(len(logs), 2, squeeze=False, width_ratios=[3.2, 1], height_ratios=heights)
     for (left, right), log, topics in zip(grid, logs, used, strict=True):
-        names = [topic["name"] or "table" for topic in topics]
+        names = [topic.name or "table" for topic in topics]
         for y, topic in enumerate(topics):
             _bar(left, y, topic)
             _intervals(right, y, topic)
@@ -36,7 +37,7 @@ def timeline(document: Mapping[str, Any]) -> Figure:
         left.set_title(log["file"])
         left.set_ylim(len(topics) + 0.5, -0.5)
         right.set(ylim=left.get_ylim(), yticks=[], xlabel="interval [ms]")
-        intervals = [1e3 / topic["rate"] for topic in topics]
+        intervals = [1e3 / topic.rate for topic in topics]
         if max(intervals) > LOG_AXIS_RATIO * min(intervals):
             right.set_xscale("log")
         else:
@@ -48,18 +49,18 @@ def timeline(document: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _bar(ax: Any, y: int, topic: Mapping[str, Any]) -> None:
+def _bar(ax: Any, y: int, topic: TopicFacts) -> None:
     """A topic while it is present; a gap is drawn wide enough to be seen."""
-    span = max(topic["end"] - topic["start"], 1e-9)
-    ax.barh(y, span, 0.3, topic["start"], color=TRUTH, alpha=0.55, label="topic")
-    for gap in topic["gaps"]:
-        width = max(gap["end"] - gap["start"], 0.003 * span)
-        ax.barh(y, width, 0.55, gap["start"], color=VERMILION, label="gap")
+    span = max(topic.end - topic.start, 1e-9)
+    ax.barh(y, span, 0.3, topic.start, color=TRUTH, alpha=0.55, label="topic")
+    for gap in topic.gaps:
+        width = max(gap.end - gap.start, 0.003 * span)
+        ax.barh(y, width, 0.55, gap.start, color=VERMILION, label="gap")
 
 
-def _intervals(ax: Any, y: int, topic: Mapping[str, Any]) -> None:
-    typical = 1e3 / topic["rate"]
-    low = max(typical - 1e3 * topic["jitter"], 0.05 * typical)
-    ax.plot([low, typical + 1e3 * topic["jitter"]], [y, y], color=BLUE, lw=5, alpha=0.4, solid_capstyle="butt")
-    ax.plot([typical, typical + 1e3 * topic["worst"]], [y, y], color=BLUE, lw=1)
+def _intervals(ax: Any, y: int, topic: TopicFacts) -> None:
+    typical = 1e3 / topic.rate
+    low = max(typical - 1e3 * topic.jitter, 0.05 * typical)
+    ax.plot([low, typical + 1e3 * topic.jitter], [y, y], color=BLUE, lw=5, alpha=0.4, solid_capstyle="butt")
+    ax.plot([typical, typical + 1e3 * topic.worst], [y, y], color=BLUE, lw=1)
     ax.plot(typical, y, "o", color=BLUE, ms=4)

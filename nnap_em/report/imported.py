@@ -9,7 +9,7 @@ import numpy as np
 from ..data.rig import Rig
 from ..import_.declared import Plan
 from ..import_.delays import Delay
-from ..import_.resample import Resampled, TopicFacts
+from ..import_.resample import Resampled
 from ..numerics.digits import number
 from .document import versions
 from .import_plot import timeline
@@ -65,19 +65,12 @@ def _log(log: Resampled, files: Iterator[str]) -> dict[str, Any]:
         "file": log.path.name,
         "origin_ns": log.origin,
         "columns": {name: {"from": str(at), "scale": at.scale} for name, at in log.addresses.items()},
-        "topics": [_topic(topic) for topic in log.topics],
-        "delays": [entry._asdict() for entry in log.delays],
+        "topics": log.topics,
+        "delays": log.delays,
         "rows": log.rows,
-        "sequences": [
-            {**s._asdict(), "missing": dict(s.missing), "file": None if s.why else next(files)} for s in log.sequences
-        ],
-        "notes": list(log.notes),
+        "sequences": [{**s._asdict(), "file": None if s.why else next(files)} for s in log.sequences],
+        "notes": log.notes,
     }
-
-
-def _topic(topic: TopicFacts) -> dict[str, Any]:
-    entry = topic._asdict()
-    return entry | {"gaps": [gap._asdict() for gap in topic.gaps], "columns": list(topic.columns)}
 
 
 def _remarks(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:

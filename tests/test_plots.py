@@ -13,9 +13,7 @@ from nnap_em.effects.base import Curve
 from nnap_em.fit.identify import FrictionTable
 from nnap_em.fit.predict import GIVEN, Prediction
 from nnap_em.report.diagnosis import _prediction_pictures
-from nnap_em.report.effect_plots import effect_figure, screen_figure
-from nnap_em.report.error_plots import error_figure, prediction_figure
-from nnap_em.report.friction_plots import friction_figure
+from nnap_em.report.fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
 from nnap_em.report.page import picture
 from nnap_em.report.residual_plots import innovation_figure, residual_figure
 from nnap_em.residual.residual import Names, Residual

@@ -23,9 +23,7 @@ from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
-from .effect_plots import effect_figure, screen_figure
-from .error_plots import error_figure, prediction_figure
-from .friction_plots import friction_figure
+from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
 from .page import MOST_PICTURES, PICTURE_BYTES, Picture, picture, write_page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction

@@ -25,9 +25,7 @@ from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
-from .effect_plots import term_figure
-from .error_plots import error_figure
-from .friction_plots import friction_figure
+from .fit_plots import error_figure, friction_figure, term_figure
 from .page import Picture, picture, write_page
 from .tables import visited_nodes, write_friction
 from .wording import reached, sentence

@@ -290,11 +290,16 @@ def test_short_test_sequences_have_no_errors_beyond_their_end():
     assert "2.0 s" not in text
 
 
-def test_every_effect_is_explained():
-    """Under the name that the report gives it, and no parameter that it does not have."""
+def test_every_effect_is_explained(monkeypatch):
+    """Under the name in the report, with words for no parameter that it lacks; a law of a user as far as it says."""
     for kind in catalogue.values():
         assert catalogue[kind.key()].meaning
         assert set(kind.words) <= set(kind.units)
+    assert catalogue["torsional_spring"].meaning in page(WHOLE) and "stiffness <i>k</i>" in page(WHOLE)
+    own = type("Wind", (), {"meaning": "", "words": {"k": "push"}})
+    monkeypatch.setitem(catalogue, "wind", own)
+    html = page(WHOLE | {"effects": [EFFECT | {"name": "wind", "description": "a wind"}]})
+    assert "push <i>k</i>" in html and "<p>A wind.</p>" in html and "<p></p>" not in html
 
 
 def test_what_the_test_sequences_do_not_bear_out_is_doubted():

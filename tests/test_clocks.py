@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import pendulum_rig
 from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
 
 from nnap_em.data import formats
@@ -21,27 +22,7 @@ from nnap_em.import_.signals import Signal
 from nnap_em.systems import specs
 
 DT = 0.01
-RIG = """\
-format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-[input]
-columns = ["u"]
-joints = [1]
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["theta1", "dtheta1"]
-[import]
-"""
+RIG = pendulum_rig() + "[import]\n"
 TOPICS = """
 [import.columns]
 theta1 = "/js:position[joint]"

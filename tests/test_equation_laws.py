@@ -24,7 +24,7 @@ from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.prediction_error.simulated import Simulated, Windows
 from nnap_em.report.document import unknown_terms as reported_terms
-from nnap_em.report.effect_plots import term_figure
+from nnap_em.report.fit_plots import term_figure
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.acrobot import table_i
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import pendulum_rig
 from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
@@ -18,30 +19,7 @@ from nnap_em.import_.signals import Signal, averaged, held, integrals, interpola
 from nnap_em.systems import specs
 
 DT = 0.01
-RIG = """\
-format = 1
-name = "bench"
-
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-
-[input]
-columns = ["u"]
-joints = [1]
-
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-
-[measurement]
-columns = ["theta1", "dtheta1"]
-"""
+RIG = pendulum_rig()
 COLUMNS = """
 [import]
 {more}

@@ -1,4 +1,13 @@
-"""nnap-em smooth: states from all readings of each sequence."""
+"""Estimate all states from all readings of each sequence.
+
+examples:
+  nnap-em smooth fit bench/test --out smoothed
+  nnap-em smooth fit bench/test --out smoothed --mcap smoothed.mcap
+
+DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+The file of --mcap gets JSON messages, for Foxglove and other viewers: /log, /smoothed, /one_row_ahead (states predicted
+from the rows before) and /missing_force (the generalised force that the model lacks, by coordinate).
+"""
 
 import argparse
 from pathlib import Path

@@ -78,7 +78,7 @@ def unknown_terms(fitted: Identified) -> list[dict[str, Any]]:
     numbers = covariances(fitted.model, fitted.m_step, fitted.state.hessian)
     for effect, cov in zip(fitted.model.effects, numbers, strict=True):
         if isinstance(effect, UnknownTerm):
-            table = dict(zip(("places", "value", "std"), (a.tolist() for a in effect.table(cov)), strict=True))
+            table = dict(zip(("places", "value", "std"), effect.table(cov), strict=True))
             unit = system.port_unit(system.ports.index(str(effect.channel)) + 1)
             signals = {name: system.unit(name) for name in effect.reads}
             out.append({"name": effect.label, "enters": effect.channel, "signals": signals, "unit": unit} | table)

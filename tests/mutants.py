@@ -925,15 +925,15 @@ MUTANTS = (
     Mutant(
         "nuisance not projected out of the error",
         "diagnosis/screen.py",
-        "error - nuisance @ solve(nuisance.T @ error - pull)",
-        "error - 0 * nuisance @ solve(nuisance.T @ error - pull)",
+        "error -= nuisance @ cho_solve(factor, nuisance.T @ error - pull)",
+        "error -= 0 * nuisance @ cho_solve(factor, nuisance.T @ error - pull)",
         "test_shares.py::test_the_nuisance_is_projected_out_by_ridge_regression",
     ),
     Mutant(
         "nuisance not projected out of the columns",
         "diagnosis/screen.py",
-        "candidates - nuisance @ solve(nuisance.T @ candidates)",
-        "candidates",
+        "left -= nuisance @ cho_solve(factor, nuisance.T @ left)",
+        "left -= 0.0",
         "test_shares.py::test_the_nuisance_is_projected_out_by_ridge_regression",
     ),
     Mutant(

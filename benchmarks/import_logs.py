@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics
 from mcap_ros2._dynamic import serialize_dynamic
 
-from nnap_em.recordings.ros2 import definitions, layout
+from nnap_em.import_.ros2 import definitions, layout
 
 EPOCH = 1_700_000_000 * 10**9
 BAR = "\n" + "=" * 80 + "\n"

@@ -4,7 +4,6 @@ They get the transition as their user would write it, and this library's own in 
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 
@@ -129,13 +128,6 @@ def cuthbert_case(what: str, own: bool, size: Size, backward: Callable | None = 
         return jnp.einsum("stpx,stp->stx", x, jax.nn.softmax(log_w, axis=-1))
 
     return Case("cuthbert", what + note, size, prepare, states)
-
-
-def cuthbert_mcmc():
-    """One independent Metropolis step."""
-    from cuthbertlib.smc.smoothing import mcmc
-
-    return functools.partial(mcmc.simulate, n_steps=1)
 
 
 def cuthbert_exact():

@@ -17,7 +17,7 @@ from typing import Any
 
 from import_logs import kinds, write
 
-from nnap_em.recordings import mcap_file
+from nnap_em.import_ import mcap_file
 
 Topics = Mapping[str, Sequence[str]]
 JOINTS = ("position[joint_1]", "position[joint_2]", "velocity[joint_1]", "velocity[joint_2]")

@@ -26,7 +26,6 @@ titles = {
     "extended": "Extended Kalman filter + RTS",
     "sigma-point": "Sigma-point filter + RTS",
     "filter": "Particle filter, and the transition alone",
-    "backward": "Particle filter + MCMC backward sampling, as many trajectories as particles",
     "exact": "Particle filter + exact backward sampling, as many trajectories as particles",
 }
 axes = {"particles": "particles", "steps": "steps of a sequence", "sequences": "sequences"}

@@ -25,7 +25,7 @@ from common_work import (
     wide_bank,
 )
 from limits import c_case, transition_case
-from peers import cuthbert_case, cuthbert_exact, cuthbert_mcmc, dynamax_case, natural_transition, particles_case
+from peers import cuthbert_case, cuthbert_exact, dynamax_case, natural_transition, particles_case
 
 from nnap_em.em.loop import e_step, em_step
 from nnap_em.fit.identify import begin
@@ -33,7 +33,7 @@ from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import Inputs
 from nnap_em.numerics.parallel import use_every_device
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle import Bootstrap, ExactBackward, Guided, MetropolisBackward, ParticleSmoother
+from nnap_em.smoother.particle import Bootstrap, ExactBackward, Guided, ParticleSmoother
 
 LOST = 0.3
 """A sequence is lost where the estimate of theta2 is off by more, root mean square [rad]."""
@@ -72,12 +72,6 @@ def groups(whole: Size, quick: bool) -> dict[str, list[Case]]:
             *(cuthbert_case(f"bootstrap filter, {size.particles}", False, size) for size in sizes),
             cuthbert_case(f"bootstrap filter, {most}", True, whole),
             *(particles_case(size._replace(sequences=2)) for size in sizes),
-        ],
-        "backward": [
-            paths_case("bootstrap, MCMC 1 step", Bootstrap(), MetropolisBackward(1), whole),
-            paths_case("bootstrap, MCMC 10 steps", Bootstrap(), MetropolisBackward(10), whole),
-            paths_case("guided, MCMC 10 steps", Guided(), MetropolisBackward(10), whole),
-            cuthbert_case("bootstrap, MCMC 1 step", False, whole, cuthbert_mcmc),
         ],
         "exact": [
             paths_case("bootstrap, exact backward", Bootstrap(), ExactBackward(), pair),

@@ -72,7 +72,7 @@ def effects() -> str:
     """A row for each class of the catalogue: law, parameters, confirmation on the machine, place in an MJCF file."""
     rows = ["| name | law | parameters | to be sure | in an MJCF file |", "| --- | --- | --- | --- | --- |"]
     for name, kind in catalogue.items():
-        law = kind.meaning().rstrip(".").replace("|", BAR)
+        law = _first_paragraph(kind.__doc__).rstrip(".")
         units = ", ".join(f"`{parameter}` [{unit}]" for parameter, unit in kind.units.items())
         rows.append(f"| `{name}` | {law} | {units} | {kind.confirm} | {_place(name)} |")
     return "\n".join(rows)
@@ -105,13 +105,13 @@ def _folder(name: str) -> str:
     folder = ROOT / "nnap_em" / name
     told = (folder / "README.md").read_text().replace("](../../docs/how/", "](").replace("](../../docs/", "](../")
     rows = [
-        f"| `{path.relative_to(folder)}` | {_first_line(path)} |"
+        f"| `{path.relative_to(folder)}` | {_first_paragraph(ast.get_docstring(ast.parse(path.read_text())))} |"
         for path in sorted(folder.rglob("*.py"))
         if path.name != "__init__.py"
     ]
     return "\n".join([f"#{told}", "| module | |", "| --- | --- |", *rows])
 
 
-def _first_line(path: Path) -> str:
-    said = ast.get_docstring(ast.parse(path.read_text())) or ""
-    return " ".join(said.split("\n\n")[0].split()).replace("|", BAR)
+def _first_paragraph(docstring: str | None) -> str:
+    """The beginning of a docstring as one line of a table."""
+    return " ".join((docstring or "").split("\n\n")[0].split()).replace("|", BAR)

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from .diagnosis.outcome import Diagnosis
     from .diagnosis.search import diagnose
     from .experiment.experiment import design
+    from .fit.check import check
     from .fit.identify import Identified, friction_table, parameter_table
     from .fit.known import identify_from
     from .fit.observer import observer
     from .fit.predict import horizon_errors, predict, smooth
     from .fit.store import load, save
-    from .identifiability.check import check
     from .model.simulate import simulate
     from .systems import read_rig, register, register_equations
 
@@ -81,7 +81,7 @@ _homes = {
     "fit.observer": ("observer",),
     "fit.predict": ("horizon_errors", "predict", "smooth"),
     "fit.store": ("load", "save"),
-    "identifiability.check": ("check",),
+    "fit.check": ("check",),
     "model.simulate": ("simulate",),
     "systems": ("read_rig", "register", "register_equations"),
 }

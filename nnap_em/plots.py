@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from .data.dataset import Dataset
 from .fit.identify import Identified, friction_table
 from .fit.predict import predict
-from .report.error_plots import prediction_figure
-from .report.friction_plots import friction_figure
+from .report.fit_plots import friction_figure, prediction_figure
 from .report.residual_plots import residual_figure
 from .residual.residual import names_of
 from .residual.residual import residual as residual_of

@@ -112,6 +112,29 @@ def slide() -> tuple[StateSpaceModel, ScoringMStep]:
     return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q)
 
 
+def pendulum_rig(columns: str = '"theta1", "dtheta1"') -> str:
+    """rig.toml of a pendulum with the input `u`, sampled every 0.01 s, of which these `columns` are measured."""
+    return f"""format = 1
+name = "bench"
+[model]
+type = "pendulum"
+m = 0.3
+lc = 0.2
+I = 0.01
+g = 9.81
+friction = "unknown"
+[input]
+columns = ["u"]
+joints = [1]
+[sampling]
+dt = 0.01
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = [{columns}]
+"""
+
+
 def chain_rig(columns: str, unknown: str = "") -> str:
     """rig.toml of two states in a chain, written as equations, with these `columns` and `unknown` terms."""
     return f"""format = 1

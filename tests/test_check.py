@@ -15,8 +15,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import REPEAT, Logs, Masked
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
-from nnap_em.identifiability import check as check_module
-from nnap_em.identifiability.check import CheckResult, check, gramian, torques, undetermined
+from nnap_em.fit import check as check_module
+from nnap_em.fit.check import CheckResult, check, gramian, torques, undetermined
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems import specs
 from nnap_em.systems.acrobot import table_i

@@ -7,41 +7,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import pendulum_rig
 from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
 
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import read_rig
-from nnap_em.recordings import clock
-from nnap_em.recordings.declared import read_plan
-from nnap_em.recordings.files import reader
-from nnap_em.recordings.resample import Resampled, resample
-from nnap_em.recordings.segments import covered, runs, sent_on_change
-from nnap_em.recordings.signals import Signal
+from nnap_em.import_ import clock
+from nnap_em.import_.declared import read_plan
+from nnap_em.import_.files import reader
+from nnap_em.import_.resample import Resampled, resample
+from nnap_em.import_.segments import covered, runs, sent_on_change
+from nnap_em.import_.signals import Signal
 from nnap_em.systems import specs
 
 DT = 0.01
-RIG = """\
-format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-[input]
-columns = ["u"]
-joints = [1]
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["theta1", "dtheta1"]
-[import]
-"""
+RIG = pendulum_rig() + "[import]\n"
 TOPICS = """
 [import.columns]
 theta1 = "/js:position[joint]"
@@ -57,7 +38,7 @@ DAY = 86400.0
 @pytest.fixture(autouse=True)
 def _no_delays(monkeypatch):
     """Delays between topics, whose tests are in `test_import.py`, take most of the time of an import this short."""
-    monkeypatch.setattr("nnap_em.recordings.resample.pairs", lambda *_: [])
+    monkeypatch.setattr("nnap_em.import_.resample.pairs", lambda *_: [])
 
 
 def _columns(t):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import swing_rig
+from helpers import pendulum_rig, swing_rig
 
 from nnap_em.commands import cli
 from nnap_em.data.counters import counter, unwrapped
@@ -89,28 +89,12 @@ def test_what_machines_do_is_no_counter(y, options):
     assert counter(y, T, **options) is None
 
 
-RIG = """\
-format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-[input]
-columns = ["u"]
-joints = [1]
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["theta1"]
-[import.columns]
+RIG = (
+    pendulum_rig('"theta1"')
+    + """[import.columns]
 theta1 = { from = "counts", scale = 0.00015339807878856412 }
 """
+)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import drawn_paths
 from nnap_em.fit.store import load
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.report.design_plots import motion_figure
+from nnap_em.report.design import motion_figure
 from nnap_em.residual.residual import names_of
 from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs

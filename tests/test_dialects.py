@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from dialects import DT, Q, T, U, V
+from helpers import pendulum_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -17,35 +18,16 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.draft.from_machine import draft_machine
-from nnap_em.recordings import text_file
-from nnap_em.recordings.columns import resolve
-from nnap_em.recordings.declared import read_plan
-from nnap_em.recordings.files import reader
-from nnap_em.recordings.recording import Address, Topic, address, last_word, word_of
-from nnap_em.recordings.resample import resample
+from nnap_em.import_ import text_file
+from nnap_em.import_.columns import resolve
+from nnap_em.import_.declared import read_plan
+from nnap_em.import_.files import reader
+from nnap_em.import_.recording import Address, Topic, address, last_word, word_of
+from nnap_em.import_.resample import resample
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
-RIG = f"""
-format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.5
-lc = 0.4
-I = 0.002
-g = 9.81
-friction = "none"
-[input]
-columns = ["u"]
-joints = [1]
-[sampling]
-dt = {DT}
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["theta1", "dtheta1"]
-"""
+RIG = pendulum_rig().replace("dt = 0.01", f"dt = {DT}")
 ARM = """<mujoco><worldbody><body name="link"><joint name="joint0" axis="0 1 0"/>
 <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.001"/></body></worldbody></mujoco>"""
 

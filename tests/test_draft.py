@@ -10,7 +10,7 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import RigError, SystemSpec, read_rig
-from nnap_em.draft.from_log import draft
+from nnap_em.init.from_log import draft
 from nnap_em.systems import specs
 
 DT, ROWS = 0.02, 400

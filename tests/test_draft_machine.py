@@ -11,7 +11,7 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.draft.from_machine import draft_machine
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
 T = 0.004 * np.arange(2000)

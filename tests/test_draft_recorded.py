@@ -9,8 +9,8 @@ from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2,
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import read_rig
-from nnap_em.draft.from_topics import draft_recorded, found_columns
-from nnap_em.recordings.recording import Topic
+from nnap_em.import_.recording import Topic
+from nnap_em.init.from_topics import draft_recorded, found_columns
 from nnap_em.systems import specs
 
 T = 0.004 * np.arange(2000)

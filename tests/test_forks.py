@@ -14,14 +14,17 @@ from nnap_em.diagnosis.columns import candidate_columns, tracks
 from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.propose import proposals, surroundings
+from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.prediction_error import multistep
 from nnap_em.prediction_error.multistep import (
-    Columns,
+    HORIZONS,
+    SHORT_HORIZONS,
     OpenLoop,
     errors,
     finish,
@@ -97,13 +100,25 @@ def test_errors_are_those_of_the_model_run_alone(known):
     np.testing.assert_allclose(error[:, 0, 0], difference, atol=0.05 * float(jnp.abs(difference).max()))
 
 
+def test_all_horizons_share_one_program_and_its_errors(known, monkeypatch):
+    """The same error after 0.1 s whether the longest horizon is that or 0.5 s, from every start that both have."""
+    along = followed(known.model, known.m_step.prior, known.path, known.data)
+    traced, one = [], multistep._errors
+    monkeypatch.setattr(multistep, "_errors", lambda *args: (traced.append(1), one(*args))[1])
+    short, before = errors(along, SHORT_HORIZONS), len(traced)
+    both = errors(along, (*SHORT_HORIZONS, *HORIZONS))
+    assert len(traced) == before > 0 and np.isfinite(short).all()
+    assert short.shape[1] > both.shape[1] > 0
+    np.testing.assert_array_equal(short[:, : both.shape[1]], both[:, :, :2])
+
+
 @pytest.mark.parametrize("name", ["torsional_spring", "base_tilt", "motor_gain"])
 def test_columns_are_difference_quotients(question, known, name):
     """A column is minus the change of the error where a hundredth of the effect is in the model."""
     candidates = _candidates(question, name)
     inputs = jax.vmap(known.model.inputs)(known.data)
     extra = candidate_columns(known.model, candidates)(tracks(known.model, known.path, inputs))
-    some = lambda index: [jax.tree.map(lambda a: a[index], extra)]  # noqa: E731
+    some = lambda index: jax.tree.map(lambda a: a[index], extra)  # noqa: E731
     along = followed(known.model, known.m_step.prior, known.path, known.data)
     before = open_loop(along, known.m_step.weights(known.model), some)
     start, probe = candidates[0].start, candidates[0].probes[0]
@@ -115,23 +130,32 @@ def test_columns_are_difference_quotients(question, known, name):
     assert np.linalg.norm(column - quotient) < 0.05 * np.linalg.norm(quotient)
 
 
-def test_columns_in_blocks_are_those_of_all_at_once(question, monkeypatch):
-    """Columns in blocks are those of one block, also where a free function has many parameters under one name."""
+def test_a_screen_in_blocks_is_that_of_all_at_once(question, monkeypatch):
+    """Shares, placebos and columns, also where a free function has many parameters under one name."""
     _, q = question
     around = surroundings(question[0], q.model, q.data, q.path, ROWS)
     free = next(c for c in catalogue["unknown_function"].candidates(around) if len(c.probes) > 5)
     q = q._replace(hypothesis=q.hypothesis.plus(free.start, free))
-    candidates = [*_candidates(question, "torsional_spring", "cogging"), free]
-    probes = sum(len(c.probes) for c in candidates)
-    whole = MultiStep().linearise(q, candidates)
+    candidates = [*_candidates(question, "torsional_spring", "cogging", "motor_gain"), free]
+    whole = screen(MultiStep(), q, candidates)
     monkeypatch.setattr(columns_of, "COLUMNS_AT_ONCE", 5)
-    sizes = [part.force.shape[1] for part in columns_of.blocks(Columns(*2 * [np.zeros((1, probes, 3, 2))]))]
-    assert len(sizes) > 2 and max(sizes) <= 5 and max(sizes) - min(sizes) == 1 and sum(sizes) == probes
-    for one, other in zip(MultiStep().linearise(q, candidates), whole, strict=True):
-        assert one.columns.shape == other.columns.shape
-        np.testing.assert_allclose(one.columns, other.columns, rtol=1e-4, atol=1e-5 * np.abs(other.columns).max())
-    numbers = q.m_step.weights(q.model).nodes.size + q.m_step.prior.mean.size
-    assert all(one.columns.shape[-1] == numbers + probes for one in whole)
+    parts = screen(MultiStep(), q, candidates)
+    for one, other in zip(parts.columns, whole.columns, strict=True):
+        assert one.shape[1] == sum(len(candidate.probes) for candidate in candidates)
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(other).max())
+    for one, other in zip(parts.screened, whole.screened, strict=True):
+        assert one.candidate is other.candidate and one.band == other.band
+        np.testing.assert_allclose([one.chance, *one.share.folds], [other.chance, *other.share.folds], rtol=1e-3)
+        np.testing.assert_allclose(one.share[:2], other.share[:2], rtol=1e-3, atol=1e-6)
+
+
+def test_blocks_keep_the_order_and_are_about_as_large_as_said(question, monkeypatch):
+    law, sizes = _candidates(question, "motor_gain")[0].start, (2, 2, 3, 3, 3, 1, 9, 1)
+    every = [Candidate(law, (law,) * size, law) for size in sizes]
+    monkeypatch.setattr(columns_of, "COLUMNS_AT_ONCE", 7)
+    blocks = columns_of.blocks_of(every)
+    assert [[len(one.probes) for one in block] for block in blocks] == [[2, 2], [3, 3, 3], [1], [9, 1]]
+    assert all(a is b for a, b in zip([one for block in blocks for one in block], every, strict=True))
 
 
 def test_a_probe_gives_the_same_column_beside_all_others_as_alone(question):

@@ -7,10 +7,10 @@ from helpers import swing, swing_rig
 from nnap_em.data.formats import write_csv
 from nnap_em.data.held import HELD_ROWS, hold, repeats
 from nnap_em.data.logs import DataWarning, read_logs
+from nnap_em.data.noise import reading_noise
 from nnap_em.data.plausible import repeats as copies
 from nnap_em.data.rough import rough
 from nnap_em.em.build import derivatives
-from nnap_em.em.readings import reading_noise
 
 T = 0.01 * np.arange(601)
 ANGLE = np.sin(2.2 * T) + 0.3 * np.sin(9.1 * T + 0.4)

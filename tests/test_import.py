@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import pendulum_rig
 from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
@@ -12,36 +13,13 @@ from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
-from nnap_em.recordings.delays import Pair, delay
-from nnap_em.recordings.segments import Segment, cut
-from nnap_em.recordings.signals import Signal, averaged, held, integrals, interpolated
+from nnap_em.import_.delays import Pair, delay
+from nnap_em.import_.segments import Segment, cut
+from nnap_em.import_.signals import Signal, averaged, held, integrals, interpolated
 from nnap_em.systems import specs
 
 DT = 0.01
-RIG = """\
-format = 1
-name = "bench"
-
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-
-[input]
-columns = ["u"]
-joints = [1]
-
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-
-[measurement]
-columns = ["theta1", "dtheta1"]
-"""
+RIG = pendulum_rig()
 COLUMNS = """
 [import]
 {more}
@@ -385,7 +363,7 @@ REFUSED = {  # what is wrong with the rig's table, or with the log, and words of
     "unknown joint": (_said("position[joint]", "position[jiont]"), {}, ["did you mean 'position[joint]'"]),
     "not declared": ({"columns": ""}, {}, ["column 'u': nothing is called so", "[import.columns] u =", "/cmd:data[0]"]),
     "unknown key": ({"more": "gaps = 1"}, {}, ["[import] gaps", "unknown", "did you mean 'gap'"]),
-    "unknown column": (_said("theta1 =", "theta2 ="), {}, ["[import.columns] theta2", "no column of this rig"]),
+    "unknown column": (_said("theta1 =", "theta2 ="), {}, ["[import.columns] theta2", "unknown table or key"]),
     "no address": (_said('"/cmd:data[0]"', "3"), {}, ["[import.columns] u", "found 3", "topic:field"]),
     "no scale": (_said('"/cmd:data[0]"', '{ from = "/cmd:data[0]", scale = 0 }'), {}, ["scale is 0"]),
     "input": ({"more": 'input = "holds"'}, {}, ["[import] input", "did you mean 'hold'"]),
@@ -440,8 +418,8 @@ def test_a_name_that_stands_twice_is_asked_for(tmp_path, capsys):
 
 def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
     """As the coordinates of a machine that was read from its file are."""
-    from nnap_em.recordings.columns import resolve
-    from nnap_em.recordings.files import reader
+    from nnap_em.import_.columns import resolve
+    from nnap_em.import_.files import reader
 
     joints = joint_states(("shoulder", "elbow"), *[np.ones((300, 2))] * 3)
     path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(T), joints)})

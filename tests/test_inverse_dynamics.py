@@ -11,8 +11,8 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build_system
-from nnap_em.identifiability.check import dynamics
-from nnap_em.identifiability.inverse_dynamics import (
+from nnap_em.fit.check import dynamics
+from nnap_em.fit.inverse_dynamics import (
     LARGEST_REMAINDER,
     SMALLEST_MISFIT,
     Explanation,

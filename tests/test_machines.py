@@ -23,7 +23,7 @@ from nnap_em.em.prior import ParameterPrior
 from nnap_em.experiment.criteria import Information
 from nnap_em.experiment.experiment import Design
 from nnap_em.experiment.information import Fit
-from nnap_em.identifiability.identifiability import identifiability, sentences
+from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve

@@ -17,9 +17,9 @@ from nnap_em.diagnosis.memory import identify, with_memory
 from nnap_em.diagnosis.outcome import Diagnosis, Step
 from nnap_em.effects import OperatingPoint
 from nnap_em.em.build import build_system, measure_scales
+from nnap_em.fit.check import Along, memory
 from nnap_em.fit.identify import begin, friction_table
 from nnap_em.fit.store import load, save
-from nnap_em.identifiability.check import Along, memory
 from nnap_em.model.base import prepare
 from nnap_em.model.dynamic_friction import SHAPES, DynamicFriction, hysteresis
 from nnap_em.model.law import StribeckLaw

@@ -13,9 +13,7 @@ from nnap_em.effects.base import Curve
 from nnap_em.fit.identify import FrictionTable
 from nnap_em.fit.predict import GIVEN, Prediction
 from nnap_em.report.diagnosis import _prediction_pictures
-from nnap_em.report.effect_plots import effect_figure, screen_figure
-from nnap_em.report.error_plots import error_figure, prediction_figure
-from nnap_em.report.friction_plots import friction_figure
+from nnap_em.report.fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
 from nnap_em.report.page import picture
 from nnap_em.report.residual_plots import innovation_figure, residual_figure
 from nnap_em.residual.residual import Names, Residual
@@ -111,7 +109,9 @@ def test_a_rounded_drawing_is_smaller_and_in_the_same_places():
     figure = prediction_figure(residual.t[0], residual.state[0], names, {"before": pair}, 1.0)
     image = io.BytesIO()
     figure.savefig(image, format="svg")
-    plain, rounded = image.getvalue(), picture("error", "", "", figure).image
+    drawn = picture("error", "", "", figure)
+    plain, rounded = image.getvalue(), drawn.image
+    assert f'width="{0.75 * drawn.width:g}pt"'.encode() in plain
     paths, scales = (re.compile(rb'(?s)\b%s="([^"]*)"' % name) for name in (b"d", b"transform"))
     for a, b in zip(paths.findall(plain), paths.findall(rounded), strict=True):
         numbers = (np.asarray(re.findall(rb"-?\d+\.?\d*", d), float) for d in (a, b))

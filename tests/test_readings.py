@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import pad
+from nnap_em.data.noise import reading_noise, resolution
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build
 from nnap_em.em.mstep import RELEASES, RESTING_OFFSET
-from nnap_em.em.readings import RESTS, ROWS_BEFORE, at_rest, onset, reading_noise, resolution
+from nnap_em.em.readings import RESTS, ROWS_BEFORE, at_rest, onset
 
 T = 0.01 * np.arange(600)
 

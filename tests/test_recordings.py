@@ -27,9 +27,9 @@ from recorders import (
 from nnap_em.data.dataset import DataError, pad
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import Logs
-from nnap_em.recordings import codecs, mcap_writer
-from nnap_em.recordings.files import reader
-from nnap_em.recordings.objects import flatten, pick
+from nnap_em.import_ import codecs, mcap_writer
+from nnap_em.import_.files import reader
+from nnap_em.import_.objects import flatten, pick
 
 T = 0.01 * np.arange(300)
 Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
@@ -116,7 +116,7 @@ def test_the_fast_way_is_taken(tmp_path, monkeypatch):
 
 
 def test_a_layout_that_differs_from_the_generic_decoder_is_not_used(tmp_path, monkeypatch):
-    from nnap_em.recordings.ros2 import Layout
+    from nnap_em.import_.ros2 import Layout
 
     monkeypatch.setattr(Layout, "read", lambda self, data, start, path: np.zeros(start.size))
     values = _read(_log(tmp_path / "a.mcap"), js=("position[elbow]",))["/js"].values

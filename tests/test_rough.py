@@ -15,10 +15,11 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, Logs
 from nnap_em.data.missing import interpolated
+from nnap_em.data.noise import reading_noise
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
-from nnap_em.data.spikes import noise, spikes
-from nnap_em.identifiability.check import check
+from nnap_em.data.spikes import spikes
+from nnap_em.fit.check import check
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}
@@ -135,7 +136,7 @@ def test_a_joint_that_stands_still_is_not_stuck():
 
 def test_standing_still_tells_no_noise():
     """The noise of a column that stands most of the time is that of the rest; it was 0, and all rows were tried."""
-    moving = _motion(0, 1.0)["theta1"]
+    noise, moving = lambda y: reading_noise(y[None]), _motion(0, 1.0)["theta1"]
     assert noise(np.append(np.full(900, moving[0]), moving)) == pytest.approx(noise(moving), rel=0.02)
     still = 1.5e-3 * np.round(np.append(np.zeros(1200), 0.03 * np.sin(0.05 * np.arange(60))) / 1.5e-3)
     spoilt = still.copy()

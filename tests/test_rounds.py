@@ -219,8 +219,8 @@ def test_laws_whose_columns_are_the_same_are_equivalent(monkeypatch):
     """Two of three candidates have proportional columns."""
     entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.2), _screened(_spring(), 0.2)]
     outcome, _ = _run(monkeypatch, entries)
-    alike = np.array([[4.0, 2.0, 0.1], [2.0, 1.0, 0.0], [0.1, 0.0, 1.0]], np.float32)
-    seen = outcome.screen._replace(information=(alike,))
+    columns = np.array([[2.0, 1.0, 0.05], [0.0, 0.0, np.sqrt(1 - 0.05**2)]], np.float32)
+    seen = outcome.screen._replace(columns=(columns,))
     assert rounds.overlaps(seen, seen.screened[0]) == pytest.approx([0.0, 0.0, 1 - 0.01 / 4], abs=1e-5)
 
 
@@ -231,7 +231,7 @@ def test_a_law_of_two_strengths_is_equivalent_to_one_that_gives_what_was_fitted(
     ripple = ripple._replace(candidate=ripple.candidate._replace(probes=ripple.candidate.probes * 2))
     ripple = ripple._replace(coefficients=np.asarray([sine, cosine]))
     columns = np.eye(4)[:, [0, 1, 1]]
-    seen = Screen((ripple, _screened(_spring(), 0.4)), (columns.T @ columns,), (np.eye(3, 6, dtype=bool),))
+    seen = Screen((ripple, _screened(_spring(), 0.4)), (columns,), (np.eye(3, 6, dtype=bool),))
     assert rounds.overlaps(seen, ripple) == pytest.approx([0.0, left], abs=1e-6)
 
 

@@ -12,9 +12,9 @@ from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
 from nnap_em.em.build import build_system
 from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
+from nnap_em.fit.identifiability import identifiability
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
-from nnap_em.identifiability.identifiability import identifiability
 from nnap_em.systems import specs
 
 RIG = """format = 1

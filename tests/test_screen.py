@@ -43,9 +43,9 @@ def test_a_lost_sequence_does_not_count_not_even_as_nan(bench):
     fit = _fit(bench)
     spring = catalogue["torsional_spring"].candidates(surroundings(bench[0], *_of(fit)))[:1]
     lost = fit._replace(path=fit.path._replace(mean=fit.path.mean.at[1].set(jnp.nan)))
-    (linearised,) = OneStep().linearise(lost, spring)
+    ((linearised,),) = OneStep().linearise(lost, [spring])
     assert not linearised.weight[1].any() and linearised.weight[[0, 2, 3]].all()
-    (unused,) = OneStep().linearise(fit._replace(used=np.array([True, False, True, True])), spring)
+    ((unused,),) = OneStep().linearise(fit._replace(used=np.array([True, False, True, True])), [spring])
     np.testing.assert_array_equal(unused.weight, linearised.weight)
 
 
@@ -69,7 +69,7 @@ def test_columns_are_difference_quotients(bench, name):
         before = run(model, at, seq)
         column = -(run(full, at, seq) - before) / small
         size = float(jnp.linalg.norm(column) * jnp.linalg.norm(before))
-        (linearised,) = OneStep().linearise(_fit(bench), [candidate])
+        ((linearised,),) = OneStep().linearise(_fit(bench), [[candidate]])
         np.testing.assert_allclose(linearised.error[i], before, atol=1e-5)
         own = linearised.columns[i, ..., -1].astype(float)
         assert float(jnp.sum(own * before)) == pytest.approx(float(jnp.sum(column * before)), abs=0.02 * size)
@@ -83,7 +83,7 @@ def test_what_a_friction_map_holds_gains_nothing(bench):
     maps = ("torque_offset", "motor_back_emf", "air_drag")
     held = [c for kind in maps for c in catalogue[kind].candidates(around) if c.start.joint]
     free = catalogue["torsional_spring"].candidates(around)
-    (linearised,) = OneStep().linearise(_fit(bench), [*held, *free])
+    ((linearised,),) = OneStep().linearise(_fit(bench), [[*held, *free]])
     count = rule.weights(model).nodes.size + rule.weights(model).prior.size
     none, weak = np.zeros(linearised.error.shape[:2], int), 1e-4 * np.eye(count)  # a prior that counts for nothing
     rows = project(linearised, none, none, weak, np.zeros(count))

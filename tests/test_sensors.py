@@ -1,7 +1,6 @@
 """Sensors of a machine file that read no joint: their readings against MuJoCo's own, and what becomes of them."""
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +21,6 @@ from nnap_em import identify
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
 from nnap_em.data.rig import RigError, read_rig, write_rig
-from nnap_em.draft.from_machine import _sensors, draft_machine
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.local import local, readings_at
@@ -34,6 +32,8 @@ from nnap_em.export.model import parameters, predictor
 from nnap_em.fit.identify import begin, phi_samples
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
+from nnap_em.import_.recording import Topic
+from nnap_em.init.from_machine import _sensors, draft_machine
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, NoFriction
@@ -41,7 +41,6 @@ from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.recordings.recording import Topic
 from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
 from nnap_em.smoother.start import StartBank
@@ -233,11 +232,6 @@ def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
     write_rig(rig, tmp_path / "again.toml")
     assert read_rig(tmp_path / "again.toml", specs) == rig
     assert unpacked(packed(read := unpacked(rig.machine))) == read
-
-
-def test_texts_of_machines_from_before_sensors_are_read():
-    before = json.dumps(json.loads(packed(read_machine(ROOT / "tests" / "machines" / "branch.xml")))[:-1])
-    assert unpacked(before).sensors == ()
 
 
 BAD = {

@@ -20,11 +20,11 @@ from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.servos import build_servos
 from nnap_em.export.model import ExportError, write_model
+from nnap_em.fit.check import ERROR, OK, WARNING, check
+from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
-from nnap_em.identifiability.check import ERROR, OK, WARNING, check
-from nnap_em.identifiability.identifiability import identifiability, sentences
 from nnap_em.model.servo import LAWS, Servo
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian

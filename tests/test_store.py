@@ -21,7 +21,7 @@ from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle import Guided, MetropolisBackward, ParticleSmoother
+from nnap_em.smoother.particle import ExactBackward, Guided, ParticleSmoother
 from nnap_em.storage import files
 from nnap_em.storage.files import StoreError
 
@@ -113,7 +113,7 @@ SMOOTHERS = {
     "cubature": lambda bank: CubatureSmoother(bank, window=30, inflations=(1.0, 2.0)),
     "extended": ExtendedKalmanSmoother,
     "particles": lambda bank: ParticleSmoother(
-        CubatureSmoother(bank, iterations=2), Guided(), MetropolisBackward(7), num_particles=31, dtype=float
+        CubatureSmoother(bank, iterations=2), Guided(), ExactBackward(7), num_particles=31, dtype=float
     ),
 }
 
@@ -249,13 +249,9 @@ def _other_code(header, arrays):
     header["leaves"][code]["of"] = "relu"
 
 
-def _lost_setting(header, arrays):
-    del header["settings"]["/m_step/nodes"]
-
-
 MISFITS = {
-    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 3"),
-    "newer": (_set(format=4), "format 4"),
+    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4"),
+    "newer": (_set(format=5), "format 5"),
     "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
     "header": (lambda header, _: header.pop("notes"), "lacks something"),
     "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),
@@ -263,7 +259,6 @@ MISFITS = {
     "lost array": (_lost_array, "state/model/log_q: missing in the file"),
     "spare array": (_spare_array, "state/model/extra: unknown here"),
     "code": (_other_code, "'relu' in the file"),
-    "setting": (_lost_setting, "m_step/nodes"),
 }
 
 

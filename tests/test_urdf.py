@@ -9,7 +9,7 @@ import pytest
 from machines import tree
 
 from nnap_em.data.rig import Declared, RigWarning, read_rig
-from nnap_em.draft.from_machine import draft_machine
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.machines.mjcf import Part, read_machine
 from nnap_em.machines.source import MachineError
 from nnap_em.systems import specs

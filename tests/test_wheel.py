@@ -60,8 +60,8 @@ def test_installed_command_runs_elsewhere(wheel, tmp_path):
     home = _run(python, "-c", "import nnap_em; print(nnap_em.__file__)", cwd=tmp_path)
     assert home.startswith(site)
 
-    written = _run(python, "-c", "from nnap_em.report.page import page; print(page({}))", cwd=tmp_path)
-    assert "Nothing is missing" in written
+    written = _run(python, "-c", "from nnap_em.report.page import page; print(page({'effects': []}))", cwd=tmp_path)
+    assert "No effect of the catalogue" in written
 
     command = tmp_path / "env/bin/nnap-em"
     assert "simulate" in _run(command, "--help", cwd=tmp_path)

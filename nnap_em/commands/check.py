@@ -1,10 +1,18 @@
-"""nnap-em check: test of whether the logs can identify what is declared."""
+"""Test whether the logs can identify what is declared.
+
+example:
+  nnap-em check bench
+
+One line per subject: ok, warning (a fit may do) or error (a fit would be in vain).  Length, missing samples,
+sampling rate, noise, torques, the velocities that each joint visits, and whether the whole state can be observed.
+Nothing is fitted and nothing is written.  Exit status 1 where one has an error.
+"""
 
 import argparse
 
 import jax
 
-from ..identifiability.check import ERROR, check
+from ..fit.check import ERROR, check
 from ..numerics.digits import counted
 from ..storage.log import Log
 from .common import read_bench

@@ -1,6 +1,7 @@
 """The command line: arguments in, exit status out; the work is in `commands`, and JAX is loaded only for it."""
 
 import argparse
+import ast
 import functools
 import importlib
 import math
@@ -37,131 +38,6 @@ examples:
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """
-_SIMULATE = """\
-examples:
-  nnap-em simulate bench
-  nnap-em simulate bench --system slide --sequences 8 --test 4 --steps 300 --seed 7
-  nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
-
-OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
-"""
-_INIT = """\
-examples:
-  nnap-em init log.csv --system acrobot --out mine  writes mine/rig.toml
-  nnap-em init mine/train/01.csv                    the same: rig.toml stands beside train/
-  nnap-em init run.mcap --system acrobot --out mine with a table [import] of what was found where
-  nnap-em init run.mcap --model arm.xml --out mine  joints, motors and sensors by the names of the file
-  nnap-em init log.csv --model equations --out mine states, inputs and rates to be written as formulas
-
-Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
-filled in.  Says which columns to rename or to convert.  A rig.toml that is there is never overwritten.
-"""
-_IMPORT = """\
-examples:
-  nnap-em init run.mcap --system acrobot            a first rig.toml, with a table [import] of the topics
-  nnap-em import run.mcap --rig rig.toml --out bench
-  nnap-em import day1.mcap day2.mcap --rig rig.toml --out bench --test 0.2 --shift /joint_states=-0.012
-
-Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and says in FOLDER/
-import.html what it did: rates, jitter, gaps, delays between topics, rows used.  Where columns come from stands in the
-table [import.columns] of rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf) and HDF5 need
-pip install "nnap-em[logs]".
-"""
-_CHECK = """\
-example:
-  nnap-em check bench
-
-One line per subject: ok, warning (a fit may do) or error (a fit would be in vain).  Length, missing samples,
-sampling rate, noise, torques, the velocities that each joint visits, and whether the whole state can be observed.
-Nothing is fitted and nothing is written.  Exit status 1 where one has an error.
-"""
-_IDENTIFY = """\
-examples:
-  nnap-em identify bench --out fit
-  nnap-em identify bench --out fit --smoother particle --particles 1000 --epochs 30
-  nnap-em identify february --from fit --out fit2   what the fit knows is the prior of these logs
-  nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
-
-OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
-test/ serves for the reported prediction error only, never for the fit.  Exit status 3 where the fit does not describe
-the motion: the first sentence of the report says why.
-"""
-_DIAGNOSE = """\
-examples:
-  nnap-em diagnose bench --out found
-  nnap-em diagnose february --from fit --out changed  what changed since a fit: a law, a number, or nothing
-  nnap-em diagnose bench --out found --minutes 5    answer after about that time; --resume goes on
-  nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
-
-Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
-report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
-test/ serves for the reported errors only.
-"""
-_DESIGN = """\
-examples:
-  nnap-em design found --out next                   what the last report leaves open, all together
-  nnap-em design fit --out next --for friction --seconds 60 --sequences 12
-  nnap-em design found --out next --for discriminate --rival actuator_lag
-  nnap-em diagnose bench --more next/logs --out again
-
-FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inputs, ready to be played), motion/*.csv
-(what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
-where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, discriminate
-(laws that the logs leave open), or all.
-"""
-_COMPARE = """\
-examples:
-  nnap-em compare monday friday
-  nnap-em compare january february march --out year
-  nnap-em compare unit7/model.npz unit8/model.npz --out units
-
-Each FIT is the output of identify or diagnose for the same machine: other logs, another day, another unit.  Prints
-every estimated number of all fits with its standard deviation, a pooled value, and a p-value: the chance of such a
-difference where nothing changed.  Friction curves are compared on the velocities that all fits visited.  OUT gets
-compare.html (read this one) and compare.json.
-"""
-_MONITOR = """\
-examples:
-  nnap-em monitor fit logs --out trend
-  nnap-em monitor fit logs --out trend --resume     judge the recordings that came since
-  nnap-em monitor fit logs --out trend --rate 0.01  an alarm in a hundred recordings by chance, not in a thousand
-
-FOLDER holds recordings of one machine, by name in order of time.  Each is judged beside the recordings of the fit:
-multi-step errors, and the change of friction and of estimated numbers that it shows alone.  After an alarm the
-recordings since the change (of many the last, as many as the fit had) are searched for what changed, as by nnap-em
-diagnose --from.  A recording with a broken sensor, another unit or another clock is not judged, and listed.  OUT gets
-monitor.html (read this one) and monitor.json.  Exit status 4 where the machine changed.
-"""
-_PREDICT = """\
-examples:
-  nnap-em predict fit bench/test --given 1.0 --out prediction
-  nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
-
-Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
-time, all states, and their standard deviations without measurement noise.  The file of --mcap gets the topics /log and
-/predicted, for Foxglove and other viewers.
-"""
-_SMOOTH_EXAMPLES = """\
-examples:
-  nnap-em smooth fit bench/test --out smoothed
-  nnap-em smooth fit bench/test --out smoothed --mcap smoothed.mcap
-
-DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
-The file of --mcap gets JSON messages, for Foxglove and other viewers: /log, /smoothed, /one_row_ahead (states predicted
-from the rows before) and /missing_force (the generalised force that the model lacks, by coordinate).
-"""
-_EXPORT = """\
-examples:
-  nnap-em export fit --out exported
-  nnap-em export found/after.npz --out exported
-  nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
-  nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
-  nnap-em export fit --observer arm.c --fmu arm.fmu  states of the running machine, as C99 and for Simulink
-  nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
-
-OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
-python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
-"""
 SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
 SMOOTHERS = {
     "cubature": "gaussian.CubatureSmoother",
@@ -182,10 +58,14 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"nnap-em {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    def command(name: str, summary: str, examples: str) -> argparse.ArgumentParser:
-        return _new(commands.add_parser, f"{summary[0].upper()}{summary[1:]}.", examples, name=name, help=summary)
+    def command(name: str) -> argparse.ArgumentParser:
+        """The parser of a command, whose help is the docstring of its module, which is not imported for that."""
+        tree = ast.parse(Path(__file__).with_name(f"{_MODULES.get(name, name)}.py").read_text())
+        summary, _, examples = (ast.get_docstring(tree, clean=False) or "").partition("\n\n")
+        short = f"{summary[0].lower()}{summary[1:]}".rstrip(".")
+        return _new(commands.add_parser, summary, examples, name=name, help=short)
 
-    simulate = command("simulate", "write a data set with known truth", _SIMULATE)
+    simulate = command("simulate")
     _file(simulate, "out", "OUT", "the new folder")
     simulate.add_argument("--system", choices=SYSTEMS, default="acrobot", help="the machine (default: acrobot)")
     simulate.add_argument("--sequences", type=_count, default=20, metavar="N", help="training sequences (20)")
@@ -197,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
         text = f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]"
         simulate.add_argument(f"--{kind}-noise", nargs=2, type=_positive, metavar=("POSITION", "RATE"), help=text)
 
-    init = command("init", "write a first rig.toml for a log", _INIT)
+    init = command("init")
     _file(init, "log", "LOG", "a CSV file with a header, MCAP or HDF5")
     machine = init.add_mutually_exclusive_group()
     machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
@@ -206,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
     _file(init, "--out", "FOLDER", "for rig.toml (default: that of the log, above train/)")
 
     several: dict[str, Any] = {"action": "append", "default": []}
-    importing = command("import", "write a data set from logs as machines write them", _IMPORT)
+    importing = command("import")
     _file(importing, "logs", "LOG", "MCAP, HDF5, CSV, Parquet or MAT", nargs="+")
     _file(importing, "--rig", "RIG", "rig.toml; its [import] says what is where", required=True)
     _file(importing, "--out", "FOLDER", "the new data set", required=True)
@@ -216,9 +96,9 @@ def parser() -> argparse.ArgumentParser:
     importing.add_argument("--shift", type=_shift, metavar="TOPIC=S", help=text, **several)
     importing.add_argument("--unwrap", metavar="COLUMN", help="take out the jumps of a counter", **several)
 
-    check = command("check", "say whether the logs can identify what is asked", _CHECK)
-    identify = command("identify", "fit the declared unknowns of a rig to its training logs", _IDENTIFY)
-    diagnose = command("diagnose", "find what the declared model lacks, add it and report before and after", _DIAGNOSE)
+    check = command("check")
+    identify = command("identify")
+    diagnose = command("diagnose")
     for bench in (check, identify, diagnose):
         _file(bench, "folder", "FOLDER", "the data set: rig.toml, train/, test/")
     for fits in (identify, diagnose):
@@ -232,7 +112,7 @@ def parser() -> argparse.ArgumentParser:
     diagnose.add_argument("--minutes", type=_minutes, metavar="M", help=text)
     _file(diagnose, "--logs", "FOLDER", "of that fit, where they were moved", **several)
 
-    design = command("design", "find the inputs to play next", _DESIGN)
+    design = command("design")
     _file(design, "folder", "FIT", "model.npz or after.npz, or the folder that holds it")
     _file(design, "--out", "OUT", "folder for the results", required=True)
     design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be learned (default: all)")
@@ -246,11 +126,11 @@ def parser() -> argparse.ArgumentParser:
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
         fits.add_argument("--profile", action="store_true", help="print the seconds of stages and programs")
 
-    compare = command("compare", "say what changed between fits of one machine", _COMPARE)
+    compare = command("compare")
     _file(compare, "fits", "FIT", "model.npz, or the folder that holds it", nargs="+")
     _file(compare, "--out", "OUT", "folder for the page and the numbers")
 
-    monitor = command("monitor", "watch a machine, recording by recording", _MONITOR)
+    monitor = command("monitor")
     _file(monitor, "model", "FIT", "model.npz, or the folder that holds it")
     _file(monitor, "folder", "FOLDER", "the recordings")
     _file(monitor, "--out", "OUT", "folder for the page and the numbers", required=True)
@@ -258,8 +138,8 @@ def parser() -> argparse.ArgumentParser:
     monitor.add_argument("--resume", action="store_true", help="keep what OUT/monitor.json says of recordings")
     _file(monitor, "--logs", "FOLDER", "of the fit, where they were moved", **several)
 
-    predict = command("predict", "predict from the first readings of each sequence and all inputs", _PREDICT)
-    smooth = command("smooth", "estimate all states from all readings of each sequence", _SMOOTH_EXAMPLES)
+    predict = command("predict")
+    smooth = command("smooth")
     for use in (predict, smooth):
         _file(use, "model", "MODEL", "model.npz, or the folder that holds it")
         _file(use, "folder", "FOLDER", "the logs, such as bench/test")
@@ -272,7 +152,7 @@ def parser() -> argparse.ArgumentParser:
     for reads in (check, identify, diagnose, design, monitor, predict, smooth):
         reads.add_argument("--trust-readings", action="store_true", help=text)
 
-    export = command("export", "write a fitted model for other programs", _EXPORT)
+    export = command("export")
     _file(export, "model", "MODEL", "model.npz, or the folder that holds it")
     _file(export, "--out", "OUT", "folder for the files")
     _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")

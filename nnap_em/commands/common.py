@@ -25,16 +25,16 @@ from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
 from ..experiment.limits import DesignError
 from ..export.model import ExportError
+from ..fit.check import ERROR, torques
 from ..fit.identify import Identified
 from ..fit.known import differences
 from ..fit.predict import GIVEN
 from ..fit.store import Stored, fingerprint, model_file, read
-from ..identifiability.check import ERROR, torques
+from ..import_.mcap_writer import Channel
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
-from ..recordings.mcap_writer import Channel
 from ..residual.residual import names_of
 from ..storage.cache import Cache
 from ..storage.files import StoreError, cores, sweep

@@ -1,4 +1,15 @@
-"""nnap-em compare: fits of one machine side by side."""
+"""Find what changed between fits of one machine.
+
+examples:
+  nnap-em compare monday friday
+  nnap-em compare january february march --out year
+  nnap-em compare unit7/model.npz unit8/model.npz --out units
+
+Each FIT is the output of identify or diagnose for the same machine: other logs, another day, another unit.  Prints
+every estimated number of all fits with its standard deviation, a pooled value, and a p-value: the chance of such a
+difference where nothing changed.  Friction curves are compared on the velocities that all fits visited.  OUT gets
+compare.html (read this one) and compare.json.
+"""
 
 import argparse
 

@@ -1,4 +1,16 @@
-"""nnap-em design: the inputs to play next, so that the logs answer what is open."""
+"""Find the inputs to play next.
+
+examples:
+  nnap-em design found --out next                   what the last report leaves open, all together
+  nnap-em design fit --out next --for friction --seconds 60 --sequences 12
+  nnap-em design found --out next --for discriminate --rival actuator_lag
+  nnap-em diagnose bench --more next/logs --out again
+
+FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inputs, ready to be played), motion/*.csv
+(what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
+where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, discriminate
+(laws that the logs leave open), or all.
+"""
 
 import argparse
 import dataclasses

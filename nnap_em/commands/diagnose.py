@@ -1,4 +1,15 @@
-"""nnap-em diagnose: find what the declared model lacks."""
+"""Find what the declared model lacks, add it and report before and after.
+
+examples:
+  nnap-em diagnose bench --out found
+  nnap-em diagnose february --from fit --out changed  what changed since a fit: a law, a number, or nothing
+  nnap-em diagnose bench --out found --minutes 5    answer after about that time; --resume goes on
+  nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
+
+Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
+report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
+test/ serves for the reported errors only.
+"""
 
 import argparse
 import math

@@ -1,4 +1,16 @@
-"""nnap-em export: the model for other programs."""
+"""Write a fitted model for other programs.
+
+examples:
+  nnap-em export fit --out exported
+  nnap-em export found/after.npz --out exported
+  nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
+  nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
+  nnap-em export fit --observer arm.c --fmu arm.fmu  states of the running machine, as C99 and for Simulink
+  nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
+
+OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
+python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
+"""
 
 import argparse
 from functools import partial

@@ -1,4 +1,15 @@
-"""nnap-em import: logs as machines write them, brought to one grid as a data set."""
+"""Write a data set from logs as machines write them.
+
+examples:
+  nnap-em init run.mcap --system acrobot            a first rig.toml, with a table [import] of the topics
+  nnap-em import run.mcap --rig rig.toml --out bench
+  nnap-em import day1.mcap day2.mcap --rig rig.toml --out bench --test 0.2 --shift /joint_states=-0.012
+
+Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and reports rates,
+jitter, gaps, delays between topics and rows used in FOLDER/import.html.  Where columns come from stands in the
+table [import.columns] of rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf) and HDF5 need
+pip install "nnap-em[logs]".
+"""
 
 import argparse
 import os
@@ -9,10 +20,10 @@ from pathlib import Path
 
 from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
+from ..import_.declared import read_plan
+from ..import_.folder import completed, places, write_sequences
+from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted
-from ..recordings.declared import read_plan
-from ..recordings.folder import completed, places, write_sequences
-from ..recordings.resample import Resampled, resample
 from ..report.imported import describe, write_page
 from ..storage.files import replace_text, whole_folder
 from ..storage.log import Log

@@ -1,16 +1,27 @@
-"""nnap-em init: a first rig.toml for a log."""
+"""Write a first rig.toml for a log.
+
+examples:
+  nnap-em init log.csv --system acrobot --out mine  writes mine/rig.toml
+  nnap-em init mine/train/01.csv                    the same: rig.toml stands beside train/
+  nnap-em init run.mcap --system acrobot --out mine with a table [import] of what was found where
+  nnap-em init run.mcap --model arm.xml --out mine  joints, motors and sensors by the names of the file
+  nnap-em init log.csv --model equations --out mine states, inputs and rates to be written as formulas
+
+Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
+filled in.  Names the columns to rename or to convert.  A rig.toml that is there is never overwritten.
+"""
 
 import argparse
 from pathlib import Path
 
 from ..data.dataset import DataError
 from ..data.formats import column_names
-from ..draft.equations import draft_equations
-from ..draft.from_log import draft
-from ..draft.from_machine import draft_machine
-from ..draft.from_topics import draft_recorded
-from ..recordings.recording import last_word
-from ..recordings.text_file import foreign
+from ..import_.recording import last_word
+from ..import_.text_file import foreign
+from ..init.equations import draft_equations
+from ..init.from_log import draft
+from ..init.from_machine import draft_machine
+from ..init.from_topics import draft_recorded
 from ..storage.files import replace_text
 from ..storage.log import Log
 from ..systems import specs

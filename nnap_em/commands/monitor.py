@@ -1,4 +1,16 @@
-"""nnap-em monitor: recordings in order of time beside a fit."""
+"""Watch a machine, recording by recording.
+
+examples:
+  nnap-em monitor fit logs --out trend
+  nnap-em monitor fit logs --out trend --resume     judge the recordings that came since
+  nnap-em monitor fit logs --out trend --rate 0.01  an alarm in a hundred recordings by chance, not in a thousand
+
+FOLDER holds recordings of one machine, by name in order of time.  Each is judged beside the recordings of the fit:
+multi-step errors, and the change of friction and of estimated numbers that it shows alone.  After an alarm the
+recordings since the change (of many the last, as many as the fit had) are searched for what changed, as by nnap-em
+diagnose --from.  A recording with a broken sensor, another unit or another clock is not judged, and listed.  OUT gets
+monitor.html (read this one) and monitor.json.  Exit status 4 where the machine changed.
+"""
 
 import argparse
 import hashlib
@@ -21,9 +33,9 @@ from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
 from ..em.build import build_system, measure_scales
 from ..em.loop import SEARCHED
+from ..fit.check import ERROR, torques
 from ..fit.identify import Identified
 from ..fit.store import model_file, read
-from ..identifiability.check import ERROR, torques
 from ..report.monitored import write_monitor
 from ..storage.log import Log
 from .common import logs_of, require_joints

@@ -1,4 +1,13 @@
-"""nnap-em predict: states from the first readings of each sequence and all inputs."""
+"""Predict from the first readings of each sequence and all inputs.
+
+examples:
+  nnap-em predict fit bench/test --given 1.0 --out prediction
+  nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
+
+Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
+time, all states, and their standard deviations without measurement noise.  The file of --mcap gets the topics /log and
+/predicted, for Foxglove and other viewers.
+"""
 
 import argparse
 import warnings
@@ -10,8 +19,8 @@ from ..data.logs import DataWarning, read_logs
 from ..diagnosis.keys import listed
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
+from ..import_.mcap_writer import require_mcap, write_mcap
 from ..numerics.digits import counted
-from ..recordings.mcap_writer import require_mcap, write_mcap
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
 

@@ -1,4 +1,12 @@
-"""nnap-em simulate: a data set with known truth."""
+"""Write a data set with known truth.
+
+examples:
+  nnap-em simulate bench
+  nnap-em simulate bench --system slide --sequences 8 --test 4 --steps 300 --seed 7
+  nnap-em simulate bench --measured theta1 --measurement-noise 0.005 0.05
+
+OUT gets rig.toml, train/, test/, and truth/ with all states and the true friction.
+"""
 
 import argparse
 from collections.abc import Sequence

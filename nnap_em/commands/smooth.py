@@ -1,4 +1,13 @@
-"""nnap-em smooth: states from all readings of each sequence."""
+"""Estimate all states from all readings of each sequence.
+
+examples:
+  nnap-em smooth fit bench/test --out smoothed
+  nnap-em smooth fit bench/test --out smoothed --mcap smoothed.mcap
+
+DIR gets a CSV file per sequence: time, all states, and their standard deviations, from all readings of the sequence.
+The file of --mcap gets JSON messages, for Foxglove and other viewers: /log, /smoothed, /one_row_ahead (states predicted
+from the rows before) and /missing_force (the generalised force that the model lacks, by coordinate).
+"""
 
 import argparse
 from pathlib import Path
@@ -10,8 +19,8 @@ from ..fit.branches import Branch, branches
 from ..fit.identify import Identified
 from ..fit.predict import smooth
 from ..fit.store import load, model_file
+from ..import_.mcap_writer import Channel, require_mcap, write_mcap
 from ..numerics.digits import counted
-from ..recordings.mcap_writer import Channel, require_mcap, write_mcap
 from ..residual.residual import residual
 from ..storage.log import Log
 from .common import log_of, states_of, write_states

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..data.formats import read_table
 from ..data.machine import unpacked
-from ..diagnosis.findings import estimates
+from ..diagnosis.findings import Estimate, estimates
 from ..diagnosis.hypothesis import covariances
 from ..diagnosis.keys import Key, key_of, listed, words
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
@@ -41,8 +40,8 @@ SEEN, GONE = 5.0, 2.0
 """Standard deviations from 0 of a viscous number in one fit, and in the other, from which on it cannot have gone so."""
 COMPARED_VELOCITIES = 41
 """Velocities of a friction curve: as many as the M-step has."""
-PERIODIC = ("phase",)
-"""Parameters of effects that are the same after a whole turn [rad]."""
+PERIODIC = "phase of"
+"""Beginning of parameters of effects that are the same after a whole turn [rad]."""
 
 
 class CompareError(ValueError):
@@ -246,7 +245,7 @@ def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Compar
         Comparison(
             together,
             tuple(_curves(together)),
-            (*_parameters(together), *_effects(together)),
+            tuple(_numbers(together)),
             tuple(_differences(together)),
             tuple(_warnings(together)),
         )
@@ -293,7 +292,7 @@ def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -
 
 
 def _visited(fitted: Identified, file: Path | None) -> tuple[Float[np.ndarray, "dof 2"], Float[np.ndarray, "dof 2"]]:
-    """Ranges of velocity and load: of the report beside the model, else of its friction table, else of the network."""
+    """Ranges of velocity and load: of the report beside the model, else of the network."""
     dof = len(fitted.model.system.coordinates)
     unknown = np.full((dof, 2), np.nan)
     if file is not None and (report := file.with_name("report.json")).exists():
@@ -304,11 +303,6 @@ def _visited(fitted: Identified, file: Path | None) -> tuple[Float[np.ndarray, "
     network = fitted.model.unknown
     if not isinstance(network, FrictionNetwork):
         return unknown, unknown
-    ending = {"before": "_before", "after": "_after"}.get(file.stem, "") if file else ""
-    if file is not None and (table := file.with_name(f"friction{ending}.csv")).exists():
-        joint, velocity = read_table(table, ("joint", "velocity")).T
-        ends = [velocity[joint == j] for j in range(1, dof + 1)]
-        return np.asarray([[v.min(), v.max()] for v in ends]), unknown
     speed = np.asarray(network.speed)
     return np.stack([-speed, speed], axis=1), unknown
 
@@ -386,34 +380,34 @@ def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) 
     return tuple(row._replace(test=test) for row, test in zip(rows, tests, strict=True))
 
 
-def _parameters(fits: Sequence[Fit]) -> Iterator[Number]:
-    """The estimated parameters of the machine."""
-    tables = [parameter_table(fit.fitted) for fit in fits]
+def _numbers(fits: Sequence[Fit]) -> Iterator[Number]:
+    """The estimated parameters of the machine and of effects."""
+    tables = [{**_parameters(fit.fitted), **_effects(fit.fitted)} for fit in fits]
     for name in dict.fromkeys(itertools.chain(*tables)):
-        rows = np.asarray([table.get(name, (np.nan, np.nan)) for table in tables], float)
-        rig = fits[0].fitted.rig
-        prior = min(s for fit in fits if (s := fit.fitted.rig.parameters[name].std) > 0)
-        yield number(name, rig.unit(name), rows[:, 0], rows[:, 1], prior)
+        entries = [table.get(name) for table in tables]
+        value, std = (np.asarray([np.nan if entry is None else entry[i] for entry in entries], float) for i in range(2))
+        if name.startswith(PERIODIC):
+            first = value[np.isfinite(value)][0]
+            value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
+        priors = (fit.fitted.rig.parameters[name].std for fit in fits if name in fit.fitted.rig.parameters)
+        prior = min((prior for prior in priors if prior > 0), default=np.inf)
+        yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
 
 
-def _effects(fits: Sequence[Fit]) -> Iterator[Number]:
+def _parameters(fitted: Identified) -> dict[str, Estimate]:
+    """The estimated parameters of the machine."""
+    return {name: Estimate(*pair, fitted.rig.unit(name)) for name, pair in parameter_table(fitted).items()}
+
+
+def _effects(fitted: Identified) -> dict[str, Estimate]:
     """The reported parameters of effects."""
-    reports = []
-    for fit in fits:
-        model = fit.fitted.model
-        pairs = zip(model.effects, covariances(model, fit.fitted.m_step, fit.fitted.state.hessian), strict=True)
-        reports.append({key_of(effect): estimates(effect, cov, model.system) for effect, cov in pairs})
-    for key in dict.fromkeys(itertools.chain(*reports)):
-        reported = [effects.get(key, {}) for effects in reports]
-        for name in dict.fromkeys(itertools.chain(*reported)):
-            entries = [parameters.get(name) for parameters in reported]
-            value = np.asarray([np.nan if parameter is None else parameter.value for parameter in entries])
-            std = np.asarray([np.nan if parameter is None else parameter.std for parameter in entries])
-            if name in PERIODIC:
-                first = value[np.isfinite(value)][0]
-                value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-            unit = next(parameter.unit for parameter in entries if parameter is not None)
-            yield number(f"{name} of {words(key)}", unit, value, std)
+    model = fitted.model
+    pairs = zip(model.effects, covariances(model, fitted.m_step, fitted.state.hessian), strict=True)
+    return {
+        f"{name} of {words(key_of(effect))}": estimate
+        for effect, cov in pairs
+        for name, estimate in estimates(effect, cov, model.system).items()
+    }
 
 
 def number(

@@ -1,7 +1,6 @@
-"""Shapes at one place of a learned curve, as a step or a hinge: columns for a fit, numbers and words."""
+"""Forms of a learned curve, each a row of a table: columns for a fit, numbers with units, and a sentence of them."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,16 @@ Columns = Float[np.ndarray, "place node column"]
 Places = Float[np.ndarray, "place number"]
 Place = Float[np.ndarray, " number"]
 Size = Float[np.ndarray, " column"]
+
+
+class Quantity(NamedTuple):
+    """A number with its unit; a format of its own shows the number alone."""
+
+    value: float
+    unit: str
+
+    def __format__(self, form: str) -> str:
+        return format(self.value, form) if form else f"{self.value:.3g} {self.unit}".rstrip()
 
 
 class View(NamedTuple):
@@ -34,25 +43,32 @@ class View(NamedTuple):
     """Distance of the basis functions [z]."""
     z: Float[np.ndarray, " node"]
 
-    @property
-    def per(self) -> str:
-        """Unit of a slope."""
-        return "" if self.unit == self.across else f"{self.unit}/{self.across}"
-
-    def at(self, z: float) -> float:
+    def at(self, z: float) -> Quantity:
         """The signal at a place; an angle that goes round within its turn."""
-        return self.low + self.length * (z % 1.0 if self.turns else z)
+        return Quantity(self.low + self.length * (z % 1.0 if self.turns else z), self.across)
+
+    def wide(self, share: float) -> Quantity:
+        """A part of the axis."""
+        return Quantity(self.length * share, self.across)
+
+    def force(self, value: float) -> Quantity:
+        """A force."""
+        return Quantity(float(value), self.unit)
+
+    def slope(self, size: float) -> Quantity:
+        """Force per signal, of a force per axis."""
+        return Quantity(float(size) / self.length, "" if self.unit == self.across else f"{self.unit}/{self.across}")
 
 
 class Description(NamedTuple):
     """A shape with its numbers and in words."""
 
     kind: str
-    numbers: dict[str, tuple[float, str]]
+    numbers: dict[str, Quantity]
     words: str
 
 
-class Family(NamedTuple):
+class Form(NamedTuple):
     """Shapes of one form: sums of columns whose sizes are free, at places of a grid."""
 
     columns: Callable[[View, Places], Columns]
@@ -65,30 +81,43 @@ class Family(NamedTuple):
     """Number of its free numbers, beside the mean."""
 
 
-def quantity(value: float, unit: str) -> str:
-    """A number in three digits, with its unit."""
-    return f"{value:.3g} {unit}".rstrip()
-
-
-def forms(view: View) -> list[Family]:
-    """Shapes of one place, the simplest first; of an angle that goes round only those that close."""
+def forms(view: View) -> list[Form]:
+    """All forms; of an angle that goes round those that close, and a wave repeats at least once in the known part."""
     within = view.start + view.span * np.linspace(0.0, 1.0, 41)
     around = np.linspace(0, 1, 41) if view.whole else within  # with both ends: what is polished stays in its grid
-    widths = np.geomspace(0.3 * view.fine, max(0.25 * view.span, view.fine), 8)
-    bump = Family(_bump, _describe_bump, product(around, np.log(widths)), (0, 1), 3)
-    if view.whole:
-        return [bump]
-    inner, coarse = within[4:-4], within[4:-4:2]
-    zones = product(coarse, coarse)
+    widths = np.log(np.geomspace(0.3 * view.fine, max(0.25 * view.span, view.fine), 8))
+    inner, none = within[4:-4], np.zeros((1, 0))
+    zones = product(inner[::2], inner[::2])
     zones = zones[zones[:, 1] - zones[:, 0] > 0.09 * view.span]
-    line, parabola, cubic = (
-        Family(partial(_powers, k), partial(_describe_powers, k), np.zeros((1, 0)), (), k) for k in (1, 2, 3)
-    )
-    hinge = Family(_hinge, _describe_hinge, product(inner, [-1.0, 1.0]), (0,), 2)
-    step = Family(_step, _describe_step, product(within[2:-2], np.log(widths)), (0, 1), 3)
-    zone = Family(_zone, _describe_zone, zones, (0, 1), 3)
-    bend = Family(_bend, _describe_bend, inner[:, None], (0,), 3)
-    return [line, parabola, hinge, step, bump, cubic, zone, bend]
+
+    finest = 0.5 / view.fine
+    part = np.arange(1.4 / view.span, 0.96 * finest, 0.3 / view.span)
+    rates = np.arange(1.0, finest + 0.5) if view.whole else part
+    rotary = view.across == "rad" and not view.whole and view.span * view.length > 0.6 * np.pi  # as gravity
+    once = np.full((int(rotary), 1), view.length / (2 * np.pi))
+    low, high = product(rates, rates).T
+    enough = (low * view.span > 1.8) | (view.whole & (high > 2.9))  # once and twice a turn: any smooth curve
+    pairs = np.stack([low, high - low], axis=1)[enough & ((high - low) * view.span > 0.89)]
+    cycles = product(rates[rates <= 0.8 * finest], np.linspace(0, 1, 17), [0.2, 0.35, 0.5, 0.65, 0.8])
+
+    waves = [
+        Form(_ripples, _ripple, once, (), 3),
+        Form(_ripples, _ripple, rates[:, None], () if view.whole else (0,), 3),
+        Form(_cycles, _square_wave, cycles, (1, 2) if view.whole else (0, 1, 2), 4),
+        Form(_ripples, _two_ripples, pairs, () if view.whole else (0, 1), 6),
+    ]
+    bump = Form(_bells, _bump, product(around, widths), (0, 1), 3)
+    local = [
+        Form(_powers(1), _line, none, (), 1),
+        Form(_powers(2), _polynomial, none, (), 2),
+        Form(_hinges, _hinge, product(inner, [-1.0, 1.0]), (0,), 2),
+        Form(_steps, _step, product(within[2:-2], widths), (0, 1), 3),
+        bump,
+        Form(_powers(3), _polynomial, none, (), 3),
+        Form(_zones, _zone, zones, (0, 1), 3),
+        Form(_bends, _bend, inner[:, None], (0,), 3),
+    ]
+    return [form for form in waves + ([bump] if view.whole else local) if len(form.grid)]
 
 
 def product(*axes: np.ndarray | list[float]) -> Places:
@@ -96,92 +125,165 @@ def product(*axes: np.ndarray | list[float]) -> Places:
     return np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
-def _powers(order: int, view: View, place: Places) -> Columns:
-    return np.stack([view.z**k for k in range(1, order + 1)], axis=1)[None]
+# --- at one place
 
 
-def _describe_powers(order: int, view: View, place: Place, size: Size) -> Description:
-    per, powers = view.per, np.arange(1, order + 1)
-    first, middle, last = (
-        float(size @ (powers * z ** (powers - 1))) / view.length for z in view.start + view.span * np.linspace(0, 1, 3)
-    )
-    if order == 1:
-        words = f"nearly a straight line in {view.name}, slope {quantity(first, per)}"
-        return Description("line", {"slope": (first, per)}, words)
-    numbers = {"slope_first": (first, per), "slope_middle": (middle, per), "slope_last": (last, per)}
-    kind = "parabola" if order == 2 else "cubic"
-    words = f"a {kind} in {view.name}, slopes {first:.3g}, {middle:.3g} and {quantity(last, per)} from end to end"
-    return Description(kind, numbers, words)
+def _powers(order: int) -> Callable[[View, Places], Columns]:
+    return lambda view, place: np.stack([view.z**k for k in range(1, order + 1)], axis=1)[None]
 
 
-def _hinge(view: View, place: Places) -> Columns:
+def _line(view: View, place: Place, size: Size) -> Description:
+    slope = view.slope(size[0])
+    return Description("line", {"slope": slope}, f"nearly a straight line in {view.name}, slope {slope}")
+
+
+def _polynomial(view: View, place: Place, size: Size) -> Description:
+    kind, powers = "parabola" if size.size == 2 else "cubic", np.arange(1, size.size + 1)
+    ends = view.start + view.span * np.linspace(0, 1, 3)
+    first, middle, last = (view.slope(size @ (powers * z ** (powers - 1))) for z in ends)
+    words = f"a {kind} in {view.name}, slopes {first:.3g}, {middle:.3g} and {last} from end to end"
+    return Description(kind, {"slope_first": first, "slope_middle": middle, "slope_last": last}, words)
+
+
+def _hinges(view: View, place: Places) -> Columns:
     return np.maximum(0.0, place[:, 1:] * (view.z - place[:, :1]))[..., None]
 
 
-def _describe_hinge(view: View, place: Place, size: Size) -> Description:
-    slope, per, at = place[1] * size[0] / view.length, view.per, view.at(place[0])
+def _hinge(view: View, place: Place, size: Size) -> Description:
+    slope, at = view.slope(place[1] * size[0]), view.at(place[0])
     side, other = ("above", "below") if place[1] > 0 else ("below", "above")
-    words = f"a hinge in {view.name} at {quantity(at, view.across)}: flat {other}, slope {quantity(slope, per)} {side}"
-    numbers = {"place": (at, view.across), f"slope_{side}": (slope, per), f"slope_{other}": (0.0, per)}
-    return Description("hinge", numbers, words)
+    words = f"a hinge in {view.name} at {at}: flat {other}, slope {slope} {side}"
+    return Description("hinge", {"place": at, f"slope_{side}": slope, f"slope_{other}": view.slope(0.0)}, words)
 
 
-def _bend(view: View, place: Places) -> Columns:
+def _bends(view: View, place: Places) -> Columns:
     above = np.maximum(0.0, view.z - place)
     return np.stack([view.z - place - above, above], axis=2)
 
 
-def _describe_bend(view: View, place: Place, size: Size) -> Description:
-    (below, above), per, at = size / view.length, view.per, view.at(place[0])
-    slopes = f"slope {quantity(below, per)} below, {quantity(above, per)} above"
-    words = f"a bend in {view.name} at {quantity(at, view.across)}: {slopes}"
-    numbers = {"place": (at, view.across), "slope_below": (below, per), "slope_above": (above, per)}
-    return Description("bend", numbers, words)
+def _bend(view: View, place: Place, size: Size) -> Description:
+    below, above, at = view.slope(size[0]), view.slope(size[1]), view.at(place[0])
+    words = f"a bend in {view.name} at {at}: slope {below} below, {above} above"
+    return Description("bend", {"place": at, "slope_below": below, "slope_above": above}, words)
 
 
-def _zone(view: View, place: Places) -> Columns:
+def _zones(view: View, place: Places) -> Columns:
     below, above = view.z - place[:, :1], view.z - place[:, 1:]
     return (np.maximum(0.0, above) + np.minimum(0.0, below))[..., None]
 
 
-def _describe_zone(view: View, place: Place, size: Size) -> Description:
-    slope, per = size[0] / view.length, view.per
-    low, high = view.at(place[0]), view.at(place[1])
-    words = f"flat in {view.name} from {low:.3g} to {quantity(high, view.across)}, slope {quantity(slope, per)} outside"
-    numbers = {"from": (low, view.across), "to": (high, view.across), "slope": (slope, per)}
-    return Description("dead zone", numbers, words)
+def _zone(view: View, place: Place, size: Size) -> Description:
+    slope, low, high = view.slope(size[0]), view.at(place[0]), view.at(place[1])
+    words = f"flat in {view.name} from {low:.3g} to {high}, slope {slope} outside"
+    return Description("dead zone", {"from": low, "to": high, "slope": slope}, words)
 
 
-def _step(view: View, place: Places) -> Columns:
+def _steps(view: View, place: Places) -> Columns:
     return ndtr((view.z - place[:, :1]) / np.exp(place[:, 1:]))[..., None]
 
 
-def _describe_step(view: View, place: Place, size: Size) -> Description:
+def _step(view: View, place: Place, size: Size) -> Description:
     wide = 2.563 * np.exp(place[1])  # from 10 to 90 % of a cumulative normal distribution
-    at, over = view.at(place[0]), view.length * max(wide, view.fine)
-    numbers = {"place": (at, view.across), "height": (size[0], view.unit), "transition": (over, view.across)}
-    way, tall = "up" if size[0] > 0 else "down", quantity(abs(size[0]), view.unit)
-    words = f"a step {way} at {view.name} = {quantity(at, view.across)}, {tall} high"
-    if wide < 1.5 * view.fine:
-        over = numbers["transition"] = 1.5 * view.fine * view.length, view.across
-        return Description("step", numbers, f"{words} (or a transition no wider than {quantity(*over)})")
-    if wide < view.span / 3:
-        return Description("step", numbers, f"{words}, over {quantity(over, view.across)}")
-    words = f"a slope in {view.name} about {quantity(at, view.across)} that levels off on both sides, {tall} {way}"
-    return Description("saturation", numbers, f"{words} over {quantity(over, view.across)}")
+    sharp = wide < 1.5 * view.fine
+    at, over = view.at(place[0]), view.wide(1.5 * view.fine if sharp else wide)
+    way, tall = "up" if size[0] > 0 else "down", view.force(abs(size[0]))
+    numbers = {"place": at, "height": view.force(size[0]), "transition": over}
+    if wide < view.span / 3 or sharp:
+        blur = f" (or a transition no wider than {over})" if sharp else f", over {over}"
+        return Description("step", numbers, f"a step {way} at {view.name} = {at}, {tall} high{blur}")
+    words = f"a slope in {view.name} about {at} that levels off on both sides, {tall} {way} over {over}"
+    return Description("saturation", numbers, words)
 
 
-def _bump(view: View, place: Places) -> Columns:
+def _bells(view: View, place: Places) -> Columns:
     away = view.z - place[:, :1]
     away = away - np.round(away) if view.whole else away  # the short way round where the curve goes round
     return np.exp(-0.5 * (away / np.exp(place[:, 1:])) ** 2)[..., None]
 
 
-def _describe_bump(view: View, place: Place, size: Size) -> Description:
-    wide = view.length * max(2.355 * np.exp(place[1]), 1.5 * view.fine)
-    bound = "at most " if wide <= 1.5 * view.fine * view.length else "about "
+def _bump(view: View, place: Place, size: Size) -> Description:
+    share, least = 2.355 * np.exp(place[1]), 1.5 * view.fine
+    bound, width = "about" if share > least else "at most", view.wide(max(share, least))
     kind, tall = ("bump", "high") if size[0] > 0 else ("dip", "deep")
-    at, height, width = view.at(place[0]), quantity(abs(size[0]), view.unit), quantity(wide, view.across)
-    words = f"a {kind} at {view.name} = {quantity(at, view.across)}, {bound}{width} wide, {height} {tall}"
-    numbers = {"place": (at, view.across), "height": (size[0], view.unit), "width": (wide, view.across)}
-    return Description(kind, numbers, words)
+    at = view.at(place[0])
+    words = f"a {kind} at {view.name} = {at}, {bound} {width} wide, {view.force(abs(size[0]))} {tall}"
+    return Description(kind, {"place": at, "height": view.force(size[0]), "width": width}, words)
+
+
+# --- periodic
+
+
+def _ripples(view: View, place: Places) -> Columns:
+    waves = np.cumsum(place, axis=1)[:, None, :]
+    phase, both = 2 * np.pi * waves * view.z[:, None], waves < 0.49 / view.fine  # two nodes a period: one phase is seen
+    return np.concatenate([np.cos(phase), both * np.sin(phase)], axis=2)
+
+
+def _rate(view: View, wave: float) -> tuple[str, Quantity, str]:
+    """Rate of repetition: periods a turn of an angle, Hz in time, else the period."""
+    if view.across == "rad":
+        often = Quantity(2 * np.pi * wave / view.length, "")
+        return "periods_per_turn", often, f"{often}"
+    if view.across == "s":
+        return "frequency", (often := Quantity(wave / view.length, "Hz")), f"{often:.2f}"
+    return "period", (period := Quantity(view.length / wave, view.across)), f"{period:.3g}"
+
+
+def _of(view: View, text: str) -> str:
+    """Rates in words."""
+    if view.across == "rad":
+        return f"{text} period{'' if text == '1' else 's'} a turn"
+    return f"{text} Hz" if view.across == "s" else f"period {text} {view.across}"
+
+
+def _wave(view: View, wave: float, cos: float, sin: float) -> tuple[Quantity, Quantity, str]:
+    """Amplitude and phase of amplitude sin(k x + phase); "at least", where basis and prior make it too small."""
+    phase = np.arctan2(cos, sin) - 2 * np.pi * wave * view.low / view.length
+    turned = Quantity(float((phase + np.pi) % (2 * np.pi) - np.pi), "rad")
+    return view.force(np.hypot(cos, sin)), turned, "at least " if wave > 0.4 / view.fine else ""
+
+
+def _ripple(view: View, place: Place, size: Size) -> Description:
+    key, rate, text = _rate(view, place[0])
+    amplitude, phase, least = _wave(view, place[0], *size)
+    unseen = ", overtones not seen" if 3 * place[0] > 0.48 / view.fine else ""
+    words = f"a ripple in {view.name} of {_of(view, text)}, amplitude {least}{amplitude}{unseen}"
+    return Description("ripple", {key: rate, "amplitude": amplitude, "phase": phase}, words)
+
+
+def _two_ripples(view: View, place: Place, size: Size) -> Description:
+    numbers, texts, tall = {}, [], []
+    for i, wave in enumerate(np.cumsum(place)):
+        key, rate, text = _rate(view, wave)
+        amplitude, phase, least = _wave(view, wave, size[i], size[i + 2])
+        numbers |= {f"{key}_{i + 1}": rate, f"amplitude_{i + 1}": amplitude, f"phase_{i + 1}": phase}
+        texts, tall = [*texts, text], [*tall, f"{least}{amplitude:.3g}"]
+    often = _of(view, " and ".join(texts))
+    words = f"two ripples in {view.name} of {often}, amplitudes {' and '.join(tall)} {view.unit}"
+    return Description("two ripples", numbers, words)
+
+
+def _cycles(view: View, place: Places) -> Columns:
+    wave, phase, duty = place[:, :1], place[:, 1:2], place[:, 2:]
+    cycle = (wave * view.z - phase + 0.5) % 1.0 - 0.5  # from the middle of what is high
+    edge = wave * view.fine / 3
+    return np.clip((0.5 * duty - np.abs(cycle)) / edge + 0.5, 0.0, 1.0)[..., None]
+
+
+def _square_wave(view: View, place: Place, size: Size) -> Description:
+    wave, phase, duty = place
+    phase, duty = (phase, duty) if size[0] > 0 else (phase + 0.5, 1 - duty)
+    key, rate, text = _rate(view, wave)
+    amplitude, rises = view.force(0.5 * abs(size[0])), (phase - 0.5 * duty) / wave
+    if not view.whole:
+        rises += np.ceil((view.start - rises) * wave) / wave
+    up, down = view.at(rises), view.at(rises + duty / wave)
+    words = (
+        f"a square wave in {view.name} of {_of(view, text)}, {amplitude} to either side, high for {100 * duty:.0f} %"
+    )
+    words += " of the period"
+    if view.whole and wave == 1.0:
+        words = f"a step up at {view.name} = {up:.3g} and down again at {down}, {view.force(abs(size[0]))} high"
+    return Description(
+        "square wave", {key: rate, "amplitude": amplitude, "duty": Quantity(duty, ""), "rises_at": up}, words
+    )

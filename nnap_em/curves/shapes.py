@@ -8,8 +8,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from ..effects.base import Curve
-from .forms import Description, Family, View, forms, quantity
-from .waves import waves
+from .forms import Description, Form, Quantity, View, forms
 
 EXPLAINS = 0.85
 """Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square."""
@@ -25,8 +24,7 @@ class Shape(NamedTuple):
     """The simplest shape that explains a curve."""
 
     kind: str
-    numbers: dict[str, tuple[float, str]]
-    """Value and unit of each number, by its name."""
+    numbers: dict[str, Quantity]
     explains: float
     """Share of the variance of the curve, weighted by how well it is known."""
     resolution: float
@@ -39,7 +37,7 @@ class Shape(NamedTuple):
 
     def entry(self) -> dict[str, Any]:
         """The entry `shape` of `report.json`."""
-        numbers = {name: {"value": value, "unit": unit} for name, (value, unit) in self.numbers.items()}
+        numbers = {name: number._asdict() for name, number in self.numbers.items()}
         return {"kind": self.kind, "numbers": numbers} | {n: getattr(self, n) for n in Shape._fields[2:-1]}
 
 
@@ -74,14 +72,14 @@ def shape(curve: Curve) -> Shape:
     view, seen = _view(curve, known), _seen(curve, known)
     total, n = float(seen.target @ seen.target), len(seen.target)
     tried: list[tuple[float, int, float, Description]] = []
-    for family in sorted(waves(view) + forms(view), key=lambda family: family.price):
-        if n - family.price < 2:
+    for form in sorted(forms(view), key=lambda form: form.price):
+        if n - form.price < 2:
             continue
-        place, size, rss = _best(family, seen, view)
+        place, size, rss = _best(form, seen, view)
         explains = 1 - rss / total
-        if 1 - (1 - explains) * n / (n - family.price) >= EXPLAINS:
-            criterion = (n + 1) * np.log(rss + known.sum()) + family.price * np.log(n + 1)  # an error at every node
-            tried.append((criterion, family.price, explains, family.describe(view, place, size)))
+        if 1 - (1 - explains) * n / (n - form.price) >= EXPLAINS:
+            criterion = (n + 1) * np.log(rss + known.sum()) + form.price * np.log(n + 1)  # an error at every node
+            tried.append((criterion, form.price, explains, form.describe(view, place, size)))
     if not tried:
         return _smooth(curve, known)
     lowest = min(criterion for criterion, *_ in tried)
@@ -129,18 +127,18 @@ def _seen(curve: Curve, known: np.ndarray) -> _Seen:
     return _Seen(project @ y, project)
 
 
-def _best(family: Family, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarray, float]:
-    """Place, size and squared residual of the best member of a family: the best two of its grid, polished."""
+def _best(form: Form, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarray, float]:
+    """Place, size and squared residual of the best member of a form: the best two of its grid, polished."""
 
     def left(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        size, residual = seen.fit(family.columns(view, place[None]))
+        size, residual = seen.fit(form.columns(view, place[None]))
         return size[0], residual[0]
 
-    _, residual = seen.fit(family.columns(view, family.grid))
+    _, residual = seen.fit(form.columns(view, form.grid))
     rss = (residual**2).sum(axis=1)
-    free = [] if rss.min() > 0.5 * seen.target @ seen.target else list(family.free)  # far from an explanation
-    places = [family.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
-    low, high = family.grid.min(axis=0), family.grid.max(axis=0)
+    free = [] if rss.min() > 0.5 * seen.target @ seen.target else list(form.free)  # far from an explanation
+    places = [form.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
+    low, high = form.grid.min(axis=0), form.grid.max(axis=0)
     if free:
         places = [_polished(lambda p: left(p)[1], place, free, low, high) for place in places]
     fits = [(place, *left(place)) for place in places]
@@ -167,11 +165,10 @@ def _polished(
 
 def _smooth(curve: Curve, known: np.ndarray) -> Shape:
     """A curve that no shape explains: the place and the size of its largest value."""
-    x, y, unit = curve.x[known], curve.mean[known], curve.unit
-    top, size = float(x[int(np.argmax(y))]), float(np.ptp(y))
-    at, tall = quantity(top, curve.signal_unit), quantity(size, unit)
+    x, y = curve.x[known], curve.mean[known]
+    at, tall = Quantity(float(x[int(np.argmax(y))]), curve.signal_unit), Quantity(float(np.ptp(y)), curve.unit)
     words = f"a smooth function of {curve.signal}, largest at {at}, {tall} from trough to peak"
-    numbers = {"largest_at": (top, curve.signal_unit), "height": (size, unit)}
+    numbers = {"largest_at": at, "height": tall}
     fine, limits = _fine(curve) * float(np.ptp(curve.x)), (float(x[0]), float(x[-1]))
     return Shape("smooth", numbers, 0.0, fine, limits, (), words + _looked(curve, known))
 

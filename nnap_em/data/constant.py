@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .noise import reading_noise
 from .plausible import Columns, bridge
-from .spikes import noise
 
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
@@ -112,8 +112,8 @@ def _disagreement(name: str, readings: Columns, dt: float) -> _Apart | None:
         return None
     way, step = travel(w, dt) - bridge(q), 3 * quantum(q)
     if rate:
-        return _Apart(-way, np.full(q.size, step + 9 * noise(q)), 0.0, q, rate)
-    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), noise(w) * dt, w, rate)
+        return _Apart(-way, np.full(q.size, step + 9 * reading_noise(q[None])), 0.0, q, rate)
+    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), reading_noise(w[None]) * dt, w, rate)
 
 
 def travel(rate: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " time"]:
@@ -194,7 +194,7 @@ def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
 
     A value that is held again near by is that of an encoder between two steps.
     """
-    usual = noise(y)
+    usual = reading_noise(y[None])
     around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
     if usual < 3 * quantum(y) or np.sum(around < _NEAR_NEIGHBOUR * usual) >= _REPEATS:
         return False
@@ -237,7 +237,7 @@ def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apa
         if moves or not apart[0].rate:
             return moves
     rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
-    spread, coarse = noise(y), 4 * quantum(y)
+    spread, coarse = reading_noise(y[None]), 4 * quantum(y)
     for side in (before, after[::-1]):
         expected, uncertainty = _ahead(side, rows, spread)
         if np.all(sign * (expected - y[run.first]) <= _SURE * uncertainty + coarse):

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .spikes import LONGEST_SPIKE, noise
+from .noise import reading_noise
+from .spikes import LONGEST_SPIKE
 
 _JUMP = 0.4  # share of the range of the readings: sign and magnitude jump by half of theirs
 _FULL_JUMP = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
@@ -96,7 +97,7 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
         return None
     if rate and (np.mean(_near_zero(x, z, at)) < _MOST or np.ptp(z) > size or not _sure(at.size, size, x)):
         return None
-    up, least = np.diff(turns)[at - 1], _MOVES * noise(z)
+    up, least = np.diff(turns)[at - 1], _MOVES * reading_noise(z[None])
     back = (np.diff(at) <= LONGEST_SPIKE) & (up[1:] == -up[:-1])  # of a spike, or where the motion turns round
     alone = ~(np.append(back, False) | np.append(False, back))
     ways = [[np.sign(up) * way > least for way in _travel(z, at, span)] for span in _SPANS]
@@ -188,7 +189,7 @@ def _measured(
         sizes.append(-np.linalg.lstsq(np.column_stack([base, turns[rows]]), x[rows], rcond=None)[0][-1])
     if not sizes or abs((size := float(np.median(sizes))) - rough) >= _SMOOTH * rough:
         return rough
-    return _simplest(size, 12 * noise(x + size * turns) / math.sqrt(len(sizes)), x)
+    return _simplest(size, 12 * reading_noise((x + size * turns)[None]) / math.sqrt(len(sizes)), x)
 
 
 def _simplest(size: float, error: float, x: Float[np.ndarray, " seen"]) -> float:

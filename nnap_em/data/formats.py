@@ -246,7 +246,7 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
-            raise _unreadable(path, error) from None
+            raise unreadable(path, error) from None
         hint = "use another copy, or write it as CSV"
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
@@ -256,13 +256,14 @@ def check_size(path: Path) -> None:
     try:
         size = path.stat().st_size
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
     if size > LARGEST_FILE:
         hint = f"cut it into sequences of some seconds, at most {LARGEST_FILE // 2**20} MB a file"
         raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {hint}")
 
 
-def _unreadable(path: Path, error: OSError) -> DataError:
+def unreadable(path: Path, error: OSError) -> DataError:
+    """The error of a file that the system does not give."""
     return DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights")
 
 
@@ -272,7 +273,7 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         with path.open("rb") as file:
             return file.read(most)
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
 
 
 @contextmanager
@@ -282,7 +283,7 @@ def _opened(path: Path) -> Iterator[TextIO]:
         with path.open(encoding="utf-8-sig") as file:
             yield file
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
     except UnicodeDecodeError:
         line = read_bytes(path).decode(errors="replace").partition("\ufffd")[0].count("\n") + 1
         refuse(path, f"line {line}", "not UTF-8", "save the file as plain UTF-8 text")

@@ -102,10 +102,12 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
         (2, 61, 1)
     """
     files = [Path(folder)] if Path(folder).is_file() else log_files(Path(folder))
-    tables = [_within(_read_table(path, rig), rig) for path in files]
+    tables = [_read_table(path, rig) for path in files]
+    tables = [_without(table, RANGE, _at_ends(table.readings(rig), rig), rig) for table in tables]
     early = [table.readings(rig, until) for table in tables]
     if held := {} if trust else _held(early):
-        tables = [_once(table, held, rig) for table in tables]
+        again = [{name: held_rows(table.readings(rig)[name], rows) for name, rows in held.items()} for table in tables]
+        tables = [_without(table, REPEAT, rows, rig) for table, rows in zip(tables, again, strict=True)]
         early = [table.readings(rig, until) for table in tables]
     entries = [[] if trust else rough(readings, rig.dt) for readings in early]
     if limits := {limit for readings, each in zip(early, entries, strict=True) for limit in _limits(readings, each)}:
@@ -201,7 +203,7 @@ class _Table(NamedTuple):
         """Row of the file of each row of the table."""
         return np.searchsorted(self.rows, np.arange(len(self.table)))
 
-    def readings(self, rig: Rig, until: float) -> dict[str, Float[np.ndarray, " time"]]:
+    def readings(self, rig: Rig, until: float = math.inf) -> dict[str, Float[np.ndarray, " time"]]:
         """The columns of readings up to some seconds after the first row."""
         early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
         return dict(zip(rig.measured, self.table[early, 1 + len(rig.logged_inputs) :].T, strict=True))
@@ -213,25 +215,19 @@ def _held(logs: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
     return {name: each for name, each in rows.items() if each > 1}
 
 
-def _within(source: _Table, rig: Rig) -> _Table:
-    """A file without the readings at the declared ends of their sensors, whose tangent there would be 0."""
-    table, masked = source.table.copy(), list(source.masked)
-    for name, (low, high) in rig.ranges.items():
-        column = table[:, 1 + len(rig.logged_inputs) + rig.measured.index(name)]
-        if (beyond := np.flatnonzero((column <= low) | (column >= high))).size:
-            column[beyond] = np.nan
-            masked.append(_masked(source, RANGE, name, beyond))
-    return source._replace(table=table, masked=masked) if rig.ranges else source
+def _at_ends(readings: Columns, rig: Rig) -> dict[str, Int[np.ndarray, " row"]]:
+    """Rows at the declared ends of the sensors, whose tangent there would be 0."""
+    outside = {name: (readings[name] <= low) | (readings[name] >= high) for name, (low, high) in rig.ranges.items()}
+    return {name: np.flatnonzero(rows) for name, rows in outside.items()}
 
 
-def _once(source: _Table, held: Mapping[str, float], rig: Rig) -> _Table:
-    """A file in which each reading stands in one row, the first that has it."""
+def _without(source: _Table, kind: str, rows: Mapping[str, Int[np.ndarray, " row"]], rig: Rig) -> _Table:
+    """A file without the readings of these rows, by column."""
     table, masked = source.table.copy(), list(source.masked)
-    for name, rows in held.items():
-        column = table[:, 1 + len(rig.logged_inputs) + rig.measured.index(name)]
-        if (again := held_rows(column, rows)).size:
-            column[again] = np.nan
-            masked.append(_masked(source, REPEAT, name, again))
+    for name, each in rows.items():
+        if each.size:
+            table[each, 1 + len(rig.logged_inputs) + rig.measured.index(name)] = np.nan
+            masked.append(_masked(source, kind, name, each))
     return source._replace(table=table, masked=masked)
 
 

@@ -152,8 +152,6 @@ def packed(machine: Machine) -> str:
 @lru_cache(maxsize=64)
 def unpacked(text: str) -> Machine:
     """The machine in a text of `packed`."""
-    parts = json.loads(text, parse_int=int)
-    fields = [_tuples(part) for part in parts]
     kinds = {
         "bodies": Body,
         "joints": Joint,
@@ -162,11 +160,9 @@ def unpacked(text: str) -> Machine:
         "sites": Site,
         "sensors": Sensor,
     }
-    named = dict(zip(Machine._fields, fields, strict=False))  # models that were saved before a field was there
-    values: dict[str, Any] = {
-        name: tuple(kinds[name](*one) for one in value) if name in kinds else value for name, value in named.items()
-    }
-    return Machine(**values)
+    fields: dict[str, Any] = dict(zip(Machine._fields, map(_tuples, json.loads(text)), strict=True))
+    fields |= {name: tuple(kind(*one) for one in fields[name]) for name, kind in kinds.items()}
+    return Machine(**fields)
 
 
 def _tuples(value):

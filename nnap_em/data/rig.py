@@ -29,6 +29,7 @@ _HINTS = {  # how the line of a key or table should look
     "name": 'name = "my_rig"',
     "model": 'a table [model] with type = "acrobot" and its parameters',
     "input": 'a table [input] with columns = ["u"] and joints = [2]',
+    "import": "a table [import]",
     "sampling": "a table [sampling] with dt, input_hold and clock",
     "measurement": 'a table [measurement] with columns = ["theta1", "dtheta1"]',
     "noise_std": "a table [measurement.noise_std] with one number above 0 per column",
@@ -196,7 +197,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     Raises RigError at the first mistake.
     """
     path = Path(path)
-    root = _Table(path, "", _parse(path))
+    root = whole_table(path)
     root.check(("format", "name", "model", "sampling", "measurement"), ("input", "start", "limits", "import"))
     if root.number("format") != 1:
         root.refuse("format")
@@ -434,9 +435,10 @@ def _units(equations: str) -> dict[str, str]:
     return {**of["states"], **of["inputs"], **of["units"]}
 
 
-def _parse(path: Path) -> dict[str, object]:
+def whole_table(path: Path) -> _Table:
+    """The whole of a rig.toml; RigError where it is no TOML."""
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        return _Table(path, "", tomllib.loads(path.read_bytes().decode("utf-8-sig")))
     except OSError as error:
         raise RigError(f"{path}: cannot be read ({error.strerror}); a data set is a folder with a rig.toml") from None
     except UnicodeDecodeError as error:

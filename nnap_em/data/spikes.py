@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+
+from .noise import reading_noise
 
 SPIKE = 6.0  # standard deviations of a reading from the value of its neighbours
 LONGEST_SPIKE = 3  # rows of a spike
-MOVING = 0.1  # share of the rows of a column that show its noise by themselves: 1 % of spikes spoils 5 % of them
 _SIDE, _NEAR = 5, 3  # rows on either side of a spike that are compared, and where the signal is too quick for these
 _MARGIN = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
 _END = 5.0  # times as large it must be in the first and last three rows, which have neighbours on one side
@@ -29,7 +30,7 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
     """Rows of single readings or short runs that leave the trend of the readings before and after them."""
     y, out = np.array(y), []
     while True:
-        sigma = max(noise(y), 1e-9 * float(np.nanmax(np.abs(y), initial=0.0)), 1e-300)
+        sigma = max(reading_noise(y[None]), 1e-9 * float(np.nanmax(np.abs(y), initial=0.0)), 1e-300)
         tried = list(_candidates(y, sigma))
         alone = [int(run[0]) for run in tried if run.size == 1]
         confirmed = [run for run in tried if _is_spike(y, run, alone, sigma)]
@@ -40,21 +41,6 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
             y[run] = np.nan
 
 
-def noise(y: Float[np.ndarray, " time"]) -> float:
-    """Standard deviation of a reading about its neighbours' cubic, by the median; at least a third of a step.
-
-    Stretches in which readings repeat show nothing of the noise of others, and count only where nearly all do.
-    """
-    seen = y[np.isfinite(y)]
-    left = _left(np.flatnonzero(np.isfinite(y)), y, 1)
-    step = np.abs(np.diff(seen))
-    least = float(np.min(step, where=step > 0, initial=math.inf)) / 3
-    miss = np.abs(left.miss) / left.factor
-    miss = miss[left.changes] if np.sum(left.changes) > MOVING * miss.size else miss
-    spread = float(np.median(miss)) / 0.6745 if miss.size else 0.0
-    return max(spread, least if math.isfinite(least) else 0.0)
-
-
 class _Left(NamedTuple):
     """Residual of the readings of runs after the cubic through two neighbours on either side is taken off."""
 
@@ -62,8 +48,6 @@ class _Left(NamedTuple):
     miss: Float[np.ndarray, "run row"]
     factor: Float[np.ndarray, "run row"]
     """Standard deviation of `miss` over that of a reading."""
-    changes: Bool[np.ndarray, " run"]
-    """True where most neighbours differ from the next."""
 
 
 def _left(k: Int[np.ndarray, " seen"], y: Float[np.ndarray, " time"], length: int) -> _Left:
@@ -81,9 +65,7 @@ def _left(k: Int[np.ndarray, " seen"], y: Float[np.ndarray, " time"], length: in
             if i != j:
                 weight[..., i] *= (z - x[:, j : j + 1]) / (x[:, i] - x[:, j])[:, None]
     miss = y[inner] - np.einsum("rli,ri->rl", weight, y[nodes])
-    z = y[np.hstack([nodes[:, :2], inner, nodes[:, 2:]])]
-    changes = 2 * np.sum(np.diff(z, axis=1) != 0, axis=1) > z.shape[1] - 1
-    return _Left(inner, miss, np.sqrt(1 + np.sum(weight**2, axis=-1)), changes)
+    return _Left(inner, miss, np.sqrt(1 + np.sum(weight**2, axis=-1)))
 
 
 def _candidates(y: Float[np.ndarray, " time"], sigma: float) -> Iterator[Int[np.ndarray, " row"]]:

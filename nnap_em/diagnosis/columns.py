@@ -1,5 +1,6 @@
 """Columns of candidates along the smoothed motion: force and reading of each of their probes."""
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -15,6 +16,8 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
 from ..numerics.parallel import each
 from ..prediction_error.multistep import Columns
+
+Blocks = Sequence[Sequence[Candidate]]
 
 
 class Track(NamedTuple):
@@ -137,29 +140,29 @@ def _stack_columns(common, track: Track) -> list[Columns]:
     return [jax.vmap(one, in_axes=(axes,))(stack) for stack, axes in stacks]
 
 
-def _groups(stacks: Sequence[Stack]) -> list[list[Stack]]:
-    """Stacks whose columns one program computes: those of a class, as far as they are no more than COLUMNS_AT_ONCE."""
-    groups: list[list[Stack]] = []
-    for stack in stacks:
-        last = groups[-1] if groups else []
-        same = bool(last) and type(last[0].probes) is type(stack.probes)
-        if same and sum(len(other.places) for other in last) + len(stack.places) <= COLUMNS_AT_ONCE:
-            last.append(stack)
-        else:
-            groups.append([stack])
-    return groups
+def blocks_of(candidates: Sequence[Candidate]) -> Blocks:
+    """Candidates in blocks of about COLUMNS_AT_ONCE columns: those of all at six joints would be gigabytes."""
+    ends = itertools.accumulate(len(candidate.probes) for candidate in candidates)
+    numbered = zip((end // COLUMNS_AT_ONCE for end in ends), candidates, strict=True)
+    return [[one for _, one in same] for _, same in itertools.groupby(numbered, lambda pair: pair[0])]
+
+
+def columns_by_block(base: StateSpaceModel, blocks: Blocks, rows: int = 0) -> Iterator[Callable[[Track], Columns]]:
+    """`candidate_columns` of each block, all of one size: columns of nothing fill the others up."""
+    size = max(sum(len(candidate.probes) for candidate in block) for block in blocks)
+    return (candidate_columns(base, block, rows, size) for block in blocks)
 
 
 def candidate_columns(
-    base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0
+    base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0, size: int = 0
 ) -> Callable[[Track], Columns]:
     """Columns that the probes of all candidates add to `base` along the tracks of some sequences: seq column time ...
 
-    Tracks are padded to `rows`, so that horizons share the largest program.
+    Tracks are padded to `rows`, so that horizons share the largest program, and columns of 0 behind them to `size`.
     """
     stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
-    groups = _groups(stacks)
-    size = sum(len(stack.places) for stack in stacks)
+    groups = [list(same) for _, same in itertools.groupby(stacks, lambda stack: type(stack.probes))]
+    size = max(size, sum(len(stack.places) for stack in stacks))
 
     def along(track: Track) -> Columns:
         length = track.middle.shape[1]
@@ -167,7 +170,7 @@ def candidate_columns(
         longer = lambda a: np.pad(a, padding + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
         track = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
-        force, reading = (np.empty((len(track.middle), size, length, n), track.middle.dtype) for n in last)
+        force, reading = (np.zeros((len(track.middle), size, length, n), track.middle.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):
@@ -176,10 +179,3 @@ def candidate_columns(
         return Columns(force, reading)
 
     return along
-
-
-def blocks(columns: Columns) -> Iterator[Columns]:
-    """The columns in blocks of at most COLUMNS_AT_ONCE, whose sizes differ by one: two programs at most."""
-    count = max(1, -(-columns.force.shape[1] // COLUMNS_AT_ONCE))
-    for parts in zip(*(np.array_split(np.asarray(a), count, axis=1) for a in columns), strict=True):
-        yield Columns(*parts)

@@ -9,7 +9,7 @@ errors is taken out of the columns, too.
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import ClassVar, NamedTuple, cast
 
 import equinox as eqx
@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..data.dataset import Dataset
-from ..effects import Candidate, flat
+from ..effects import flat
 from ..em.local import locals_along
 from ..em.quadratic import whitened_sensitivities
-from ..model.state_space import Inputs, StateSpaceModel
+from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import batches, each
 from ..prediction_error.multistep import (
@@ -40,7 +40,7 @@ from ..prediction_error.multistep import (
     weighed,
 )
 from ..smoother.kalman import CUBATURE, kalman_filter
-from .columns import blocks, candidate_columns, tracks
+from .columns import Blocks, columns_by_block, tracks
 from .hypothesis import Hypothesis
 from .refit import Refit, refit
 from .smoothed import SmoothedFit
@@ -77,8 +77,8 @@ class AbstractLoss(eqx.Module):
         return 1.0
 
     @abstractmethod
-    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
-        """Errors and derivatives along the smoothed paths of `fit`, by band of horizons."""
+    def linearise(self, fit: SmoothedFit, blocks: Blocks) -> Iterator[tuple[Linearised, ...]]:
+        """Errors and derivatives along the smoothed paths of `fit`, by band, for one block of candidates at a time."""
 
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """A `trial` after the steps of this loss, which follow its fit by likelihood."""
@@ -118,31 +118,29 @@ class MultiStep(AbstractLoss):
         removed = [evidence.removed for evidence in fit.hypothesis.evidence if evidence is not None]
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
-    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
+    def linearise(self, fit: SmoothedFit, blocks: Blocks) -> Iterator[tuple[Linearised, ...]]:
         """Errors of predictions that begin from the filter every 50 ms, with robust weights."""
         model, path, data = fit.model, fit.path, fit.data
         weights = fit.m_step.weights(model)
-        track = jax.tree.map(np.asarray, tracks(model, path, each(_inputs, model, data)))
-        along = candidate_columns(_machine(fit), candidates)
         every = tuple(sorted(set(sum(self.bands, ()))))
-        predictions = open_loop(
-            followed(model, weights.prior, path, data),
-            weights,
-            lambda sequences: blocks(along(jax.tree.map(lambda a: a[sequences], track))),
-            every,
-        )
-        rows, weight = starts(model, data, every), weighed(predictions, fit.used)
         bands = [[every.index(h) for h in band] for band in self.bands]
-        return tuple(
-            Linearised(
-                _flat(predictions.error[:, :, band]),
-                _flat(predictions.columns[:, :, band], 1),
-                _flat(weight[:, :, band]),
-                float(np.mean(predictions.overlap[band])),
-                rows,
+        follows, rows = followed(model, weights.prior, path, data), starts(model, data, every)
+        track = jax.tree.map(np.asarray, tracks(model, path, follows.linear.seq.inputs))
+        error, own = errors(follows, every), weights.nodes.size + weights.prior.size
+        for along in columns_by_block(_machine(fit), blocks):
+            extra = lambda s: along(jax.tree.map(lambda a: a[s], track))  # noqa: B023, E731
+            predictions = open_loop(follows, weights, extra, every, error)
+            weight = weighed(predictions._replace(columns=predictions.columns[..., :own]), fit.used)
+            yield tuple(
+                Linearised(
+                    _flat(error[:, :, band]),
+                    _flat(predictions.columns[:, :, band], 1),
+                    _flat(weight[:, :, band]),
+                    float(np.mean(predictions.overlap[band])),
+                    rows,
+                )
+                for band in bands
             )
-            for band in bands
-        )
 
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """The trial after Gauss-Newton steps on the multi-step errors."""
@@ -173,24 +171,23 @@ class OneStep(AbstractLoss):
     measure: ClassVar[str] = "share of the squared one-step error"
     bands: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=((),))
 
-    def linearise(self, fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Linearised, ...]:
+    def linearise(self, fit: SmoothedFit, blocks: Blocks) -> Iterator[tuple[Linearised, ...]]:
         """Innovations in standard deviations; derivatives by the sensitivity equations of the Kalman filter."""
         model, data = fit.model, fit.data
         weights = fit.m_step.weights(model)
         linear = locals_along(model, weights.prior, fit.path, data, CUBATURE)
         track = tracks(model, fit.path, linear.seq.inputs)
-        along = candidate_columns(_machine(fit), candidates, fit.rows)
-        common = (model.log_q, model.log_r, model.start, weights.nodes)
-        parts = []
-        for _, (local, batch) in batches(len(data.t), linear, track):  # columns of all at once fill the memory
-            innovations = each(_innovations, common, (local, batch.middle, along(batch)), together=1)
-            parts.append([np.asarray(a, np.float32) for a in innovations])
-        error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
-        finite = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns).all(axis=(1, 2, 3)) & fit.used
-        weight = (np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None] & finite[:, None, None]).astype(
-            float
-        )
-        return (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
+        common, own = (model.log_q, model.log_r, model.start, weights.nodes), weights.nodes.size + weights.prior.size
+        known = np.isfinite(np.asarray(data.y)) & np.asarray(data.valid)[..., None]
+        for along in columns_by_block(_machine(fit), blocks, fit.rows):
+            parts = []
+            for _, (local, batch) in batches(len(data.t), linear, track):  # columns of all at once fill the memory
+                innovations = each(_innovations, common, (local, batch.middle, along(batch)), together=1)
+                parts.append([np.asarray(a, np.float32) for a in innovations])
+            error, columns = (np.concatenate(a)[: len(data.t)] for a in zip(*parts, strict=True))
+            finite = np.isfinite(error).all(axis=(1, 2)) & np.isfinite(columns[..., :own]).all(axis=(1, 2, 3))
+            weight = (known & (finite & fit.used)[:, None, None]).astype(float)
+            yield (Linearised(error.astype(float), columns, weight, 1.0, np.arange(data.t.shape[1])),)
 
     def along(self, fit: SmoothedFit, hypothesis: Hypothesis, path: Gaussian) -> Refit:
         """Its log-likelihood: that of the one pass of a refit."""
@@ -222,10 +219,6 @@ def _machine(fit: SmoothedFit) -> StateSpaceModel:
 def _flat(a: np.ndarray, last: int = 0) -> np.ndarray:
     """Horizons and channels as one axis."""
     return a.reshape(*a.shape[:2], a.shape[2] * a.shape[3], *a.shape[4 : 4 + last])
-
-
-def _inputs(model: StateSpaceModel, seq: Dataset) -> Inputs:
-    return model.inputs(seq)
 
 
 def _innovations(common, one) -> tuple[Float[Array, "time obs"], Float[Array, "time obs column"]]:

@@ -9,12 +9,15 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
 
-from ..effects import Candidate, flat
+from ..effects import Candidate, fields
 from ..prediction_error.shape import friction_prior
 from ..storage.journal import HERE, step
+from .columns import blocks_of
 from .folds import members, parts
 from .keys import complexity
 from .losses import AbstractLoss, Linearised
@@ -50,6 +53,7 @@ class Shares(NamedTuple):
     directions: Float[np.ndarray, " candidate"]
     coefficients: Float[np.ndarray, " probe"]
     survived: Float[np.ndarray, " candidate"]
+    far: Float[np.ndarray, " candidate"]
 
 
 class Screened(NamedTuple):
@@ -69,6 +73,8 @@ class Screened(NamedTuple):
     """Number of independent errors."""
     survived: float = 1.0
     """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]."""
+    far: float = 0.0
+    """Distance of a linear law from none, in root mean square of the standard deviations of its prior."""
 
     @property
     def ratio(self) -> float:
@@ -94,8 +100,7 @@ class Screened(NamedTuple):
     def admissible(self) -> bool:
         """True where the parts left out confirm the share."""
         start, multiple = self.candidate.start, float(self.coefficients[0])
-        far = float(np.sqrt(np.mean(self.coefficients**2 * _ridge(self.candidate))))
-        if not sensible(multiple, far, self.survived, linear=start.linear):
+        if not sensible(multiple, self.far, self.survived, linear=start.linear):
             return False
         return agreed(self.share.folds, self.floor, responds=start.responds_to_feedback())
 
@@ -113,20 +118,21 @@ def project(
     precision: Float[np.ndarray, "nuisance nuisance"],
     pull: Float[np.ndarray, " nuisance"],
 ) -> Rows:
-    """Errors and candidates without the part that the nuisance explains under its prior."""
-    keep = linearised.weight > 0
+    """Errors and candidates, 0 where one is no number, without the part that the nuisance explains under its prior."""
     step = int(block.max(initial=0)) + 1
-    cell = np.broadcast_to((fold * step + block)[:, :, None], keep.shape)[keep]
-    order, root = np.argsort(cell, kind="stable"), np.sqrt(linearised.weight[keep])
-    error = (root * linearised.error[keep])[order]
-    columns = (root[:, None] * linearised.columns[keep])[order].astype(float)
-    nuisance, candidates = columns[:, : len(pull)], columns[:, len(pull) :]
-    factor = np.linalg.cholesky(nuisance.T @ nuisance + precision)
-    solve = lambda a: np.linalg.solve(factor.T, np.linalg.solve(factor, a))  # noqa: E731
-    error = error - nuisance @ solve(nuisance.T @ error - pull)
-    left = candidates - nuisance @ solve(nuisance.T @ candidates)
-    survived = np.linalg.norm(left, axis=0) / np.maximum(np.linalg.norm(candidates, axis=0), 1e-300)
-    return Rows(error, left, cell[order], step, linearised.overlap, survived)
+    cell = np.broadcast_to((fold * step + block)[:, :, None], linearised.weight.shape).ravel()
+    keep = np.flatnonzero((weight := linearised.weight.ravel()) > 0)
+    keep = keep[np.argsort(cell[keep], kind="stable")]
+    root = np.sqrt(weight[keep])
+    columns = root[:, None] * linearised.columns.reshape(len(weight), -1)[keep]
+    nuisance, left = columns[:, : len(pull)], np.nan_to_num(columns[:, len(pull) :], posinf=0.0, neginf=0.0)
+    factor = cho_factor(nuisance.T @ nuisance + precision)
+    error = root * linearised.error.ravel()[keep]
+    error -= nuisance @ cho_solve(factor, nuisance.T @ error - pull)
+    whole = np.linalg.norm(left, axis=0)
+    left -= nuisance @ cho_solve(factor, nuisance.T @ left)
+    survived = np.linalg.norm(left, axis=0) / np.maximum(whole, 1e-300)
+    return Rows(error, left, cell[keep], step, linearised.overlap, survived)
 
 
 def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
@@ -180,12 +186,12 @@ def _gone(c, score, gram) -> Float[np.ndarray, " candidate"]:
 
 
 def _sums(rows: Rows, places: Int[np.ndarray, "candidate probe"], ridge) -> _Sums:
-    edges = np.flatnonzero(np.diff(rows.cell)) + 1
-    scores, grams = [], []
-    for indices in np.split(np.arange(len(rows.cell)), edges):
-        x = np.moveaxis(rows.columns[indices[0] : indices[-1] + 1][:, places], 0, 1)  # candidate row probe
-        scores.append(np.einsum("mrk,r->mk", x, rows.error[indices[0] : indices[-1] + 1]))
-        grams.append(np.swapaxes(x, 1, 2) @ x)
+    edges = [0, *(np.flatnonzero(np.diff(rows.cell)) + 1), len(rows.cell)]
+    columns, scores, grams = np.ascontiguousarray(rows.columns.T), [], []
+    for cell in itertools.starmap(slice, itertools.pairwise(edges)):
+        x = columns[:, cell][places]  # candidate probe row
+        scores.append(x @ rows.error[cell])
+        grams.append(x @ np.swapaxes(x, 1, 2))
     return _Sums(np.stack(scores), np.stack(grams), ridge)
 
 
@@ -200,13 +206,15 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
     total, fold, block = square.sum(), cells // rows.step, cells % rows.step
     held = np.array([square[fold == f].sum() for f in np.unique(fold)] or [0.0])
     where, sizes = spans(candidates), np.array([len(c.probes) for c in candidates])
+    once = {id(c): _ridge(c) for c in {id(c): c for c in candidates}.values()}
+    ridge = [once[id(c)] for c in candidates]
     inside, left_out, directions = np.zeros((3, len(candidates)))
     survived = np.array([rows.survived[span].max(initial=0.0) for span in where])
     folds, coefficients = np.zeros((len(candidates), len(held))), np.zeros(where[-1].stop)
     for size in np.unique(sizes) if len(held) > 1 else ():  # of one fold nothing can be left out
         indices = np.flatnonzero(sizes == size)
         places = np.array([np.arange(where[int(i)].start, where[int(i)].stop) for i in indices])
-        sums = _sums(rows, places, np.array([_ridge(candidates[int(i)]) for i in indices]))
+        sums = _sums(rows, places, np.array([ridge[int(i)] for i in indices]))
         gone, coefficients[places], directions[indices] = sums.fitted()
         count = np.maximum(len(rows.error) / rows.overlap, directions[indices] + 2)
         inside[indices] = 1 - (1 - gone / total) * (count - 1) / (count - directions[indices] - 1)
@@ -215,63 +223,74 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
         moments = sum(sums.left_out(block == b) for b in np.unique(block))
         least = np.where(np.asarray(timed)[indices], np.inf, moments)
         left_out[indices] = np.minimum(out.sum(axis=1), least) / total
-    return Shares(inside, left_out, folds, directions, coefficients, survived)
+    far = np.array([np.sqrt(np.mean(coefficients[span] ** 2 * r)) for span, r in zip(where, ridge, strict=True)])
+    return Shares(inside, left_out, folds, directions, coefficients, survived, far)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
-    """Prior precision of the multiples of the probes."""
-    start, spread = np.asarray(flat(candidate.start)), np.asarray(flat(candidate.prior_std))
-    steps = [(np.asarray(flat(probe)) - start) / spread for probe in candidate.probes]
-    return np.array([np.sum(step**2) for step in steps]) if candidate.start.linear else np.zeros(len(steps))
+    """Prior precision of the multiples of the probes; 0 for a law that is not linear."""
+    if not candidate.start.linear:
+        return np.zeros(len(candidate.probes))
+    flat = lambda effect: np.concatenate([np.ravel(getattr(effect, name)) for name in fields(effect)])  # noqa: E731
+    start, spread, *probes = map(flat, (candidate.start, candidate.prior_std, *candidate.probes))
+    return np.array([np.sum(((probe - start) / spread) ** 2) for probe in probes])
 
 
 class _Band(NamedTuple):
-    """Shares of one band, of candidates and of placebos."""
+    """Shares of one band, of the candidates and of each placebo."""
 
-    shares: Shares
-    placebos: tuple[Shares, ...]
-    information: Float[np.ndarray, "probe probe"]
-    """Gram matrix of the columns."""
+    shares: tuple[Shares, ...]
+    columns: Float[np.ndarray, "row probe"]
+    """Columns without what the nuisance can explain."""
     independent: float
     """Number of independent errors."""
     members: Bool[np.ndarray, "fold seq"]
     """Sequences that each fold holds, or pieces of."""
 
 
-_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE)
-_BAND = _Band(_SHARES, (), HERE, HERE, HERE)
+_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE, HERE)
 
 
-@step(lambda loss, _, __, shifts: (_BAND._replace(placebos=(_SHARES,) * shifts),) * len(loss.bands))
+@step(lambda loss, _, __, shifts: (_Band((_SHARES,) * (1 + shifts), HERE, HERE, HERE),) * len(loss.bands))
 def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int) -> tuple[_Band, ...]:
     """The screen of every band.
 
     The seed of the placebos is fixed, so that the same data give the same chance level.
     """
-    model, weights = fit.model, fit.m_step.weights(fit.model)
-    precision, pull = friction_prior(model, weights)
-    timed = ["time" in c.start.signals(model.system) for c in candidates]
-    out = []
-    for linearised in loss.linearise(fit, candidates):
-        fold, block = parts(model, fit.path, fit.data, fit.used, fit.recording, linearised.rows)
-        rng, of = np.random.default_rng(0), lambda one: project(one, fold, block, precision, pull)  # noqa: B023
-        rows = of(linearised)
-        real = shares(rows, candidates, timed)
-        moved = (of(shifted(linearised, len(pull), rng)) for _ in range(shifts))
-        placebos = tuple(shares(one, candidates, timed) for one in moved)
-        columns = rows.columns.astype(np.float32)
-        independent = len(rows.error) / rows.overlap
-        held = members(fold, np.asarray((linearised.weight > 0).any(axis=2)))
-        out.append(_Band(real, placebos, columns.T @ columns, independent, held))
-    return tuple(out)
+    blocks, out = blocks_of(candidates), []
+    prior = friction_prior(fit.model, fit.m_step.weights(fit.model))
+    for some, bands in zip(blocks, loss.linearise(fit, blocks), strict=True):
+        out.append([_band(fit, some, *prior, linearised, shifts) for linearised in bands])
+    return tuple(map(_joined, zip(*out, strict=True)))
+
+
+def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> _Band:
+    """The screen of some candidates at one band."""
+    count, timed = 1 + shifts, ["time" in c.start.signals(fit.model.system) for c in candidates]
+    fold, block = parts(fit.model, fit.path, fit.data, fit.used, fit.recording, linearised.rows)
+    rng, size = np.random.default_rng(0), spans(candidates)[-1].stop
+    linearised = linearised._replace(columns=linearised.columns[..., : len(pull) + size])
+    moved = [shifted(linearised, len(pull), rng).columns[..., len(pull) :] for _ in range(shifts)]
+    columns = np.concatenate([linearised.columns, *moved], axis=-1)
+    rows = project(linearised._replace(columns=columns), fold, block, precision, pull)
+    every = shares(rows, [*candidates] * count, timed * count)
+    split = tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
+    held = members(fold, np.asarray((linearised.weight > 0).any(axis=2)))
+    return _Band(split, rows.columns[:, :size].astype(np.float32), len(rows.error) / rows.overlap, held)
+
+
+def _joined(blocks: Sequence[_Band]) -> _Band:
+    """The screen of all candidates at one band."""
+    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *(block.shares for block in blocks))
+    return blocks[0]._replace(shares=whole, columns=np.concatenate([block.columns for block in blocks], axis=1))
 
 
 class Screen(NamedTuple):
     """All candidates before any refit."""
 
     screened: tuple[Screened, ...]
-    information: tuple[Float[np.ndarray, "probe probe"], ...]
-    """Gram matrix of the columns of all probes, by band."""
+    columns: tuple[Float[np.ndarray, "row probe"], ...]
+    """Columns of all probes without what friction and parameters can explain, by band."""
     members: tuple[Bool[np.ndarray, "fold seq"], ...]
     """Sequences that each fold holds, or pieces of, by band."""
 
@@ -284,12 +303,12 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
     bands = _bands(loss, fit, candidates, shifts)
     out = []
     for number, band in enumerate(bands):
-        floor = loss.bars.floor(band.independent) / loss.remaining_share(fit)
-        placebo = [s for one in band.placebos for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
+        (real, *moved), floor = band.shares, loss.bars.floor(band.independent) / loss.remaining_share(fit)
+        placebo = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
         chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
-        out.append(_screened(band.shares, candidates, number, floor, chance, band.independent))
+        out.append(_screened(real, candidates, number, floor, chance, band.independent))
     best = (max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
-    return Screen(tuple(best), tuple(band.information for band in bands), tuple(b.members for b in bands))
+    return Screen(tuple(best), tuple(band.columns for band in bands), tuple(b.members for b in bands))
 
 
 def _screened(
@@ -297,8 +316,8 @@ def _screened(
 ) -> Iterator[Screened]:
     for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
-        directions, survived = round(float(shares.directions[i])), float(shares.survived[i])
-        numbers = band, floor, chance, independent, survived
+        directions = round(float(shares.directions[i]))
+        numbers = band, floor, chance, independent, float(shares.survived[i]), float(shares.far[i])
         yield Screened(candidate, shares.coefficients[span], directions, share, *numbers)
 
 
@@ -307,14 +326,14 @@ def overlaps(screen: Screen, chosen: Screened) -> list[float]:
 
     It is 0 for the same model: a ripple of one period a turn may have the amplitude and phase of a tilt.
     """
-    candidates, information = [s.candidate for s in screen.screened], screen.information[chosen.band]
+    candidates, columns = [s.candidate for s in screen.screened], screen.columns[chosen.band]
     where = spans(candidates)
     reference = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
-    fitted = np.asarray(chosen.coefficients, float)
-    total, out = fitted @ information[reference, reference] @ fitted, []
+    fitted = columns[:, reference] @ np.asarray(chosen.coefficients, float)
+    total, out = fitted @ fitted, []
     for span in where:
-        cross = fitted @ information[reference, span].astype(float)
-        block = information[span, span].astype(float)
+        some = columns[:, span].astype(float)
+        cross, block = fitted @ some, some.T @ some
         left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross
         out.append(float(np.clip(left / max(total, 1e-300), 0.0, 1.0)))
     return out

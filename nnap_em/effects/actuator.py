@@ -34,8 +34,10 @@ class MotorGain(InputEffect):
     """gain u."""
 
     name: ClassVar[str] = "motor_gain"
+    meaning: ClassVar[str] = "The motor delivers another torque than commanded, in a fixed proportion."
     confirm: ClassVar[str] = "Block the joint and measure its torque at one command."
     units: ClassVar[dict[str, str]] = {"gain": "-"}
+    words: ClassVar[dict[str, str]] = {"gain": "delivered / commanded"}
     excess: Scalar
     """gain - 1."""
 
@@ -54,8 +56,10 @@ class DeadZone(InputEffect):
     """Nothing below width, sign(u) (|u| - width) beyond."""
 
     name: ClassVar[str] = "dead_zone"
+    meaning: ClassVar[str] = "Small commands have no effect."
     confirm: ClassVar[str] = "Raise the command slowly from zero until the joint moves, both ways."
     units: ClassVar[dict[str, str]] = {"width": "N m"}
+    words: ClassVar[dict[str, str]] = {"width": "half width"}
     above_zero: ClassVar[str] = "width"
     linear: ClassVar[bool] = False
     width: Scalar
@@ -73,20 +77,20 @@ class Saturation(InputEffect):
     """Limited to +-limit."""
 
     name: ClassVar[str] = "saturation"
+    meaning: ClassVar[str] = "The motor cannot deliver more than a limit."
     confirm: ClassVar[str] = (
         "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
     )
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
+    words: ClassVar[dict[str, str]] = {"limit": "limit"}
     above_zero: ClassVar[str] = "limit"
     linear: ClassVar[bool] = False
     limit: Scalar
 
     @classmethod
     def candidates(cls, around):
-        grid = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)
-        return [
-            one(partial(cls, **place), 2 * size, s * size, 0.2 * size) for place, size in around.drives for s in grid
-        ]
+        grid, drives = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2), around.drives
+        return [one(partial(cls, **place), 2 * size, s * size, 0.2 * size) for place, size in drives for s in grid]
 
     def drive(self, torque):
         return jnp.clip(torque, -self.limit, self.limit)
@@ -123,6 +127,7 @@ class InputDelay(DriveEffect):
     """u acts later by any time; before the first row it was 0."""
 
     name: ClassVar[str] = "input_delay"
+    meaning: ClassVar[str] = "Commands act late."
     confirm: ClassVar[str] = "Log command and motor current on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     above_zero: ClassVar[str] = "delay"
@@ -156,8 +161,10 @@ class ActuatorLag(DriveEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
 
     name: ClassVar[str] = "actuator_lag"
+    meaning: ClassVar[str] = "The motor follows its command gradually."
     confirm: ClassVar[str] = "Log command and motor current on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}
+    words: ClassVar[dict[str, str]] = {"tau": "time constant"}
     above_zero: ClassVar[str] = "tau"
     tau: Scalar
 

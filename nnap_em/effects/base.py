@@ -4,7 +4,6 @@ A new effect is one new file in this folder; the catalogue finds it.
 """
 
 import dataclasses
-import inspect
 import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -171,10 +170,14 @@ class AbstractEffect(eqx.Module):
     """Key of the vocabulary for a law that it has no name for."""
     named: ClassVar[bool] = True
     """False for a law without a form of its own."""
+    meaning: ClassVar[str] = ""
+    """The law in a sentence for a reader."""
     confirm: ClassVar[str] = ""
     """Measurement on the machine that confirms it."""
     units: ClassVar[dict[str, str]] = {}
     """Reported parameters and their units on a rotary joint."""
+    words: ClassVar[dict[str, str]] = {}
+    """Reported parameters in words."""
     units_free: ClassVar[dict[str, str]] = {}
     """Those that are others where it acts on no single joint."""
     above_zero: ClassVar[str] = ""
@@ -194,11 +197,6 @@ class AbstractEffect(eqx.Module):
     """The joint that it acts on, counted from 1; None: all, or no joint."""
     channel: str | None = eqx.field(static=True, default=None, kw_only=True)
     """The reading that it acts on ("all": every one); of equations also the port, or the input."""
-
-    @classmethod
-    def meaning(cls) -> str:
-        """The law in a sentence."""
-        return " ".join(inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0].split())
 
     @classmethod
     def key(cls) -> str:
@@ -365,9 +363,12 @@ def flat(effect: AbstractEffect) -> Float[Array, " param"]:
     return jnp.concatenate([jnp.ravel(getattr(effect, name)) for name in fields(effect)])
 
 
-def one(make: Callable[[Scalar], AbstractEffect], none: float, probe: float, spread: float) -> Candidate:
-    """A candidate of one strength: no effect, a small one, its prior standard deviation."""
-    return Candidate(make(a(none)), (make(a(probe)),), make(a(spread)))
+def one(
+    make: Callable[..., AbstractEffect], none: float, probe: float, spread: float, *inner: tuple[float, float]
+) -> Candidate:
+    """A candidate of one strength: no effect, a small one, its prior standard deviation; `inner` as in `pair`."""
+    at, wide = [a(value) for value, _ in inner], [a(std) for _, std in inner]
+    return Candidate(make(a(none), *at), (make(a(probe), *at),), make(a(spread), *wide))
 
 
 def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inner: tuple[float, float]) -> Candidate:

@@ -41,8 +41,15 @@ class Payload(Variation):
     """
 
     name: ClassVar[str] = "payload"
+    meaning: ClassVar[str] = "A body carries more mass than declared."
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "centre_x": "m", "centre_y": "m", "centre_z": "m"}
+    words: ClassVar[dict[str, str]] = {
+        "mass": "added mass",
+        "centre_x": "its centre along x of the body",
+        "centre_y": "its centre along y",
+        "centre_z": "its centre along z",
+    }
     moment: Float[Array, "3"] | None = None
     """First moment about the point [kg m]; None: the mass is at the tip."""
     point: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
@@ -81,32 +88,40 @@ class LinkInertia(Variation):
     """A moment of inertia off by dI."""
 
     name: ClassVar[str] = "link_inertia"
+    meaning: ClassVar[str] = "A link is harder (or easier) to spin than declared."
     confirm: ClassVar[str] = "Swing the link alone about a known axis and time it."
     units: ClassVar[dict[str, str]] = {"dI": "kg m^2"}
+    words: ClassVar[dict[str, str]] = {"dI": "added inertia"}
 
 
 class LinkLength(Variation):
     """A length off by dl."""
 
     name: ClassVar[str] = "link_length"
+    meaning: ClassVar[str] = "A link is longer (or shorter) than declared."
     confirm: ClassVar[str] = "Measure the distance between the joints."
     units: ClassVar[dict[str, str]] = {"dl": "m"}
+    words: ClassVar[dict[str, str]] = {"dl": "added length"}
 
 
 class CenterOfMass(Variation):
     """A centre of mass off by dlc along the link."""
 
     name: ClassVar[str] = "center_of_mass"
+    meaning: ClassVar[str] = "The centre of mass of a link is not where declared."
     confirm: ClassVar[str] = "Balance the link on an edge."
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
+    words: ClassVar[dict[str, str]] = {"dlc": "shift outwards"}
 
 
 class PayloadStep(JointEffect):
     """A payload that comes on at a moment of the clock; the edge is some samples wide, so that a fit can move it."""
 
     name: ClassVar[str] = "payload_step"
+    meaning: ClassVar[str] = "The payload changed at a moment of the session."
     confirm: ClassVar[str] = "Ask what was mounted or lost at that moment."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "time": "s"}
+    words: ClassVar[dict[str, str]] = {"mass": "added mass", "time": "moment"}
     mass: Scalar
     time: Scalar
     edge: Scalar = known()
@@ -115,14 +130,10 @@ class PayloadStep(JointEffect):
     def candidates(cls, around):
         if not around.session:
             return []
-        first, last = around.duration
-        out = []
-        for j, size in varieties(around, "payload"):
-            make, interval, edge = partial(cls.of, joint=j), (last - first) / 24, 3 * around.dt
-            for time in (first + interval * i for i in range(1, 24)):
-                probe, spread = make(0.05 * size, time, edge), make(size, interval, edge)
-                out.append(Candidate(make(0.0, time, edge), (probe,), spread))
-        return out
+        first, interval = around.duration[0], (around.duration[1] - around.duration[0]) / 24
+        times = [first + interval * i for i in range(1, 24)]
+        joints = [(partial(cls, edge=a(3 * around.dt), joint=j), size) for j, size in varieties(around, "payload")]
+        return [one(make, 0.0, 0.05 * size, size, (time, interval)) for make, size in joints for time in times]
 
     def physics(self, system, time):
         return system.vary("payload", self.joint, self.mass * jax.nn.sigmoid((time - self.time) / self.edge))

@@ -9,7 +9,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .base import AbstractEffect, JointEffect, Scalar, known, one
+from .base import AbstractEffect, JointEffect, Scalar, a, known, one
 
 PROBED, PRIOR_STD = 0.05, 0.5
 """Torque of a probe, and standard deviation of a change, in the typical torque of the joint."""
@@ -21,6 +21,7 @@ class CoulombChange(JointEffect):
     """Coulomb friction of a joint differs from that of the fit: -change sign(w)."""
 
     name: ClassVar[str] = "coulomb_change"
+    meaning: ClassVar[str] = "Coulomb friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m"}
     change: Scalar
@@ -29,12 +30,10 @@ class CoulombChange(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        sizes = zip(around.joints, map(float, around.torque), map(float, around.speed), strict=True)
-        return [
-            one(partial(cls, knee=jnp.asarray(SIGN_BEND * speed), joint=j), 0.0, PROBED * torque, PRIOR_STD * torque)
-            for j, torque, speed in sizes
-            if around.moved is not None and around.learned
-        ]
+        learned = around.joints if around.moved is not None and around.learned else ()
+        knees = [partial(cls, knee=a(SIGN_BEND * float(around.speed[j - 1])), joint=j) for j in learned]
+        sizes = zip(knees, map(float, around.torque), strict=False)
+        return [one(make, 0.0, PROBED * torque, PRIOR_STD * torque) for make, torque in sizes]
 
     def phrase(self, sizes):
         return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"
@@ -50,6 +49,7 @@ class ViscousChange(JointEffect):
     """Viscous friction of a joint differs from that of the fit: -change w."""
 
     name: ClassVar[str] = "viscous_change"
+    meaning: ClassVar[str] = "Viscous friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}
     change: Scalar
@@ -74,6 +74,7 @@ class NumberChange(AbstractEffect):
     """An estimated number of the machine differs from that of the fit."""
 
     name: ClassVar[str] = "change"
+    meaning: ClassVar[str] = "A number of the machine is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Measure it."
     units: ClassVar[dict[str, str]] = {"change": "unit of the number"}
     change: Scalar

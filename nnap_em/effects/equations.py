@@ -40,6 +40,7 @@ class Flow(AbstractEffect):
     """
 
     name: ClassVar[str] = "flow"
+    meaning: ClassVar[str] = "A flow."
     confirm: ClassVar[str] = "Change one signal of it at a time."
     strength: Scalar
     level: Scalar
@@ -177,6 +178,7 @@ class ConstantFlow(PortEffect):
     """strength."""
 
     name: ClassVar[str] = "constant_flow"
+    meaning: ClassVar[str] = "A state gains or loses at a constant rate."
     confirm: ClassVar[str] = "Leave all inputs at zero and watch the state drift."
     kind: ClassVar[int] = 0
     count: ClassVar[int] = 0
@@ -186,6 +188,9 @@ class LinearFlow(PortEffect):
     """strength p: a leak where p is the state itself, else a coupling."""
 
     name: ClassVar[str] = "linear_flow"
+    meaning: ClassVar[str] = (
+        "A state gains or loses in proportion to a signal: a leak where it is its own, else a coupling."
+    )
     confirm: ClassVar[str] = "Hold all else still, change this signal alone, and watch the rate of the state."
     kind: ClassVar[int] = 1
 
@@ -194,6 +199,7 @@ class SquareFlow(PortEffect):
     """strength p |p|."""
 
     name: ClassVar[str] = "square_flow"
+    meaning: ClassVar[str] = "A state gains or loses with the square of a signal."
     confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
     kind: ClassVar[int] = 4
 
@@ -202,6 +208,7 @@ class ProductFlow(PortEffect):
     """strength p q."""
 
     name: ClassVar[str] = "product_flow"
+    meaning: ClassVar[str] = "A state gains or loses in proportion to the product of two signals."
     confirm: ClassVar[str] = "Change one of the two signals while the other is zero: the rate must stay."
     kind: ClassVar[int] = 3
     count: ClassVar[int] = 2
@@ -211,6 +218,7 @@ class ThresholdFlow(PortEffect):
     """strength (p - level) where p is above the level."""
 
     name: ClassVar[str] = "threshold_flow"
+    meaning: ClassVar[str] = "A state gains or loses once a signal is above a level."
     confirm: ClassVar[str] = "Raise this signal slowly and watch where the rate of the state begins to change."
     kind: ClassVar[int] = 5
     reports: ClassVar[tuple[str, ...]] = ("strength", "level")
@@ -220,6 +228,7 @@ class Exchange(PortEffect):
     """strength (p - q) leaves the state p and enters the state q, as heat and pressure do."""
 
     name: ClassVar[str] = "exchange"
+    meaning: ClassVar[str] = "One state loses to another in proportion to their difference, as heat does."
     confirm: ClassVar[str] = "Bring one of the two states up with all inputs off, and watch the other follow."
     kind: ClassVar[int] = 2
     leaves: ClassVar[bool] = True
@@ -233,6 +242,7 @@ class Transfer(PortEffect):
     """strength (p - level) leaves the state p above a level, and a share of it enters another."""
 
     name: ClassVar[str] = "transfer"
+    meaning: ClassVar[str] = "Above a level one state loses, and another gains a share of it."
     confirm: ClassVar[str] = "Fill the first state above the level and watch where the flow goes."
     kind: ClassVar[int] = 5
     leaves: ClassVar[bool] = True
@@ -247,6 +257,7 @@ class Overflow(PortEffect):
     """strength u leaves the state p while it is above a level, and a share of it enters another."""
 
     name: ClassVar[str] = "overflow"
+    meaning: ClassVar[str] = "Above a level of a state its inflow goes elsewhere, a share of it into another state."
     confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
     kind: ClassVar[int] = 6
     leaves: ClassVar[bool] = True
@@ -261,6 +272,7 @@ class Bend(SensorEffect):
     """value + bend (value - true)^2 / range, the range that of the readings: it reads `true` as it is."""
 
     name: ClassVar[str] = "sensor_bend"
+    meaning: ClassVar[str] = "A sensor bends: what it reads is a curve of the value."
     confirm: ClassVar[str] = "Compare the sensor with another one at three places of its range."
     units: ClassVar[dict[str, str]] = {"bend": "-", "true": "unit of the channel"}
     bend: Scalar
@@ -314,6 +326,7 @@ class FreeFlow(AbstractEffect):
     """A free function of the signals that `pick` takes of states and inputs, at the port `at`; one program for all."""
 
     name: ClassVar[str] = "free_flow"
+    meaning: ClassVar[str] = "A flow as a function of some signals."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Change one signal of it at a time."
     weights: Float[Array, " node"]
@@ -336,6 +349,7 @@ class UnknownTerm(AbstractEffect):
     """
 
     name: ClassVar[str] = "unknown_term"
+    meaning: ClassVar[str] = "A rate as a function of these signals, outside the vocabulary of effects."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Hold all signals but one still, and move that one through its range."
     weights: Float[Array, " basis"]

@@ -16,8 +16,10 @@ class PositionDependentFriction(JointEffect):
     """tau_f (1 + depth cos(n theta_j + phase))."""
 
     name: ClassVar[str] = "position_dependent_friction"
+    meaning: ClassVar[str] = "Friction is stronger at some angles than at others."
     confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
+    words: ClassVar[dict[str, str]] = {"depth": "relative depth", "n": "periods per turn", "phase": "phase"}
     cosine: Scalar
     sine: Scalar
     n: Scalar
@@ -44,8 +46,10 @@ class FrictionDrift(JointEffect):
     """tau_f (1 + change (1 - exp(-t / tau)))."""
 
     name: ClassVar[str] = "friction_drift"
+    meaning: ClassVar[str] = "Friction changes with time, as by warming up."
     confirm: ClassVar[str] = "Run the same motion cold and warm."
     units: ClassVar[dict[str, str]] = {"change": "-", "tau": "s"}
+    words: ClassVar[dict[str, str]] = {"change": "relative change", "tau": "time constant"}
     change: Scalar
     pace: Scalar
     """Log of tau."""
@@ -55,12 +59,8 @@ class FrictionDrift(JointEffect):
         if not around.learned:
             return []
         span = around.duration[1] - around.duration[0]
-        out = []
-        for j in around.joints:
-            make = partial(cls.of, joint=j)
-            paces = [math.log(share * span) for share in (0.05, 0.15, 0.4, 1.0)]
-            out += [Candidate(make(0.0, pace), (make(0.1, pace),), make(1.0, 1.0)) for pace in paces]
-        return out
+        paces = [math.log(share * span) for share in (0.05, 0.15, 0.4, 1.0)]
+        return [one(partial(cls, joint=j), 0.0, 0.1, 1.0, (pace, 1.0)) for j in around.joints for pace in paces]
 
     def values(self):
         return {"change": self.change, "tau": jnp.exp(self.pace)}
@@ -115,13 +115,11 @@ class LoadFriction(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        out = []
-        for j, _ in around.driven:
-            knee, names = a(0.02 * float(around.speed[j - 1])), (around.column(j), around.system.rates[j - 1])
-            for whole in (False, True):
-                make = partial(cls, knee=knee, whole=whole, names=names, joint=j)
-                out.append(one(make, 0.0, 0.05, 0.5))
-        return out
+        def make(j: int, whole: bool):
+            names = around.column(j), around.system.rates[j - 1]
+            return partial(cls, knee=a(0.02 * float(around.speed[j - 1])), whole=whole, names=names, joint=j)
+
+        return [one(make(j, whole), 0.0, 0.05, 0.5) for j, _ in around.driven for whole in (False, True)]
 
     def richer(self, around):
         two_sided, falls = self.load is not None, self.stribeck is not None

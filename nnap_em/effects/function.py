@@ -105,6 +105,7 @@ class UnknownFunction(JointEffect):
     """A torque sum_i w_i phi_i(inputs) at one joint [Broomhead & Lowe 1988]."""
 
     name: ClassVar[str] = "unknown_function"
+    meaning: ClassVar[str] = "A force as a function of these signals, outside the vocabulary of effects."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Repeat the motion with what stands under suspicion taken off."
     held: ClassVar[bool] = True

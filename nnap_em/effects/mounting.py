@@ -13,8 +13,10 @@ class BaseTilt(AbstractEffect):
     """Gravity acts on theta1 + angle."""
 
     name: ClassVar[str] = "base_tilt"
+    meaning: ClassVar[str] = "The base is not level: gravity points in another direction than declared."
     confirm: ClassVar[str] = "Put a level on the base, and let the machine hang at rest: where does it read zero?"
     units: ClassVar[dict[str, str]] = {"angle": "rad"}
+    words: ClassVar[dict[str, str]] = {"angle": "tilt"}
     angle: Scalar
 
     @classmethod
@@ -48,8 +50,10 @@ class BaseVibration(AbstractEffect):
     """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
 
     name: ClassVar[str] = "base_vibration"
+    meaning: ClassVar[str] = "The base shakes, or something else forces the machine periodically."
     confirm: ClassVar[str] = "Put an accelerometer on the base."
     units: ClassVar[dict[str, str]] = {"amplitude": "m/s^2", "frequency": "Hz", "phase": "rad"}
+    words: ClassVar[dict[str, str]] = {"amplitude": "amplitude", "frequency": "frequency", "phase": "phase"}
     sine: Scalar
     cosine: Scalar
     frequency: Scalar

@@ -25,10 +25,12 @@ class TorsionalSpring(PlaceEffect):
     """
 
     name: ClassVar[str] = "torsional_spring"
+    meaning: ClassVar[str] = "A joint is pulled back to a rest position, as by a cable or a spring."
     confirm: ClassVar[str] = (
         "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
     )
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
+    words: ClassVar[dict[str, str]] = {"k": "stiffness", "theta0": "rest position"}
     slope: Scalar
     """Stiffness at zero [N m/rad]."""
     moment: Scalar
@@ -80,8 +82,10 @@ class Cogging(PlaceEffect):
     """amplitude sin(k theta_j + phase), and an overtone of twice k: detents are seldom pure."""
 
     name: ClassVar[str] = "cogging"
+    meaning: ClassVar[str] = "A torque that repeats with the angle, as from magnets or gear teeth."
     confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
+    words: ClassVar[dict[str, str]] = {"amplitude": "amplitude", "k": "periods per turn", "phase": "phase"}
     sine: Scalar
     cosine: Scalar
     k: Scalar
@@ -123,8 +127,10 @@ class TorqueOffset(JointEffect):
     """A constant torque; a learned friction map holds it."""
 
     name: ClassVar[str] = "torque_offset"
+    meaning: ClassVar[str] = "A constant torque at a joint."
     confirm: ClassVar[str] = "Let the unpowered joint settle from both sides and compare."
     units: ClassVar[dict[str, str]] = {"value": "N m"}
+    words: ClassVar[dict[str, str]] = {"value": "torque"}
     value: Scalar
 
     @classmethod
@@ -140,8 +146,10 @@ class HardStop(PlaceEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
     name: ClassVar[str] = "hard_stop"
+    meaning: ClassVar[str] = "A joint meets a stop."
     confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
+    words: ClassVar[dict[str, str]] = {"upper": "upper stop", "lower": "lower stop"}
     substeps: ClassVar[int] = 4
     linear: ClassVar[bool] = False
     upper: Scalar
@@ -186,8 +194,10 @@ class EddyBrake(JointEffect):
     """-c cos^2(theta_j - center) w_j."""
 
     name: ClassVar[str] = "eddy_brake"
+    meaning: ClassVar[str] = "A brake that works at some angles, as by a magnet."
     confirm: ClassVar[str] = "Let the joint coast through a turn at one speed and look where it slows."
     units: ClassVar[dict[str, str]] = {"c": "N m s/rad", "center": "rad"}
+    words: ClassVar[dict[str, str]] = {"c": "largest damping", "center": "strongest at"}
     even: Scalar
     """c cos(2 center)."""
     odd: Scalar

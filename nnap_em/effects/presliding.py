@@ -16,8 +16,10 @@ class PreslidingFriction(JointEffect):
     """
 
     name: ClassVar[str] = "presliding_friction"
+    meaning: ClassVar[str] = "Friction with memory: before it slides, the joint gives like a spring."
     confirm: ClassVar[str] = "Push the joint at rest with a small torque and see whether it springs back."
     units: ClassVar[dict[str, str]] = {"sigma0": "N m/rad"}
+    words: ClassVar[dict[str, str]] = {"sigma0": "stiffness"}
     memory: ClassVar[int] = 1
     linear: ClassVar[bool] = False
     log_sigma: Scalar

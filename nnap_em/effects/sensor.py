@@ -14,6 +14,7 @@ class SensorBias(SensorEffect):
     """value + bias."""
 
     name: ClassVar[str] = "sensor_bias"
+    meaning: ClassVar[str] = "A sensor is off by a constant."
     confirm: ClassVar[str] = "Bring the joint to a known position and read the sensor."
     units: ClassVar[dict[str, str]] = {"bias": "unit of the channel"}
     bias: Scalar
@@ -36,8 +37,10 @@ class SensorScale(SensorEffect):
     """scale value."""
 
     name: ClassVar[str] = "sensor_scale"
+    meaning: ClassVar[str] = "A sensor reads too large or too small, in a fixed proportion."
     confirm: ClassVar[str] = "Move the joint by a known angle and compare."
     units: ClassVar[dict[str, str]] = {"scale": "-"}
+    words: ClassVar[dict[str, str]] = {"scale": "reading / value"}
     excess: Scalar
     """scale - 1."""
 
@@ -56,6 +59,7 @@ class SensorDelay(SensorEffect):
     """The value some time ago."""
 
     name: ClassVar[str] = "sensor_delay"
+    meaning: ClassVar[str] = "A sensor reports late."
     confirm: ClassVar[str] = "Tap the link and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     above_zero: ClassVar[str] = "delay"
@@ -77,6 +81,7 @@ class SensorQuantization(SensorEffect):
     """
 
     name: ClassVar[str] = "sensor_quantization"
+    meaning: ClassVar[str] = "A sensor reads in steps."
     confirm: ClassVar[str] = "Look up the counts per turn of the encoder."
     units: ClassVar[dict[str, str]] = {"step": "unit of the channel"}
     read_off: ClassVar[bool] = True

@@ -47,8 +47,10 @@ class JointFlexibility(Transmission):
     """An elastic transmission of stiffness k."""
 
     name: ClassVar[str] = "joint_flexibility"
+    meaning: ClassVar[str] = "The transmission between motor and joint gives elastically."
     confirm: ClassVar[str] = "Block the link and twist the motor: the angle per torque."
     units: ClassVar[dict[str, str]] = {"k": "N m/rad"}
+    words: ClassVar[dict[str, str]] = {"k": "stiffness"}
     substeps: ClassVar[int] = 5
     log_k: Scalar
     log_inertia: Scalar
@@ -77,8 +79,10 @@ class Backlash(Transmission):
     """Play of width gap, with a stiff contact at either side."""
 
     name: ClassVar[str] = "backlash"
+    meaning: ClassVar[str] = "Play between motor and joint."
     confirm: ClassVar[str] = "Block the motor and wiggle the link."
     units: ClassVar[dict[str, str]] = {"gap": "rad"}
+    words: ClassVar[dict[str, str]] = {"gap": "play"}
     above_zero: ClassVar[str] = "gap"
     substeps: ClassVar[int] = 10
     gap: Scalar

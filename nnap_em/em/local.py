@@ -24,19 +24,19 @@ def local(
     prepared = prepare(model, seq)
     affine = rows(lambda state, u: linearise(model, state, u), path, prepared.inputs)
     reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(path.mean, prepared.inputs)
-    by_force, by_parameter, feels, of_reading = _sensitivities(model, prior, path, seq, prepared.inputs)
-    return Local(prepared, affine, reading, by_force, by_parameter, of_reading, feels)
+    return Local(prepared, affine, reading, *_sensitivities(model, prior, path, seq, prepared.inputs))
 
 
 def _sensitivities(
     model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, seq: Dataset, inputs: Inputs
 ) -> tuple[
+    Float[Array, "time state"],
     Float[Array, "time state port"],
     Float[Array, "time state param"],
-    Float[Array, "time obs port"] | None,
     Float[Array, "time obs param"],
+    Float[Array, "time obs port"] | None,
 ]:
-    """Sensitivities of next state and reading to a force held over the step, and to the parameters."""
+    """The next state; sensitivities of it and the reading to a force held over the step and to the parameters."""
     value, held = prior.read(model), prior.held(model)
     free = np.flatnonzero(~held)
     ports = len(model.system.ports)
@@ -52,7 +52,8 @@ def _sensitivities(
             return changed.transition(x, u, z[:ports]), changed.emission(x, u, z[:ports])
 
         def along(dz, du):
-            return jax.jvp(both, (z, u), (dz, du))[1]
+            (ahead, _), tangents = jax.jvp(both, (z, u), (dz, du))
+            return ahead, tangents
 
         def pushed(p):
             changed = prior.write(model, value.at[held].set(p))
@@ -60,7 +61,8 @@ def _sensitivities(
             nothing = jnp.zeros(0, x.dtype)
             return sum((e.force(scene, nothing) for e in changed.effects if e.held), still)
 
-        moved, read = jax.vmap(along, in_axes=(0, -1), out_axes=-1)(jnp.eye(z.shape[0], dtype=z.dtype), by_z)
+        unit = jnp.eye(z.shape[0], dtype=z.dtype)
+        ahead, (moved, read) = jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(unit, by_z)
         by_force, feels = moved[:, :ports], read[:, :ports] if model.system.senses_push else None
         by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, ports:])
         of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, ports:])
@@ -69,7 +71,7 @@ def _sensitivities(
             push = jax.jacfwd(pushed)(value[held])
             by_parameter = by_parameter.at[:, held].set(by_force @ push)
             of_reading = of_reading if feels is None else of_reading.at[:, held].set(feels @ push)
-        return by_force, by_parameter, feels, of_reading
+        return ahead, by_force, by_parameter, of_reading, feels
 
     return rows(row, path, inputs, by_z)
 

@@ -18,6 +18,8 @@ class Local(NamedTuple):
     seq: Prepared
     affine: Affine
     reading: Reading
+    ahead: Float[Array, "*time state"]
+    """The next state."""
     by_force: Float[Array, "*time state port"]
     """Sensitivity of the next state to a force held over the step."""
     by_parameter: Float[Array, "*time state param"]

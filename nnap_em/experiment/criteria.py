@@ -20,23 +20,20 @@ class Information(NamedTuple):
     contrasts: tuple[Contrast, ...] = ()
 
     def __add__(self, other: "Information") -> "Information":  # type: ignore[override]
-        pairs = zip(self.contrasts, other.contrasts, strict=True)
-        both = (Contrast(*(a + b for a, b in zip(one, two, strict=True))) for one, two in pairs)
-        return Information(self.information + other.information, tuple(both))
+        return jax.tree.map(np.add, self, other)
 
     def times(self, amount: float) -> "Information":
         """The information `times` as large."""
         return jax.tree.map(lambda a: amount * a, self)
 
-    def of(self, which) -> "Information":
-        """Some of the proposals."""
-        return Information(self.information[which], tuple(Contrast(*(a[which] for a in c)) for c in self.contrasts))
-
     def sum(self) -> "Information":
         """All together."""
-        return Information(
-            self.information.sum(axis=0), tuple(Contrast(*(a.sum(axis=0) for a in c)) for c in self.contrasts)
-        )
+        return jax.tree.map(lambda a: a.sum(axis=0), self)
+
+
+def some(tree, which):
+    """Some of the proposals along the first axis of all arrays of a tree."""
+    return jax.tree.map(lambda a: a[which], tree)
 
 
 def after(cov: Float[np.ndarray, "phi phi"], information) -> Float[np.ndarray, "*proposal phi phi"]:

@@ -14,7 +14,7 @@ from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
-from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share
+from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share, some
 from .information import Fit, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
@@ -224,13 +224,10 @@ def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log)
         proposal.shape[~ok, :, -1] *= LIMIT_FACTOR
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
-    _, each = evaluated(setup, _padded(proposal, effort.batch), effort.few)
-    return Plan(proposal, each.of(np.arange(len(proposal.family)))), trials
-
-
-def _padded(proposal: Proposal, batch: int) -> Proposal:
-    """Batch padded to the number played at once: one program serves."""
-    return Proposal(*(a[np.arange(batch) % len(a)] for a in proposal))
+    count = len(proposal.family)
+    padded = some(proposal, np.arange(effort.batch) % count)  # as many as are played at once: one program serves
+    _, each = evaluated(setup, padded, effort.few)
+    return Plan(proposal, some(each, np.arange(count))), trials
 
 
 def _row_of_logs(setup: Setup, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:

@@ -14,7 +14,7 @@ from ..data.dataset import Dataset
 from ..fit.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
-from .criteria import AbstractCriterion, Information
+from .criteria import AbstractCriterion, Information, some
 from .information import Contrast, Fit, contrast, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
@@ -101,9 +101,9 @@ def search(
     for _ in range(count):  # greedily: what the next one adds to those that are chosen
         costs = criterion.cost(pool.expected if total is None else total + pool.expected)
         chosen.append(int(np.argmin(np.nan_to_num(costs, nan=np.inf))))
-        added = pool.expected.of(chosen[-1])
+        added = some(pool.expected, chosen[-1])
         total = added if total is None else total + added
-    plan = _of(pool, np.asarray(chosen))
+    plan = some(pool, np.asarray(chosen))
     log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
     for number in range(effort.rounds):
         if float(criterion.cost(plan.expected.sum())) <= criterion.least:
@@ -123,7 +123,7 @@ def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, lo
     plans, waiting = [], drawn(rng, effort.batch, inputs, states)
     for _ in range(effort.tries):
         ok, expected = evaluated(setup, waiting, effort.few)
-        plans.append(_of(Plan(waiting, expected), ok))
+        plans.append(some(Plan(waiting, expected), ok))
         have = sum(len(plan.proposal.family) for plan in plans)
         log(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
@@ -147,22 +147,18 @@ def _bettered(
     """Every sequence replaced by the best of some like it, where that is better."""
     count = len(plan.proposal.family)
     place = np.arange(effort.batch) % count
-    other = mutated(rng, Proposal(*(a[place] for a in plan.proposal)), reach)
+    other = mutated(rng, some(plan.proposal, place), reach)
     ok, expected = evaluated(setup, other, effort.few)
     for slot in range(count):
         mine = np.flatnonzero(ok & (place == slot))
-        remainder = _of(plan, np.arange(count) != slot).expected.sum()
-        costs = criterion.cost(remainder + expected.of(np.append(mine, 0)))[: len(mine)]
+        remainder = some(plan, np.arange(count) != slot).expected.sum()
+        costs = criterion.cost(remainder + some(expected, np.append(mine, 0)))[: len(mine)]
         current = float(criterion.cost(plan.expected.sum()))
         if len(mine) and np.nanmin(costs, initial=np.inf) < current:
             best = int(mine[np.nanargmin(costs)])
-            plan = _joined([_of(plan, np.arange(count) < slot), _of(Plan(other, expected), np.asarray([best])),
-                            _of(plan, np.arange(count) > slot)])  # fmt: skip
+            plan = _joined([some(plan, np.arange(count) < slot), some(Plan(other, expected), np.asarray([best])),
+                            some(plan, np.arange(count) > slot)])  # fmt: skip
     return plan
-
-
-def _of(plan: Plan, which) -> Plan:
-    return Plan(Proposal(*(a[which] for a in plan.proposal)), plan.expected.of(which))
 
 
 def _joined(plans: list[Plan]) -> Plan:

@@ -1,12 +1,12 @@
 """A fitted model as one file: loading gives the same numbers to the last bit.
 
-The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the rig, the
-settings and the plain numbers.  No code is stored; loading builds the model anew from the rig and puts the numbers in.
+The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the rig and
+the plain values.  No code is stored; loading builds the model anew from the rig and puts the numbers in.
 """
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,14 +24,14 @@ from ..model.dynamic_friction import DynamicFriction
 from ..numerics.digest import plain
 from ..smoother import kinds
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
-from ..storage.leaves import describe, name_of, restore, tuples
+from ..storage.leaves import describe, name_of, restore, tuples, walk
 from ..systems import systems
 from .identify import Identified, begin
 
 _GIVE = "give the model.npz that `nnap-em identify` wrote"
 MODEL_KIND = Kind(
     "nnap_em fitted model",
-    3,  # 1 had the precision of the network's weights in place of that of torques, 2 other names in the M-step
+    4,
     "model",
     _GIVE,
     f"{_GIVE}, from a copy that is whole",
@@ -91,7 +91,6 @@ def save(
     path = Path(path)
     arrays: dict[str, np.ndarray] = {}
     leaves: dict[str, dict[str, Any]] = {}
-    settings: dict[str, Any] = {}
 
     def leaf(place: str, value: Any) -> Any:
         try:
@@ -102,18 +101,12 @@ def save(
             arrays[place] = array
         return value
 
-    def setting(place: str, value: Any) -> Any:
-        if plain(value):
-            settings[place] = value
-        return value
-
-    _rebuild(_tree(fitted), "", leaf, setting)
+    walk(_tree(fitted), leaf)
     header = {
         "rig": dataclasses.asdict(fitted.rig),
         "effects": [_sketch(path, effect) for effect in fitted.model.effects],
         "smoother": _sketch(path, fitted.smoother),
         "leaves": leaves,
-        "settings": settings,
         "fingerprint": fingerprint,
         "notes": dict(notes or {}),
     }
@@ -157,35 +150,12 @@ def _tree(fitted: Identified) -> dict[str, Any]:
     return {name: value for name, value in fitted._asdict().items() if name != "rig"}
 
 
-def _rebuild(node: Any, place: str, leaf: Callable[[str, Any], Any], setting: Callable[[str, Any], Any]) -> Any:
-    """A copy of `node`, with `leaf` applied to its arrays and numbers and `setting` to its static fields."""
-    if isinstance(node, eqx.Module):
-        rebuilt = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
-        for field in dataclasses.fields(node):
-            child, value = f"{place}/{field.name}", getattr(node, field.name)
-            static = field.metadata.get("static", False)
-            object.__setattr__(
-                rebuilt, field.name, setting(child, value) if static else _rebuild(value, child, leaf, setting)
-            )
-        return rebuilt
-    if isinstance(node, Mapping):
-        return {name: _rebuild(value, f"{place}/{name}", leaf, setting) for name, value in node.items()}
-    names = getattr(node, "_fields", None)
-    if isinstance(node, tuple) and names is not None:
-        named = zip(names, node, strict=True)
-        return type(node)(*(_rebuild(value, f"{place}/{name}", leaf, setting) for name, value in named))
-    if isinstance(node, tuple | list):
-        return type(node)(_rebuild(value, f"{place}/{i}", leaf, setting) for i, value in enumerate(node))
-    return leaf(place, node)
-
-
 def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Identified:
     """The model that `header` and `arrays` describe, on the skeleton that its rig gives."""
     rig = _rig(header["rig"])
     if rig.system not in systems:
         refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
     leaves: Mapping[str, Any] = header["leaves"]
-    settings = header["settings"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
@@ -211,18 +181,12 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
             differs(place, "of another shape" if array is not None else "no array in the file")
         return restore(leaves[place], array, value)
 
-    def setting(place: str, value: Any) -> Any:
-        seen.add(place)
-        if plain(value) != (place in settings):
-            differs(place, "a setting that only one of the two has")
-        return tuples(settings[place]) if place in settings else value
-
     known = {kind.__name__: kind for kind in (*catalogue.values(), *parts, DynamicFriction)}
     effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header["effects"])
     tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
     tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
-    tree = _rebuild(tree, "", leaf, setting)
-    for place in (*leaves, *settings):
+    tree = walk(tree, leaf)
+    for place in leaves:
         if place not in seen:
             differs(place, "unknown here")
     return Identified(rig=rig, **tree)

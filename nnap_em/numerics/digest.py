@@ -22,6 +22,17 @@ def is_key(value: Any) -> TypeGuard[jax.Array]:
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
+def parts(node: Any) -> dict[str, Any] | None:
+    """The children of a node of a tree by their names; None for a leaf."""
+    if dataclasses.is_dataclass(node) and not isinstance(node, type):
+        return {field.name: getattr(node, field.name) for field in dataclasses.fields(node)}
+    if isinstance(node, Mapping):
+        return dict(node)
+    if isinstance(node, tuple | list):
+        return dict(zip(getattr(node, "_fields", map(str, range(len(node)))), node, strict=True))
+    return None
+
+
 def full_name(code: Any) -> str:
     """Module and name of a class or function."""
     return f"{code.__module__}.{code.__qualname__}"
@@ -38,16 +49,9 @@ def digest(*trees: Any, name: Callable[[Any], str] = full_name) -> str:
         sha256.update(f"{text}\0".encode() + content)
 
     def walk(node: Any) -> None:
-        kind, parts = type(node), None
-        if dataclasses.is_dataclass(node) and not isinstance(node, type):
-            parts = {field.name: getattr(node, field.name) for field in dataclasses.fields(node)}
-        elif isinstance(node, Mapping):
-            parts = node
-        elif isinstance(node, tuple | list):
-            parts = dict(enumerate(node))
-        if parts is not None:
-            feed(f"{name(kind)}{list(parts)}")
-            for part in parts.values():
+        if (inside := parts(node)) is not None:
+            feed(f"{name(type(node))}{list(inside)}")
+            for part in inside.values():
                 walk(part)
         elif is_key(node):
             feed(str(jax.random.key_impl(node)), np.asarray(jax.random.key_data(node)).tobytes())
@@ -59,7 +63,7 @@ def digest(*trees: Any, name: Callable[[Any], str] = full_name) -> str:
         elif callable(node) and hasattr(node, "__qualname__"):
             feed(name(node))
         else:
-            raise TypeError(f"{full_name(kind)} cannot be distinguished from another of its kind")
+            raise TypeError(f"{full_name(type(node))} cannot be distinguished from another of its kind")
 
     walk(trees)
     return sha256.hexdigest()

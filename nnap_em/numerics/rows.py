@@ -15,8 +15,8 @@ ROWS_AT_ONCE = 32
 def rows(function: Callable, path: Gaussian, *trees: Any) -> Any:
     """`jax.vmap(function)(path, *trees)` along the first axis, in blocks of nearly `ROWS_AT_ONCE`.
 
-    All at once beyond `WIDE` states, where little is gained: at six joints with a body on top a program in blocks took
-    22 GB and a quarter of an hour to compile.
+    All at once beyond `MOST_UNROLLED` states, where little is gained: at six joints with a body on top a program in
+    blocks took 22 GB and a quarter of an hour to compile.
     """
     length, states = path.mean.shape
     if states > MOST_UNROLLED:

@@ -5,7 +5,7 @@ filter up to the start and of the open loop from there on, so that the errors ar
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -105,54 +105,44 @@ class Followed(NamedTuple):
 
 def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Followed:
     """`model` along the paths of all sequences."""
-    linear, exact = _wide(model, prior, path, data)
+    linear = _wide(model, prior, path, data)
     state, gain = each(_filtered, (model.log_q, model.log_r, model.start), linear)
-    return Followed(model, data, linear, 0.5 * (path.mean + exact), state, gain)
+    return Followed(model, data, linear, 0.5 * (path.mean + linear.ahead), state, gain)
 
 
 def open_loop(
     along: Followed,
     weights: Weights,
-    extra: Callable[[Int[np.ndarray, " sequence"]], Iterable[Columns]] | None = None,
+    extra: Callable[[Int[np.ndarray, " sequence"]], Columns] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
+    error: Float[np.ndarray, "seq start horizon obs"] | None = None,
 ) -> OpenLoop:
-    """Multi-step errors of all sequences and their derivatives; `extra` returns further columns, in blocks.
-
-    It takes indices of sequences: columns of all sequences, or of all candidates at six joints, would be gigabytes.
-    """
+    """Multi-step errors, or `error` where it is known, and their derivatives; `extra` gives columns by sequences."""
     (rows, obs), ports = along.data.y.shape[1:], len(along.model.system.ports)
-    grid = _grid(along.model, along.data, horizons)
-
-    def none(indices) -> Iterable[Columns]:
-        yield Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))
-
-    columns, see = [], channels(along.model)
+    grid, see, out = _grid(along.model, along.data, horizons), channels(along.model), []
+    none = lambda indices: Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))  # noqa: E731
     for indices, part in batches(len(along.state), along.linear, along.gain, along.middle):
-        blocks: list[np.ndarray] = []
-        for block in (extra or none)(indices):
-            sens = np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, block), together=1))[..., see, :]
-            estimated = sens.shape[-1] - block.force.shape[1]
-            blocks.append(sens[..., estimated if blocks else 0 :])  # those of what is estimated once
-        columns.append(np.concatenate(blocks, axis=-1))
-    overlap = np.asarray(grid.ages) / grid.stride
-    return OpenLoop(errors(along, horizons), np.concatenate(columns)[: len(along.state)], overlap)
+        every = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(indices)), together=1)
+        out.append(np.asarray(every)[..., see, :])
+    columns, overlap = np.concatenate(out)[: len(along.state)], np.asarray(grid.ages) / grid.stride
+    return OpenLoop(errors(along, horizons) if error is None else error, columns, overlap)
 
 
 def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
     """The errors alone [rad, or m]; NaN where there is none."""
-    grid = _grid(along.model, along.data, horizons)
-    error = each(_errors, (along.model, grid), (along.state, along.linear.seq))
-    return np.asarray(error)[..., channels(along.model)]
+    grid, rows = _grid(along.model, along.data, horizons), along.state.shape[1]
+    ages = np.pad(grid.ages, (0, max(0, len(HORIZONS + SHORT_HORIZONS) - len(grid.ages))), mode="edge")
+    numbers = along.model, jnp.arange(grid.stride, rows, grid.stride), jnp.asarray(ages)  # one program for all horizons
+    error = np.asarray(each(_errors, numbers, (along.state, along.linear.seq)))
+    return error[:, : len(grid.starts(rows)), : len(grid.ages), channels(along.model)]
 
 
 def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
     return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons, model.pace)
 
 
-def _wide(
-    model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset
-) -> tuple[Local, Float[Array, "seq time state"]]:
-    """The model along its paths, with slopes as wide as predictions err, through the exact transition; and that."""
+def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Local:
+    """The model along its paths, with slopes as wide as predictions err, through the exact transition."""
     dof, states = len(model.system.coordinates), len(model.system.states)
     rates = jnp.where(data.valid[..., None], path.mean[..., dof:states], jnp.nan)
     if dof:
@@ -163,15 +153,9 @@ def _wide(
     spread = jnp.concatenate([*spread, jnp.full(path.mean.shape[-1] - states, 1e-6)])
     wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
     linear = locals_along(model, prior, wide, data, CUBATURE)
-    exact = each(_exact, model, (path.mean, linear.seq.inputs))
-    offset = exact - jnp.einsum("stij,stj->sti", linear.affine.matrix, path.mean)
+    offset = linear.ahead - jnp.einsum("stij,stj->sti", linear.affine.matrix, path.mean)
     affine = linear.affine._replace(offset=offset, noise=jnp.zeros_like(linear.affine.noise))
-    return linear._replace(affine=affine), exact
-
-
-def _exact(model: StateSpaceModel, one) -> Float[Array, "time state"]:
-    """The transition along a path."""
-    return jax.vmap(model.transition)(*one)
+    return linear._replace(affine=affine)
 
 
 def _filtered(common, linear: Local):
@@ -182,18 +166,21 @@ def _filtered(common, linear: Local):
 
 
 def _errors(common, one) -> Float[Array, "start horizon obs"]:
-    """Open-loop errors of one sequence."""
-    (model, grid), (state, seq) = common, one
-    starts = grid.starts(state.shape[0])
-    row = lambda k: jax.tree.map(lambda a: a[k], seq.inputs)  # noqa: E731
+    """Open-loop errors of one sequence some rows after every start; of what ends beyond it, no matter what."""
+    (model, starts, ages), (state, seq) = common, one
+    at = lambda a, k: a[jnp.minimum(k, len(state) - 1)]  # noqa: E731
+    row = lambda k: jax.tree.map(lambda a: at(a, k), seq.inputs)  # noqa: E731
 
-    def step(x, h):
+    def step(h, carry):
+        x, read = carry
         x = jax.vmap(model.transition)(x, row(starts + h))
-        return x, jax.vmap(model.emission)(x, row(starts + h + 1))
+        seen = jax.vmap(model.emission)(x, row(starts + h + 1))
+        return x, jnp.where((ages == h + 1)[:, None, None], seen, read)
 
-    _, read = jax.lax.scan(step, state[starts], jnp.arange(grid.ages[-1]))
+    nothing = jnp.zeros((len(ages), len(starts), seq.y.shape[1]), state.dtype)
+    _, read = jax.lax.fori_loop(0, ages[-1], step, (state[starts], nothing))
     known = jnp.where(seq.observed, seq.y, jnp.nan)
-    return jnp.stack([known[starts + age] - read[age - 1] for age in grid.ages], axis=1)
+    return jnp.moveaxis(at(known, starts[None] + ages[:, None]) - read, 0, 1)
 
 
 def sensitivities(

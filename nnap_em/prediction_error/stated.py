@@ -75,7 +75,7 @@ def widened(
     weights = m_step.weights(model)
     other = discrepancy_columns(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
-    predictions = open_loop(along, weights, lambda indices: [jax.tree.map(lambda a: a[indices], other)])
+    predictions = open_loop(along, weights, lambda indices: jax.tree.map(lambda a: a[indices], other))
     prior = np.asarray(weights.prior_precision(model.unknown))
     errors, scores = _rows(predictions, weighed(predictions, used), len(prior))
     information = prior + errors.own.T @ (errors.weight[:, None] * errors.own)

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..comparison.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Number
 from ..comparison.pooling import JointTest, Pooled
 from ..numerics.digits import number, with_std
-from ..storage.files import replace_text
-from .compare_plots import comparison_figure
 from .document import versions
-from .page import Picture, picture, rendered
-from .tables import write_json
+from .page import Picture, picture, rendered, write_report
+from .style import BLUE, GREEN, PURPLE, TRUTH, VERMILION, band, head, limits, styled, symbol
 from .wording import p_value
 
 SHOWN = 5
@@ -28,17 +27,10 @@ LEGEND = (
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
     """Write compare.json and compare.html into the folder `out`."""
-    named = comparison.fits[0].fitted.rig.named
-    document = describe(comparison)
-    write_json(out / "compare.json", document, named)
-    text = rendered(
-        "compare.html.j2",
-        document=document,
-        rows=rows(comparison),
-        legend=LEGEND,
-        pictures=[_picture(comparison, curve) for curve in comparison.curves],
-    )
-    replace_text(out / "compare.html", named(text))
+    document, pictures = describe(comparison), [_picture(comparison, curve) for curve in comparison.curves]
+    content = {"document": document, "rows": rows(comparison), "legend": LEGEND, "pictures": pictures}
+    text = rendered("compare.html.j2", **content)
+    write_report(out, "compare", document, text, comparison.fits[0].fitted.rig.named)
 
 
 # --- in numbers
@@ -52,8 +44,8 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         "rig": rig.name,
         "system": rig.system,
         "verdict": comparison.verdict,
-        "cause": None if comparison.cause is None else comparison.cause._asdict(),
-        "changed": list(comparison.changed),
+        "cause": comparison.cause,
+        "changed": comparison.changed,
         "level": CHANGED,
         "least_shared": LEAST_SHARED,
         "fits": [
@@ -61,8 +53,8 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         ],
         "friction": [_curve(curve, names) for curve in comparison.curves],
         "numbers": [_number(each, names) for each in comparison.numbers],
-        "differences": list(comparison.differences),
-        "warnings": list(comparison.warnings),
+        "differences": comparison.differences,
+        "warnings": comparison.warnings,
         "versions": versions(),
     }
 
@@ -76,10 +68,10 @@ def _curve(curve: Curve, names: Sequence[str]) -> dict[str, Any]:
     return {
         "joint": curve.joint,
         "units": {"velocity": curve.units[0], "torque": curve.units[1]},
-        "velocity": curve.velocity.tolist(),
-        "fits": {names[i]: {"torque": t.tolist(), "std": s.tolist(), "cov": c.tolist()} for i, t, s, c in fits},
-        "pooled": {part: np.asarray(values).tolist() for part, values in curve.pooled._asdict().items()},
-        "test": _test(curve.test),
+        "velocity": curve.velocity,
+        "fits": {names[i]: {"torque": t, "std": s, "cov": c} for i, t, s, c in fits},
+        "pooled": curve.pooled,
+        "test": curve.test,
         "changed": curve.changed,
         "law": [_number(each, names) | {"changed": each in curve.parts} for each in curve.law],
     }
@@ -92,13 +84,9 @@ def _number(each: Number, names: Sequence[str]) -> dict[str, Any]:
         "unit": each.unit,
         "fits": {name: {"value": value, "std": std} for name, value, std in rows if math.isfinite(value)},
         "pooled": {part: float(values[0]) for part, values in each.pooled._asdict().items()},
-        "test": None if each.test is None else _test(each.test),
+        "test": each.test,
         "changed": each.changed,
     }
-
-
-def _test(test: JointTest) -> dict[str, Any]:
-    return test._asdict()
 
 
 # --- in a table
@@ -186,3 +174,36 @@ def _picture(comparison: Comparison, curve: Curve) -> Picture:
     caption = "With 90 % bands, on the velocities that all fits visited; below, the same minus the pooled curve."
     title = f"{curve.name[0].upper()}{curve.name[1:]}"
     return picture("found", title, caption, comparison_figure(comparison, curve))
+
+
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, "#56B4E9", "#E69F00")
+"""Colours of the fits, in their order; more fits than colours begin again."""
+
+
+@styled
+def comparison_figure(comparison: Comparison, curve: Curve) -> Figure:
+    """Curves with their bands, their differences from the pooled curve, and the velocities that each fit visited."""
+    colours = [COLOURS[i % len(COLOURS)] for i in curve.fits]
+    figure = Figure(figsize=(6.6, 5.6 + 0.2 * len(curve.fits)), layout="constrained")
+    heights = (1.0, 0.7, 0.04 + 0.05 * len(curve.fits))
+    above, difference, below = figure.subplots(3, 1, sharex=True, height_ratios=heights)
+    for i, colour, torque, std in zip(curve.fits, colours, curve.torque, curve.std, strict=True):
+        for ax, mean in ((above, torque), (difference, torque - curve.pooled.value)):
+            band(ax, curve.velocity, mean, std, colour, comparison.fits[i].name)
+            ax.collections[-1].set_label("_")  # the caption explains the bands
+    above.plot(curve.velocity, curve.pooled.value, color=TRUTH, lw=1.0, ls="--", label="pooled")
+    above.set_ylim(*limits(list(curve.torque), 0.2))
+    above.set_ylabel(f"friction [{curve.units[1]}]")
+    difference.set_ylim(*limits(list(curve.torque - curve.pooled.value), 0.5))
+    difference.set_ylabel(f"minus pooled [{curve.units[1]}]")
+    for ax in (above, difference):
+        ax.axhline(0, color="#BBBBBB", lw=0.8, zorder=0)
+    for row, (i, colour) in enumerate(zip(curve.fits, colours, strict=True)):
+        low, high = comparison.fits[i].velocity[curve.joint - 1]
+        below.plot([low, high], [-row, -row], color=colour, lw=4, solid_capstyle="butt")
+    below.set_yticks(-np.arange(len(curve.fits)), [comparison.fits[i].name for i in curve.fits])
+    below.set_ylim(0.6 - len(curve.fits), 0.6)
+    rate = comparison.fits[0].fitted.model.system.rates[curve.joint - 1]
+    below.set_xlabel(f"velocity {symbol(rate)} [{curve.units[0]}]; bars: visited by each fit")
+    head(figure, f"Friction of joint {curve.joint}", [above])
+    return figure

@@ -47,10 +47,8 @@ class Contact(NamedTuple):
 
     def document(self) -> dict[str, Any]:
         """The contact as report.json has it."""
-        numbers = {name: estimate._asdict() for name, estimate in self.parameters.items()}
-        loop = {"angle": np.asarray(self.loop.angle).tolist(), "torque": np.asarray(self.loop.torque).tolist()}
-        loop["std"] = self.std.tolist()
-        return {"joint": self.joint, "parameters": numbers, "text": self.text, "hysteresis": loop}
+        loop = {"angle": self.loop.angle, "torque": self.loop.torque, "std": self.std}
+        return {"joint": self.joint, "parameters": self.parameters, "text": self.text, "hysteresis": loop}
 
 
 def contacts(fitted: Identified) -> list[Contact]:

@@ -1,10 +1,13 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy import stats
 
 from ..data.formats import write_csv
@@ -12,13 +15,11 @@ from ..diagnosis.keys import key_of, listed, words
 from ..experiment.criteria import Information, after
 from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
-from ..residual.residual import names_of
-from ..storage.files import replace_text
+from ..residual.residual import Names, names_of
 from ..storage.log import Log
-from .design_plots import bands_figure, motion_figure
 from .document import versions
-from .page import Picture, picture, rendered
-from .tables import write_json
+from .page import Picture, picture, rendered, write_report
+from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styled, symbol
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
@@ -39,10 +40,8 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
         "seconds": time.perf_counter() - began,
         "versions": versions(),
     }
-    named = design.fitted.rig.named
-    write_json(out / "design.json", document, named)
     text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
-    replace_text(out / "design.html", named(text))
+    write_report(out, "design", document, text, design.fitted.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUT_DIR}")
 
@@ -117,12 +116,8 @@ def friction_entries(design: Design) -> list[dict[str, Any]]:
         seen = weight[j] > 0
         near = seen & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
-        curves = {f"std_{side}": std[j][seen].tolist() for side, std in stds.items()}
-        out.append(
-            {"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms}
-            | {"velocity": v[seen].tolist()}
-            | curves
-        )
+        curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}
+        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms} | curves)
     return out
 
 
@@ -216,3 +211,67 @@ def _pictures(design: Design, document: dict[str, Any]) -> list[Picture]:
         title = f"Sequences {which[0] + 1} to {which[-1] + 1}"
         out.append(picture("error", title, caption, motion_figure(design, names, which)))
     return out
+
+
+@styled
+def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
+    """Standard deviation against velocity, a panel for each joint; `friction` as in design.json."""
+    figure = Figure(figsize=(max(4.4, 3.8 * min(len(friction), 4)), 3.4 * -(-len(friction) // 4)), layout="constrained")
+    (grid,) = panels(figure, len(friction))
+    sides = {
+        "std_now": (BEFORE, "now"),
+        "std_same_time_of_old_inputs": (READING, "old inputs"),
+        "std_expected": (AFTER, "designed"),
+    }
+    for ax, entry, rate in zip(grid, friction, names.rates, strict=True):
+        for side, (colour, label) in sides.items():
+            ax.plot(entry["velocity"], entry[side], color=colour, label=label)
+        ax.set_xscale("symlog", linthresh=entry["near_rest_below"])
+        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= entry["near_rest_below"]])
+        ax.set_yscale("log")
+        ax.axvspan(
+            -entry["near_rest_below"], entry["near_rest_below"], color="#F1F1F1", lw=0, zorder=0, label="near rest"
+        )
+        ax.set(
+            xlabel=f"velocity {symbol(rate)} [{names.unit(rate)}]",
+            ylabel=f"std of friction [{names.force_unit(entry['joint'])}]",
+        )
+        ax.set_title(names.joint(entry["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
+    head(figure, "How well friction is known", list(grid))
+    return figure
+
+
+@styled
+def motion_figure(design: Design, names: Names, which: Sequence[int]) -> Figure:
+    """Inputs and coordinates of some sequences, one below the other."""
+    inputs, states = design.fitted.rig.input_columns, names.coordinates
+    rows = len(inputs) + 2 * len(states)
+    figure = Figure(figsize=(3.3 * max(len(which), 2), 0.6 + 1.35 * rows), layout="constrained")
+    grid = figure.subplots(rows, len(which), sharex=True, sharey="row", squeeze=False)
+    for column, i in enumerate(which):
+        for k, ax in enumerate(grid[: len(inputs), column]):
+            ax.step(design.t, design.u[i, :, k], where="post", color=ZERO_LINE, label="to be played")
+            _fence(ax, design.limits.low[k], design.limits.high[k], [design.u[..., k]])
+        for s, ax in enumerate(grid[len(inputs) :, column]):
+            low, middle, high = (band[i, :, s] for band in (design.low, design.middle, design.high))
+            ax.fill_between(design.t, low, high, color=AFTER, alpha=0.25, lw=0, label="98 % of motions")
+            ax.plot(design.t, middle, color=AFTER, label="expected")
+            _fence(ax, design.limits.lowest[s], design.limits.highest[s], [design.low[..., s], design.high[..., s]])
+        grid[0, column].set_title(f"Sequence {i + 1}")
+        grid[-1, column].set_xlabel("time [s]")
+    units = [names.force_unit(j) for j in design.fitted.model.system.joints] + [
+        names.unit(n) for n in (*states, *names.rates)
+    ]
+    for ax, name, unit in zip(grid[:, 0], (*inputs, *states, *names.rates), units, strict=True):
+        ax.set_ylabel(f"{symbol(name)} [{unit}]")
+    head(figure, "What to play, and what should happen", list(grid.ravel()))
+    return figure
+
+
+def _fence(ax: Axes, low: float, high: float, shown: Sequence[Any]) -> None:
+    """Limits as lines, where they are near what is shown."""
+    bottom, top = limits(shown, 0.3)
+    for edge in (low, high):
+        if bottom <= edge <= top:
+            ax.axhline(edge, color=BEFORE, ls="--", lw=0.9, label="limit")
+    ax.set_ylim(bottom, top)

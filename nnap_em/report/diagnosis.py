@@ -23,12 +23,10 @@ from ..residual.interventions import Intervention
 from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
-from .effect_plots import effect_figure, screen_figure
-from .error_plots import error_figure, prediction_figure
-from .friction_plots import friction_figure
+from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
 from .page import MOST_PICTURES, PICTURE_BYTES, Picture, picture, write_page
 from .residual_plots import innovation_figure, residual_figure
-from .tables import visited_nodes, write_friction, write_json
+from .tables import visited_nodes, write_friction
 
 
 @stage("report")
@@ -71,9 +69,9 @@ def write_diagnosis(
         outcome, far = changes(diagnosis, accepted, error, rivals, suspects), []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *(one.sentence for one in far)]),
-        "moved": [one._asdict() for one in far],
+        "moved": far,
         "complete": diagnosis.complete,
-        "since_fit": {"risen": diagnosis.risen and diagnosis.risen._asdict()} if diagnosis.change else None,
+        "since_fit": {"risen": diagnosis.risen} if diagnosis.change else None,
         "effects": [entry(f) for f in accepted],
         "interventions": [_disturbance(force, train.files) for force in diagnosis.interventions],
         "error": error,
@@ -84,14 +82,12 @@ def write_diagnosis(
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
-        "disagreements": [d._asdict() for d in disputed],
+        "disagreements": disputed,
         "undecided": [place_of(key) for key in rivals],
-        "suspects": [suspect._asdict() for suspect in suspects],
+        "suspects": suspects,
         "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
     }
-    named = diagnosis.before.rig.named
-    write_json(out / "report.json", document, named)
-    write_page(out, document, figures, named)
+    write_page(out, document, figures, diagnosis.before.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'report.html'} and report.json")
 

@@ -15,9 +15,9 @@ from ..data.logs import Logs
 from ..data.servo import TORQUE
 from ..diagnosis.hypothesis import covariances
 from ..effects.equations import UnknownTerm
+from ..fit.identifiability import identifiability, sentences
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
-from ..identifiability.identifiability import identifiability, sentences
 from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law
 from .tables import INNER
 
@@ -78,7 +78,7 @@ def unknown_terms(fitted: Identified) -> list[dict[str, Any]]:
     numbers = covariances(fitted.model, fitted.m_step, fitted.state.hessian)
     for effect, cov in zip(fitted.model.effects, numbers, strict=True):
         if isinstance(effect, UnknownTerm):
-            table = dict(zip(("places", "value", "std"), (a.tolist() for a in effect.table(cov)), strict=True))
+            table = dict(zip(("places", "value", "std"), effect.table(cov), strict=True))
             unit = system.port_unit(system.ports.index(str(effect.channel)) + 1)
             signals = {name: system.unit(name) for name in effect.reads}
             out.append({"name": effect.label, "enters": effect.channel, "signals": signals, "unit": unit} | table)

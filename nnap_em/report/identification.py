@@ -14,10 +14,10 @@ from ..data.logs import Logs
 from ..diagnosis.keys import listed
 from ..em.build import build_system
 from ..em.loop import STEP_REFUSED
+from ..fit.check import dynamics
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import misfits, moved
 from ..fit.predict import posterior_of
-from ..identifiability.check import dynamics
 from ..numerics.digits import counted
 from ..numerics.profile import stage
 from ..residual.residual import names_of
@@ -25,11 +25,9 @@ from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
-from .effect_plots import term_figure
-from .error_plots import error_figure
-from .friction_plots import friction_figure
+from .fit_plots import error_figure, friction_figure, term_figure
 from .page import Picture, picture, write_page
-from .tables import visited_nodes, write_friction, write_json
+from .tables import visited_nodes, write_friction
 from .wording import reached, sentence
 
 
@@ -82,7 +80,7 @@ def write_identification(
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), misfit),
         "misfit": misfit,
-        "moved": [one._asdict() for one in moved(fitted)],
+        "moved": moved(fitted),
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),
@@ -102,7 +100,6 @@ def write_identification(
         "model": "model.npz",
     }
     _log_summary(document, log)
-    write_json(out / "report.json", document, fitted.rig.named)
     write_page(out, document, figures, fitted.rig.named)
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
     return not misfit

@@ -10,12 +10,10 @@ from matplotlib.figure import Figure
 from ..comparison.monitor import Reference, Trend
 from ..fit.identify import Identified
 from ..numerics.digits import counted
-from ..storage.files import replace_text
 from ..storage.log import Log
 from .document import versions
-from .page import picture, rendered
+from .page import picture, rendered, write_report
 from .style import BLUE, READING, VERMILION, band, head, styled
-from .tables import write_json
 
 
 def write_monitor(
@@ -23,10 +21,11 @@ def write_monitor(
 ) -> None:
     """Write monitor.json and monitor.html into the folder `out`."""
     rows = found["recordings"]
-    alarm = None
-    if seen.alarm is not None:
-        at, since = (rows[i]["file"] for i in (seen.alarm.at, seen.alarm.since))
-        alarm = {"chart": seen.alarm.chart, "file": at, "since": since}
+    alarm = seen.alarm and {
+        "chart": seen.alarm.chart,
+        "file": rows[seen.alarm.at]["file"],
+        "since": rows[seen.alarm.since]["file"],
+    }
     numbers = zip(beside.names, beside.units, seen.value.T, seen.std.T, strict=True)
     document = {
         "format": 1,
@@ -36,22 +35,19 @@ def write_monitor(
         "changed": alarm is not None,
         "alarm": alarm,
         "threshold": seen.threshold,
-        "charts": {name: chart.tolist() for name, chart in seen.charts.items()},
-        "numbers": [{"name": n, "unit": u, "change": v.tolist(), "std": s.tolist()} for n, u, v, s in numbers],
+        "charts": seen.charts,
+        "numbers": [{"name": n, "unit": u, "change": v, "std": s} for n, u, v, s in numbers],
         **found,
         "versions": versions(),
     }
-    named = fitted.rig.named
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "monitor.json", document, named)
     caption = (
         "Above: multi-step errors of each recording over those of the fit on recordings left out. Below: the chart "
+        "that alarms at the dashed line, and every number as a change since the fit, with 90 % bands."
     )
-    caption += "that alarms at the dashed line, and every number as a change since the fit, with 90 % bands."
     pictures = [picture("found", "Trend", caption, trend_figure(document))]
     skipped = [f"{row['file']}: {row['reason']}" for row in rows if row["reason"]]
     text = rendered("monitor.html.j2", document=document, pictures=pictures, skipped=skipped)
-    replace_text(out / "monitor.html", named(text))
+    write_report(out, "monitor", document, text, fitted.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'monitor.html'} and monitor.json")
 
@@ -85,7 +81,7 @@ def trend_figure(document: Mapping[str, Any]) -> Figure:
     chart.set_ylim(0, 2 * document["threshold"])
     chart.set_ylabel("charts")
     for ax, each in zip(panels, numbers, strict=True):
-        band(ax, x, np.asarray(each["change"]), np.asarray(each["std"]), BLUE, each["name"])
+        band(ax, x, each["change"], each["std"], BLUE, each["name"])
         ax.axhline(0, color="#BBBBBB", lw=0.8)
         ax.set_title(f"{each['name']} [{each['unit']}]", fontsize=8)
     figure.axes[-1].set_xlabel("recording")

@@ -1,30 +1,31 @@
 """The report as one page: a single HTML file without scripts that fetches nothing.
 
-`document` is what report.json holds; any of its keys may be missing or null.  The page itself is page.html.j2.
+`document` is what the JSON file beside it holds.  Each command has a template; parts.html.j2 has what they share.
 """
 
 import base64
+import functools
 import io
 import itertools
 import re
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jinja2
 from matplotlib.figure import Figure
 
 from ..diagnosis.findings import growth
+from ..effects import catalogue
 from ..numerics.digits import finite, number
 from ..residual.statistics import FAILS
 from ..storage.files import replace_text
 from . import wording
-from .vocabulary import MEANINGS, WORDS
+from .tables import write_json
 from .wording import ratio, reached
 
-FIGURE_SECTIONS = ("found", "error", "residual", "details")
-"""Sections that figures may stand in."""
+Section = Literal["found", "error", "residual", "details"]
+"""Section of a page that a figure may stand in."""
 MOST_PICTURES, PICTURE_BYTES = 5, 900_000
 """Pictures to choose from under one title, and bytes of all of them, at most; the first is always there."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
@@ -38,7 +39,6 @@ decides, because nats are worth little where noise is not that of the
 model."""
 _PLACES = re.compile(rb'(?<=\s)(?:d|x|y)="[^"]*"')
 _DIGITS = re.compile(rb"(\.\d\d)\d+")
-_SVG_UNITS = {b"pt": 96 / 72, b"in": 96.0}
 
 
 class Picture(NamedTuple):
@@ -47,36 +47,31 @@ class Picture(NamedTuple):
     title: str
     caption: str
     image: bytes
-    """PNG or SVG."""
-    place: str = "residual"
-    """Section: "found", "error", "residual" or "details"."""
+    """SVG."""
+    place: Section = "residual"
     choice: str = ""
     """Name among the pictures of one title, of which the reader chooses one; empty: it stands alone."""
+    width: float = 0.0
+    """Width of the image [CSS px]; 0 where it is unknown."""
 
     @property
     def source(self) -> str:
         """The image as an address that holds it."""
-        return f"data:{_media(self)};base64,{base64.b64encode(self.image).decode('ascii')}"
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.image).decode('ascii')}"
 
     @property
     def style(self) -> str:
         """About its own size; wide ones scroll inside their box on a phone."""
-        width = _width(self.image)
-        least = round(0.72 * width) if width > 560 else 0
-        return f"min-width:{least}px;max-width:{round(1.1 * width)}px" if width else ""
+        least = round(0.72 * self.width) if self.width > 560 else 0
+        return f"min-width:{least}px;max-width:{round(1.1 * self.width)}px" if self.width else ""
 
 
-def picture(place: str, title: str, caption: str, figure: Figure, choice: str = "") -> Picture:
-    """A drawn figure for the page."""
+def picture(place: Section, title: str, caption: str, figure: Figure, choice: str = "") -> Picture:
+    """A drawn figure for the page; paths and marks to a hundredth of a point: four fifths of the size."""
     image = io.BytesIO()
     figure.savefig(image, format="svg")
-    return Picture(title, caption, _rounded(image.getvalue()), place, choice)
-
-
-def _rounded(svg: bytes) -> bytes:
-    """The drawing with paths and marks to a hundredth of a point: four fifths of the size."""
-    short = lambda match: _DIGITS.sub(rb"\1", match[0])  # noqa: E731
-    return _PLACES.sub(short, svg)
+    rounded = _PLACES.sub(lambda match: _DIGITS.sub(rb"\1", match[0]), image.getvalue())
+    return Picture(title, caption, rounded, place, choice, 96 * figure.get_size_inches()[0])
 
 
 def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
@@ -85,17 +80,30 @@ def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
     return [list(group) for _, group in itertools.groupby(section, lambda p: p.title if p.choice else id(p))]
 
 
+def write_report(
+    out: Path, kind: str, document: Mapping[str, Any], text: str, named: Callable[[str], str] = str
+) -> None:
+    """Write KIND.json and the page `text` as KIND.html into the folder `out`, in the names of the user's file."""
+    write_json(out / f"{kind}.json", document, named)
+    replace_text(out / f"{kind}.html", named(text))
+
+
+def write_page(
+    out: Path, document: Mapping[str, Any], pictures: Sequence[Picture], named: Callable[[str], str] = str
+) -> None:
+    """Write report.json, report.html, and figures.html with the same figures to zoom into."""
+    replace_text(out / "figures.html", named(rendered("figures.html.j2", title=document["rig"], pictures=pictures)))
+    write_report(out, "report", document, page(document, pictures), named)
+
+
 def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
-    """The whole page; raises ValueError where an image is neither PNG nor SVG."""
-    for picture in pictures:
-        if picture.place not in FIGURE_SECTIONS:
-            raise ValueError(f"figure {picture.title!r}: place {picture.place!r}; use {', '.join(FIGURE_SECTIONS)}")
+    """Page of a fit or a diagnosis, whose document has no key `effects` or has one."""
     error, effects = document.get("error") or {}, document.get("effects") or []
     parameters = document.get("parameters") or {}
     return rendered(
-        "page.html.j2",
+        "report.html.j2",
         document=document,
-        fitted="effects" not in document and "model" in document,
+        fitted="effects" not in document,
         pictures=pictures,
         effects=effects,
         errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
@@ -107,20 +115,12 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     )
 
 
-def write_page(
-    out: Path, document: Mapping[str, Any], pictures: Sequence[Picture], named: Callable[[str], str] = str
-) -> None:
-    """Write report.html, and figures.html with the same figures to zoom into, in the names of the user's file."""
-    title = document.get("rig") or "Figures"
-    replace_text(out / "figures.html", named(rendered("figures.html.j2", title=title, pictures=pictures)))
-    replace_text(out / "report.html", named(page(document, pictures)))
-
-
 def rendered(template: str, **content: Any) -> str:
     """A template of this folder, filled in."""
     return _environment().get_template(template).render(**content)
 
 
+@functools.cache
 def _environment() -> jinja2.Environment:
     """Templates that escape all text, with the words of a report as filters."""
     loader = jinja2.PackageLoader("nnap_em", "report")
@@ -133,8 +133,7 @@ def _environment() -> jinja2.Environment:
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {
         "most": MOST_PICTURES,
-        "meanings": MEANINGS,
-        "words": WORDS,
+        "catalogue": catalogue,
         "level": FAILS,
         "at": _at,
         "ratio": ratio,
@@ -222,23 +221,3 @@ def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
 def _highest(entries: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
     """The eight entries of highest score, highest first."""
     return sorted(entries or [], key=lambda entry: -(entry.get("gain") or 0.0))[:8]
-
-
-# --- images
-
-
-def _media(picture: Picture) -> str:
-    if picture.image.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    head = picture.image[:4000].lstrip()
-    if head.startswith((b"<svg", b"<?xml", b"<!DOCTYPE svg")) and b"<svg" in head:
-        return "image/svg+xml"
-    raise ValueError(f"figure {picture.title!r}: neither PNG nor SVG")
-
-
-def _width(image: bytes) -> int:
-    """Width in CSS pixels; 0 where it is unknown.  PNG is taken for 150 dots per inch."""
-    if image.startswith(b"\x89PNG"):
-        return round(struct.unpack(">I", image[16:20])[0] * 96 / 150) if len(image) >= 24 else 0
-    match = re.search(rb"<svg\b[^>]*?\swidth=[\"']([0-9.]+)(pt|in|px)?[\"']", image[:4000])
-    return round(float(match[1]) * _SVG_UNITS.get(match[2], 1.0)) if match else 0

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -18,18 +19,23 @@ INNER = (0.5, 99.5)
 
 
 def write_json(path: Path, document: Mapping[str, Any], naming: Callable[[str], str] = str) -> None:
-    """Write JSON whole or not at all, texts as `naming` returns them; values that are not finite become null."""
+    """Write JSON whole or not at all, texts as `naming` returns them."""
+    replace_text(path, json.dumps(plain(document, naming), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
-    def clean(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: clean(item) for name, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [clean(item) for item in value]
-        if isinstance(value, str):
-            return naming(value)
-        return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    replace_text(path, json.dumps(clean(document), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+def plain(value: Any, naming: Callable[[str], str] = str) -> Any:
+    """A document as JSON holds it: named tuples by their fields, arrays as lists, null for what is not finite."""
+    if isinstance(value, tuple) and type(value) is not tuple:
+        value = value._asdict()  # type: ignore[attr-defined]
+    if isinstance(value, np.ndarray | jax.Array):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(item, naming) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item, naming) for item in value]
+    if isinstance(value, str):
+        return naming(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def visited_nodes(velocity: Float[np.ndarray, "sample dof"]) -> Float[np.ndarray, "dof node"]:

@@ -2,7 +2,6 @@
 
 from .backward import ExactBackward, ffbs
 from .filter import particle_filter
-from .metropolis import MetropolisBackward
 from .potentials import Potentials
 from .proposals import Bootstrap, Guided, Lookahead
 from .smoother import ParticleSmoother
@@ -12,7 +11,6 @@ __all__ = [
     "ExactBackward",
     "Guided",
     "Lookahead",
-    "MetropolisBackward",
     "ParticleSmoother",
     "Potentials",
     "ffbs",

@@ -1,7 +1,6 @@
-"""Draws of whole trajectories backward through the particles of a filter; here all are weighed for each."""
+"""Draws of whole trajectories backward through the particles of a filter."""
 
 import math
-from abc import abstractmethod
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,40 +22,23 @@ class Trajectories(NamedTuple):
     """Process noise x_{k+1} - f(x_k)."""
 
 
-class AbstractBackward(eqx.Module):
-    """Draws the particle that a trajectory passes through at k, given where it is at k + 1."""
+class ExactBackward(eqx.Module):
+    """Draws the particle that a trajectory passes through at k, given where it is at k + 1.
 
-    @property
-    @abstractmethod
-    def draws(self) -> int:
-        """Uniform numbers needed for one step of one path."""
+    Forward filtering, backward sampling: all particles are weighed for each path [Godsill, Doucet & West 2004].
+    """
 
-    @abstractmethod
+    block: int = eqx.field(static=True, default=32)
+    """Particles per block of the two-level inverse distribution function."""
+
     def __call__(
         self,
         x_next: Float[Array, "state path"],
         f: Float[Array, "state particle"],
         log_w: Float[Array, " particle"],
-        log_ahead: Float[Array, " particle"],
-        parent: Int[Array, " path"],
-        uniform: Float[Array, "draw path"],
+        uniform: Float[Array, " path"],
     ) -> Int[Array, " path"]:
-        """Indices with probability proportional to exp(log_w) N(x_next; f, I); `parent` is the genealogical one."""
-
-
-class ExactBackward(AbstractBackward):
-    """Forward filtering, backward sampling: all particles are weighed for each path [Godsill, Doucet & West 2004]."""
-
-    block: int = eqx.field(static=True, default=32)
-    """Particles per block of the two-level inverse distribution function."""
-
-    @property
-    def draws(self) -> int:
-        """One."""
-        return 1
-
-    def __call__(self, x_next, f, log_w, log_ahead, parent, uniform):
-        """Indices, each weighed against all particles."""
+        """Indices with probability proportional to exp(log_w) N(x_next; f, I), by a uniform number for each path."""
         spare = -log_w.shape[0] % self.block
         centre = jnp.mean(x_next, axis=1, keepdims=True)  # or the squares below would cancel
         f = f - centre
@@ -75,7 +57,7 @@ class ExactBackward(AbstractBackward):
         _, (tops, sums) = jax.lax.scan(weigh, None, (jnp.swapaxes(f, 0, 1), level[:, :, None]))
         top = jnp.max(tops, axis=0)
         reach = upto((sums * exp2(tops - top[None])).T, 0).T
-        target = uniform[0] * reach[-1]
+        target = uniform * reach[-1]
         outer = jnp.minimum(jnp.sum(reach <= target[None], axis=0), reach.shape[0] - 1)
         before = jnp.take_along_axis(jnp.pad(reach, ((1, 0), (0, 0))), outer[None], axis=0)[0]
         within = level[outer] - top[:, None]
@@ -87,7 +69,7 @@ class ExactBackward(AbstractBackward):
         return (outer * self.block + inner).astype(jnp.int32)
 
 
-def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int, key: PRNGKeyArray) -> Trajectories:
+def ffbs(history: ParticleHistory, backward: ExactBackward, *, num_paths: int, key: PRNGKeyArray) -> Trajectories:
     """Draw trajectories backward through the particles of a filter."""
     key_last, key_steps = jax.random.split(key)
     dtype, exact = history.x.dtype, history.origin.dtype
@@ -95,9 +77,8 @@ def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int
 
     def step(carry, slices):
         index, x_next = carry
-        time, active, x, f, log_w, log_ahead, ancestors = slices
-        uniform = uniforms(key_steps, time, backward.draws, num_paths, dtype)
-        chosen = backward(x_next, f, log_w, log_ahead, ancestors[index], uniform)
+        time, active, x, f, log_w = slices
+        chosen = backward(x_next, f, log_w, uniforms(key_steps, time, 1, num_paths, dtype)[0])
         index = jnp.where(active, chosen, index)  # nothing is resampled on arrival in the padding
         state = x[:, index]
         return (index, state), (state, x_next - f[:, index])
@@ -105,8 +86,8 @@ def ffbs(history: ParticleHistory, backward: AbstractBackward, *, num_paths: int
     h = history
     times = jnp.arange(h.x.shape[0] - 1, dtype=jnp.int32)
     end = h.x[-1][:, last]
-    before = jax.tree.map(lambda a: a[:-1], (h.active, h.x, h.f, h.log_w, h.log_ahead))
-    _, (x, kick) = jax.lax.scan(step, (last, end), (times, *before, h.ancestors[1:]), reverse=True)
+    before = jax.tree.map(lambda a: a[:-1], (h.active, h.x, h.f, h.log_w))
+    _, (x, kick) = jax.lax.scan(step, (last, end), (times, *before), reverse=True)
     x = jnp.swapaxes(jnp.concatenate([x, end[None]]), 1, 2).astype(exact)
     kick = jnp.swapaxes(kick, 1, 2).astype(exact)
     return Trajectories(h.origin[:, None] + h.scale[None, None] * x, h.scale[None, None] * kick)

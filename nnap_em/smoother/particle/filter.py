@@ -42,8 +42,6 @@ class ParticleHistory(NamedTuple):
     """Mean of the next state, as seen from the next origin."""
     log_w: Float[Array, "time particle"]
     """Log weights of p(x_k | y_{0:k}), up to a constant of each time."""
-    log_ahead: Float[Array, "time particle"]
-    """log psi~_{k+1}(f); the filter itself carries the weights exp(log_w + log_ahead)."""
     ancestors: Int[Array, "time particle"]
     """Index at k - 1 of the parent of each particle at k."""
     active: Bool[Array, " time"]
@@ -122,7 +120,7 @@ def particle_filter(
         total = top + jnp.log(mass)
         log_w = jnp.where(arrive, grown - total, log_w)
         ess = jnp.where(arrive, mass**2 / jnp.sum(w**2), ess)
-        out = (jnp.stack(x), jnp.stack(f), log_w - log_ahead, log_ahead, ancestors, ess)
+        out = (jnp.stack(x), jnp.stack(f), log_w - log_ahead, ancestors, ess)
         return (f, log_w, ess), (*out, jnp.where(any_alive, jnp.where(arrive, total, 0.0), -jnp.inf).astype(exact))
 
     mean = [jnp.full(num_particles, m, dtype) for m in start.mean.astype(dtype)]
@@ -131,8 +129,8 @@ def particle_filter(
     # Drawn time by time: the numbers of a time do not depend on how many follow.
     times = jnp.arange(y.shape[0], dtype=jnp.int32)
     offset = jax.random.uniform(key_offset, y.shape[:1], dtype)
-    _, (x, f, log_w, ahead, ancestors, ess, total) = jax.lax.scan(
+    _, (x, f, log_w, ancestors, ess, total) = jax.lax.scan(
         step, (mean, flat, size), (times, offset, arrive, leave, origin, later[0], u, y, seq.observed, steps, later[1])
     )
     loglik = jnp.sum(total) + log_ahead[0].astype(exact)
-    return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ahead, ancestors, leave, ess, loglik)
+    return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ancestors, leave, ess, loglik)

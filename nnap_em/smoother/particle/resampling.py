@@ -22,11 +22,7 @@ def upto(x: Float[Array, "*batch n"], k: int) -> Float[Array, "*batch n"]:
 
 def systematic(log_w: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
     """Sorted indices of `count` draws by one uniform `offset` [Kitagawa 1996]."""
-    return sweep(cumsum(jnp.exp(log_w - jnp.max(log_w))), offset, count)
-
-
-def sweep(reach: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
-    """Place of (j + offset) / count of the total among the cumulative weights, for each j."""
+    reach = cumsum(jnp.exp(log_w - jnp.max(log_w)))
     before = jnp.ceil(reach * (count / reach[-1]) - offset).astype(jnp.int32)  # draws among the particles up to here
     drops = jnp.zeros(count + 1, reach.dtype).at[jnp.clip(before, 0, count)].add(1, mode="promise_in_bounds")
     return jnp.minimum(cumsum(drops[:count]).astype(jnp.int32), reach.shape[0] - 1)

@@ -12,7 +12,7 @@ from ...numerics.gaussian import Gaussian
 from ..gaussian import CubatureSmoother, GaussianSmoother
 from ..posterior import AbstractSmoother, Posterior
 from ..start import StartBank
-from .backward import AbstractBackward, ExactBackward, ffbs
+from .backward import ExactBackward, ffbs
 from .filter import ParticleHistory, particle_filter
 from .proposals import AbstractProposal, Lookahead
 
@@ -22,7 +22,7 @@ class ParticleSmoother(AbstractSmoother):
 
     guide: GaussianSmoother
     proposal: AbstractProposal = Lookahead()
-    backward: AbstractBackward = ExactBackward()
+    backward: ExactBackward = ExactBackward()
     num_particles: int = eqx.field(static=True, default=300)
     num_paths: int = eqx.field(static=True, default=100)
     dtype: str = eqx.field(static=True, default="float32", converter=lambda dtype: jnp.dtype(dtype).name)

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.formats import csv_fields, header_hint, number, place, refuse
+from ..data.noise import reading_noise
 from ..data.rig import SystemSpec, toml_text
 from ..data.units import SIZES, UNITS, named_unit, parameter_unit
-from ..em.readings import reading_noise
 
 _NAMES = {  # what people call a column, its number apart
     "time": re.compile(r"_*(time|t|timestamp|clock)()$"),

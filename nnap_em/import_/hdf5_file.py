@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
-from ..data.formats import dated
+from ..data.formats import dated, unreadable
 from ..data.units import UNITS, is_time, named_unit
 from .clock import nanoseconds, rising
 from .objects import LISTED_ENTRIES
@@ -119,7 +119,7 @@ def _opened(path: Path) -> Iterator[Any]:
         file = h5py.File(path, "r")
     except OSError as error:
         if error.errno:
-            raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights") from None
+            raise unreadable(path, error) from None
         hint = "use another copy, or write it again"
         raise DataError(f"{path}: no HDF5 file, or damaged or cut short; {hint}") from None
     with file:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..data.noise import reading_noise, resolution
 from ..data.rig import toml_text
 from ..data.units import is_time, named_unit
-from ..em.readings import reading_noise, resolution
 from .from_log import DRAFT_HEAD, Draft, meaning, numbers, sampling
 
 EQUAL_SHARE = 0.5

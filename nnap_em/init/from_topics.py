@@ -10,8 +10,8 @@ from jaxtyping import Float
 from ..data.dataset import DataError
 from ..data.rig import SystemSpec, toml_text
 from ..data.units import SIZES, named_unit
-from ..recordings.files import read, reader
-from ..recordings.recording import UNTIMED, Address, Topic, last_word, places
+from ..import_.files import read, reader
+from ..import_.recording import UNTIMED, Address, Topic, last_word, places
 from .from_log import Draft, drafted, meaning
 
 EXAMINED_ROWS = 100_000

@@ -11,14 +11,14 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
+from ..data.noise import reading_noise, resolution
 from ..data.rig import Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
 from ..em.equations import motion
-from ..em.readings import onset, reading_noise, resolution
+from ..em.readings import onset
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
-from ..fit.identify import Identified, begin
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
@@ -27,6 +27,7 @@ from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
+from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, explanations, gains, mistakes, regression
 from .stops import at_stops
 

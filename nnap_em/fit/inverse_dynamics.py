@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float
 from scipy.optimize import lsq_linear
 
 from ..data.dataset import Dataset
+from ..data.noise import reading_noise
 from ..data.rig import Rig
 from ..data.servo import TORQUE
-from ..em.readings import reading_noise
 from ..systems import AbstractSystem
 
 WIDTH, ORDER = 7, 4

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
+from ..data.formats import unreadable
 from .clock import choose
 from .codecs import Codec, Unreadable, codec
 from .mcap_records import MAGIC, Batch, Broken, Frames
@@ -133,7 +134,7 @@ def _opened(path: Path) -> Iterator[_Open]:
     try:
         file = path.open("rb")
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights") from None
+        raise unreadable(path, error) from None
     with file:
         if file.read(len(MAGIC)) != MAGIC:
             refuse(path, "the file", "no MCAP file", "give a file that an MCAP recorder wrote")

@@ -12,13 +12,13 @@ from ..data.dataset import DataError
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
 from ..data.rig import SystemSpec, toml_text
 from ..data.servo import TORQUE
+from ..import_.files import reader
+from ..import_.recording import Address, Topic, places
+from ..import_.text_file import foreign
 from ..machines.locked import Part
 from ..machines.mjcf import read_machine
 from ..machines.source import parse
 from ..machines.urdf import stuck
-from ..recordings.files import reader
-from ..recordings.recording import Address, Topic, places
-from ..recordings.text_file import foreign
 from .from_log import DRAFT_HEAD, Draft, driven, from_one, meaning, measurement, numbers, sampling
 from .from_topics import COMMAND, addresses, columns_table, commands
 

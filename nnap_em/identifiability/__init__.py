@@ -1,1 +1,0 @@
-"""Test of what the logs can identify."""

@@ -25,7 +25,8 @@ import numpy as np
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Declared, Rig, read_rig
-from nnap_em.fit.identify import Identified, friction_table, identify
+from nnap_em.diagnosis.memory import identify
+from nnap_em.fit.identify import Identified, friction_table
 from nnap_em.fit.predict import horizon_errors, posterior_of, predict
 from nnap_em.model import hooks
 from nnap_em.systems import specs

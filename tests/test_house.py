@@ -16,7 +16,7 @@ FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "eff
 PACKAGE = ROOT / "nnap_em"
 
 
-LINES, CONSTANTS = 35_317, 563
+LINES, CONSTANTS = 35_127, 559
 """Lines and module constants of the package: they may fall, and then these fall with them."""
 
 

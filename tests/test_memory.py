@@ -1,22 +1,24 @@
 """Friction with memory: passive, odd, the static map in its limits; found and recovered where it is, and only there."""
 
-import inspect
 from dataclasses import replace
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plant
 import pytest
+from helpers import around, declared_model
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig, read_rig, write_rig
+from nnap_em.diagnosis import memory as memories
+from nnap_em.diagnosis.memory import identify, with_memory
+from nnap_em.diagnosis.outcome import Diagnosis, Step
 from nnap_em.effects import OperatingPoint
 from nnap_em.em.build import build_system, measure_scales
-from nnap_em.fit import memory as memories
 from nnap_em.fit.check import Along, memory
-from nnap_em.fit.identify import begin, friction_table, identify
+from nnap_em.fit.identify import begin, friction_table
 from nnap_em.fit.store import load, save
 from nnap_em.model.base import prepare
 from nnap_em.model.dynamic_friction import SHAPES, DynamicFriction, hysteresis
@@ -185,7 +187,7 @@ def test_the_table_is_the_torque_of_steady_sliding(fitted):
 def test_a_static_map_is_kept_where_there_is_no_memory():
     fitted = identify(_rig(), _logs(None, 0), key=jax.random.key(0))
     assert fitted.model.effects == ()
-    assert fitted.memory.startswith("joint 1: the static map is kept, no memory")
+    assert fitted.memory.startswith("joint 1: the static map is kept, no memory is seen")
 
 
 @pytest.mark.parametrize(
@@ -239,31 +241,35 @@ def test_dynamic_friction_is_declared_and_written(tmp_path):
     assert read_rig(tmp_path / "rig.toml", specs) == _rig()
 
 
-def test_the_other_joints_are_tried_where_the_best_is_refused(monkeypatch):
-    """The second joint shows memory best and its contact predicts no better; the first still gets one."""
-    tried = []
+def test_contacts_are_tried_from_none_to_the_dry_friction_of_the_map():
+    """None adds nothing; in steady sliding, at any rate, neither do the others; sizes are those of the joint."""
+    scales = around(declared_model(plant.Case()))._replace(dry=np.array([0.3, 0.02]))
+    candidates = DynamicFriction.candidates(scales)
+    assert [c.start.joint for c in candidates] == [1] * 4 + [2] * 4
+    assert DynamicFriction.candidates(scales._replace(learned=False)) == []
+    for candidate in candidates:
+        (probe,), j = candidate.probes, candidate.start.joint - 1
+        np.testing.assert_allclose(jnp.exp(probe.log_level), scales.dry[j], rtol=1e-12)
+        scene = _scene(jnp.asarray([0.7, -0.4]))
+        steady = (probe.level(scene.v[j]) * jnp.sign(scene.v[j]))[None]
+        np.testing.assert_allclose(probe.force(scene, steady), 0.0, atol=1e-12)
+        np.testing.assert_allclose(candidate.start.force(scene, jnp.zeros(1)), 0.0, atol=1e-4 * scales.dry[j])
+        assert abs(probe.force(scene, jnp.zeros(1))[j]) > 0.5 * scales.dry[j]
 
-    def screen(model, rule, path, data, used, scales, distance, joints):
-        wald = np.zeros(3)
-        wald[list(joints)] = np.array([8.0, 9.0, 1.0])[list(joints)]
-        return memories.Screen(np.full(3, 0.1), wald, np.full(3, 0.5), np.full(3, 0.1))
 
-    def with_contact(fitted, bristle, *_, **__):
-        tried.append(bristle)
-        return fitted
-
-    system = SimpleNamespace(coordinates=("a", "b", "c"), force_unit=lambda j: "N m", unit=lambda name: "rad")
-    fit = SimpleNamespace(model=SimpleNamespace(system=system), rule=None, path=None, used=None, state=None)
-    one = np.ones(3)
-    monkeypatch.setattr(memories, "_smoothed", lambda *_: fit)
-    monkeypatch.setattr(memories, "sizes", lambda *_: memories.Sizes(one, 2 * one, one, one, one))
-    monkeypatch.setattr(memories, "screen", screen)
-    monkeypatch.setattr(memories, "contact", lambda model, scales, joint, level, distance: joint)
-    monkeypatch.setattr(memories, "_unseen", lambda *_: "the static map is kept, no memory")
-    monkeypatch.setattr(memories, "_with", with_contact)
-    monkeypatch.setattr(memories, "_judged", lambda fitted, trial, data: (tried[-1] == 1, "evidence"))
-    remember = inspect.unwrap(memories.remember)
-    out = remember(None, None, None, None, epochs=1, watch=None)
-    assert tried == [2, 1]
-    starts = ("memory (evidence)", memories.REFUSED, "the static map is kept, no")
-    assert [line.partition(": ")[2][: len(text)] for line, text in zip(out.sentences, starts, strict=True)] == [*starts]
+@pytest.mark.parametrize(
+    ("steps", "sentence"),
+    [
+        ([], "no memory is seen"),
+        ([(0.04, None)], "no memory is seen (a contact would remove 4.0% of the squared error)"),
+        ([(0.4, -0.02), (0.01, None)], "no memory is seen (a contact would remove 1.0% of the squared error)"),
+        ([(0.4, -0.02)], "memory predicts no better (it removes -2.0% of the squared error)"),
+    ],
+)
+def test_a_joint_that_is_refused_is_not_one_without_memory(monkeypatch, steps, sentence):
+    """The sentence is that of the last round which judged the joint."""
+    law = (DynamicFriction.name, 1, None, ())
+    rounds = tuple(Step(60, ((law, seen),), () if left is None else ((law, left),), None, 4) for seen, left in steps)
+    fit = begin(_rig(), _logs(4.0, 0, sequences=2), key=jax.random.key(0))
+    monkeypatch.setattr(memories, "search", lambda context, **_: Diagnosis(context.before, context.before, (), rounds))
+    assert with_memory(fit, _logs(4.0, 0, sequences=2)).memory == f"joint 1: the static map is kept, {sentence}"

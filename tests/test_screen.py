@@ -13,10 +13,9 @@ from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.diagnosis.losses import OneStep
 from nnap_em.diagnosis.propose import proposals, seeded, surroundings
 from nnap_em.diagnosis.screen import overlaps, project, screen
-from nnap_em.diagnosis.smoothed import SmoothedFit
+from nnap_em.diagnosis.smoothed import SmoothedFit, extended
 from nnap_em.effects import catalogue
 from nnap_em.em.local import local
-from nnap_em.fit.memory import extended
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.kalman import CUBATURE, kalman_filter

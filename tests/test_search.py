@@ -482,7 +482,7 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
     held = search._held(rig)
     assert held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
-    before = _context().before._replace(rig=held, smoother=search._unbranched(StartBank((1, 1), (0,))))
+    before = _context().before._replace(rig=held, smoother=search.unbranched(StartBank((1, 1), (0,))))
     stds = []
 
     def step(rule, model, posterior, data):

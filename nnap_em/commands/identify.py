@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.rig import Rig
+from ..diagnosis.memory import with_memory
 from ..em.loop import EMState
 from ..fit.identify import MakeSmoother, Watch, identify
 from ..fit.known import identify_from
@@ -46,10 +47,11 @@ def run(args: argparse.Namespace, log: Log) -> int:
     data, epochs = bench.train.data, []
     fit, _ = origin(args, bench, log)
     with resumable(args, bench, log):
-        most = args.epochs * (1 + bench.rig.memory)
-        watch, key = _watch(bench.rig, most, epochs, log), jax.random.key(args.seed)
+        watch, key = _watch(bench.rig, args.epochs, epochs, log), jax.random.key(args.seed)
         options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
         fitted = identify(bench.rig, data, **options) if fit is None else identify_from(fit, bench.rig, data, **options)
+        if bench.rig.memory and fit is None:
+            fitted = with_memory(fitted, data, log)
         remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}

@@ -99,7 +99,8 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
     was compared with that when it was found.  Of each the best candidate.
     """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    keyed = [(key_of(candidate.start), candidate) for candidate in proposals(around, fit.model.effects)]
+    every = proposals(around, fit.model.effects, context.kinds)
+    keyed = [(key_of(candidate.start), candidate) for candidate in every]
     moved = bool(fit.model.effects)
     some = [c for key, c in keyed if key in evidence.equivalent or (moved and elsewhere(key, law))]
     best: dict[Key, Screened] = {}

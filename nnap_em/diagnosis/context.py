@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset, horizon
+from ..effects import AbstractEffect, catalogue
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import not_diverged
 from ..fit.identify import Identified, begin
@@ -69,6 +70,8 @@ class SearchContext(NamedTuple):
     """The fit from which the search began along its own recordings, where the question is what changed since."""
     change: bool = False
     """True where that is the question: the declared model is a fit, and its laws stay."""
+    kinds: Collection[type[AbstractEffect]] = catalogue.values()
+    """Laws that are tried."""
 
     @property
     def longest(self) -> int:

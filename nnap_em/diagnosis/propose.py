@@ -1,6 +1,6 @@
 """Candidates of a search: every effect of the catalogue that this machine could have, and where its fit starts."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import equinox as eqx
 import jax
@@ -58,6 +58,7 @@ def surroundings(
         rig.friction,
         rig.input_columns,
         moved=moved if change else None,
+        dry=np.maximum(0.5 * np.abs(slow - back) - 0.4 * viscous * speed, 0.01 * scales.torque),
     )
 
 
@@ -74,9 +75,13 @@ def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
     return jax.vmap(unknown)(v)
 
 
-def proposals(around: SearchScales, known: Sequence[AbstractEffect] = ()) -> list[Candidate]:
-    """Everything in the catalogue that this machine could have, and other forms of what is `known` to be there."""
-    every = [candidate for kind in catalogue.values() for candidate in kind.candidates(around)]
+def proposals(
+    around: SearchScales,
+    known: Sequence[AbstractEffect] = (),
+    kinds: Collection[type[AbstractEffect]] = catalogue.values(),
+) -> list[Candidate]:
+    """Everything of some kinds that this machine could have, and other forms of what is `known` to be there."""
+    every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     keys = {key_of(candidate.start) for candidate in every}
     free = (form for law in known if law.named for form in free_form(law, around))
     every += [form for form in free if key_of(form.start) not in keys]

@@ -8,14 +8,13 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect
 from ..fit.identify import Identified
-from ..fit.memory import extended
 from ..storage.log import silent
 from .context import SEARCH_EFFORT, SearchContext, smooth
 from .losses import OneStep
 from .propose import proposals, seeded, surroundings
 from .refit import Refit, refit
 from .screen import screen
-from .smoothed import SmoothedFit
+from .smoothed import SmoothedFit, extended
 
 STARTS = 3
 """Places from which a law is fitted; one that is not linear, from all that there are."""

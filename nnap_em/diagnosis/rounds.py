@@ -39,7 +39,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     """Screen everything that the machine may have, and refit the best until one is accepted."""
     rig, model = context.before.rig, fit.model
     around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
-    seen = screen(context.loss, fit, proposals(around, model.effects))
+    seen = screen(context.loss, fit, proposals(around, model.effects, context.kinds))
     fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
     ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))

@@ -17,6 +17,7 @@ from scipy import stats
 from ..data.dataset import Dataset
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
+from ..effects.sensor import SensorQuantization
 from ..em.loop import EMState, FitError, e_step
 from ..em.mstep import not_diverged
 from ..fit.identify import Identified, begin, finished, identify
@@ -108,7 +109,8 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     """
     before, data = context.before, context.data
     try:  # steps of readings as noise: they spoil the noise that all else leans on
-        begun = (context.declared, None) if context.change else quantised(context, context.declared)
+        steps_tried = SensorQuantization in context.kinds and not context.change
+        begun = quantised(context, context.declared) if steps_tried else (context.declared, None)
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
@@ -290,7 +292,7 @@ def diagnose(
             seen[rows] = (state, used)
             log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
 
-        outcome = identify(held, part, key=key, smoother=_unbranched, watch=watch)
+        outcome = identify(held, part, key=key, smoother=unbranched, watch=watch)
         stages.clear()  # a fit that fails leaves the stages of the one before
         stages.update(seen)
         return outcome
@@ -302,7 +304,7 @@ def diagnose(
         return search_equations(before, data, log, end)
     change, origin = (
         start is not None,
-        None if start is None or own is None else along(start, own, _unbranched(start.bank)),
+        None if start is None or own is None else along(start, own, unbranched(start.bank)),
     )
     ended = _ended(hold) if change else finished if white else _released(rig)
     if white:
@@ -327,7 +329,7 @@ def _put(
 
     Raises FitError where it follows none.
     """
-    before = known(start, rig, data, key=key, smoother=_unbranched, hold=hold)
+    before = known(start, rig, data, key=key, smoother=unbranched, hold=hold)
     posterior = e_step(before.model, data, before.smoother, key=before.state.key)
     used = np.asarray(not_diverged(posterior, data))
     if not used.any():
@@ -386,7 +388,7 @@ def _released(rig: Rig) -> Callable[[Identified, Dataset], Identified]:
     return release
 
 
-def _unbranched(bank: StartBank) -> GaussianSmoother:
+def unbranched(bank: StartBank) -> GaussianSmoother:
     """Smoother of the search: one Gaussian.
 
     The likelier branch of a hidden angle is that of the model, and a model that lacks an effect chooses wrongly: on a

@@ -2,6 +2,9 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -11,6 +14,7 @@ from ..em.mstep import ScoringMStep, not_diverged
 from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
+from ..numerics.ode import integrate
 from ..smoother.posterior import AbstractSmoother
 from .hypothesis import Hypothesis
 
@@ -54,3 +58,23 @@ def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> Smoo
     return SmoothedFit(
         hypothesis, hypothesis, posterior.state, data, np.asarray(not_diverged(posterior, data)), data.t.shape[1]
     )
+
+
+@eqx.filter_jit
+def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
+    """`path` of the model without its last effects, with the memory that these would have along it."""
+    width, states = path.mean.shape[-1], model.start.mean.shape[0]
+    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
+
+    def one(mean, cov, seq):
+        def step(m, slices):
+            x, u = slices
+            memory_rate = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
+            return integrate(memory_rate, m, model.dt, model.steps), m
+
+        _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
+        wide = jnp.zeros((mean.shape[0], states, states), cov.dtype)
+        wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
+        return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
+
+    return jax.vmap(one)(path.mean, path.cov, data) if states > width else path

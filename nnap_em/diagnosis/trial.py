@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, Candidate, flat
-from ..fit.memory import extended
 from ..numerics.gaussian import Gaussian
 from .context import SearchContext
 from .findings import estimates
@@ -17,7 +16,7 @@ from .losses import AbstractLoss
 from .propose import seeded
 from .refit import Refit, refit
 from .screen import Screened
-from .smoothed import SmoothedFit
+from .smoothed import SmoothedFit, extended
 from .verdict import FORESEEN, Rejection, needed, required, veto
 
 

@@ -72,6 +72,8 @@ class SearchScales(NamedTuple):
     """Ranges of the readings, of equations."""
     moved: tuple[tuple[str, str, float], ...] | None = None
     """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
+    dry: Float[np.ndarray, " dof"] = np.zeros(0)
+    """Dry friction of the learned map: its odd part at 0.4 of the largest velocity, less the viscous one [N m]."""
 
     @property
     def ordered(self) -> list[tuple[str, str]]:
@@ -299,6 +301,10 @@ class AbstractEffect(eqx.Module):
     def drift(self, scene: OperatingPoint, memory: Float[Array, " memory"]) -> Float[Array, " memory"]:
         """Time derivative of its own states."""
         return memory
+
+    def beside(self, model: Any) -> Any:
+        """The model that it joins, without what it takes the place of."""
+        return model
 
     def sliding(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Part of friction in steady sliding at `v` [rad/s] that the learned map leaves to it [N m]."""

@@ -190,8 +190,8 @@ def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArra
 
 
 SCHEDULE = Schedule()
-WIDENED, SMOOTHED, SEARCHED, REMEMBERED = range(1 << 30, (1 << 30) + 4)
-"""Numbers folded into the key of a fit for draws after it, of its covariance, states, a later search, contacts."""
+WIDENED, SMOOTHED, SEARCHED = range(1 << 30, (1 << 30) + 3)
+"""Numbers folded into the key of a fit for draws after it, of its covariance, states, a later search."""
 EPOCHS = 40
 """Epochs of a fit at most."""
 REST = 0.05

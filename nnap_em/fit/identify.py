@@ -42,7 +42,6 @@ from ..prediction_error.stated import widened
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
-from .memory import remember
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
@@ -177,9 +176,6 @@ def identify(
     fitted = fitted if smoother is None else fitted._replace(smoother=smoother(fitted.bank))
     state = fit(fitted.state, data, fitted.smoother, fitted.m_step, epochs=epochs, schedule=schedule, watch=watch)
     fitted = fitted._replace(state=state)
-    if rig.memory and start is None:
-        contacts = remember(state, fitted.m_step, fitted.smoother, data, epochs=epochs, watch=watch)
-        fitted = fitted._replace(state=contacts.state, m_step=contacts.m_step, memory="\n".join(contacts.sentences))
     rise = unsettled(fitted.state, schedule, int(np.max(np.sum(np.asarray(data.valid), axis=1))))
     return finished(fitted._replace(rise=rise), data)
 

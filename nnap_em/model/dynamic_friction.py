@@ -3,15 +3,24 @@
 import math
 from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..effects.base import JointEffect, Scalar, known
+from ..effects.base import Candidate, JointEffect, Scalar, known
 
 SHAPES = 5
 """Numbers of the learned stiffness curve: the degree of its Bernstein polynomial."""
+DISTANCES = 4
+"""Presliding distances from which a contact is tried."""
+RISE, STRIBECK = 0.1, 0.05
+"""First rise of the level towards rest, and the velocity over which it falls, over the largest."""
+FAINT = 1e-5
+"""Level and damping of none, over those that are tried."""
+NUMBERS_STD = (1.0, 2.0, 1.0, 1.5, 1.5, 1.5)
+"""Prior standard deviations of the numbers of a contact, in their order."""
 
 
 class DynamicFriction(JointEffect):
@@ -64,6 +73,43 @@ class DynamicFriction(JointEffect):
     """Largest stiffness that the integrator bears [N m/rad]."""
     fastest: Scalar = known()
     """Largest relaxation rate that it bears [1/s]."""
+
+    @classmethod
+    def candidates(cls, around):
+        """Dahl's contacts of every joint, from the travel within two samples after a reversal to a tenth of the range.
+
+        The damper is a fifth of critical.
+        """
+        out = []
+        masses = np.linalg.inv(np.asarray(around.system.mass(jnp.zeros(len(around.system.coordinates)))))
+        for j in around.joints if around.learned else ():
+            level, speed, inertia = around.dry[j - 1], around.speed[j - 1], 1 / masses[j - 1, j - 1]
+            shortest = 2 * around.dt**2 * around.torque[j - 1] / inertia
+            longest = max(0.1 * (around.high - around.low)[j - 1], 2 * shortest)
+            places = {
+                "knee": 0.01 * speed,
+                "stiffest": inertia / around.dt**2,  # a radian of its own vibration in an integration step
+                "fastest": 2 / around.dt,  # within the stability of Runge and Kutta's method, 2.78
+                "joint": j,
+            }
+            spread = cls.of(*NUMBERS_STD[:-1], shape=jnp.full(SHAPES, NUMBERS_STD[-1]), **places)
+            for distance in np.geomspace(shortest, longest, DISTANCES):
+                damping = 0.4 * math.sqrt(level * inertia / distance)
+                numbers = np.log([level, distance, damping, RISE, STRIBECK * speed])
+                faint = numbers + math.log(FAINT) * np.array([1, 0, 1, 0, 0])
+                none, probe = (cls.of(*each, shape=jnp.zeros(SHAPES), **places) for each in (faint, numbers))
+                out.append(Candidate(none, (probe,), spread))
+        return out
+
+    def beside(self, model):
+        """The map is a straight line where the contact takes the place of the sign of the rate.
+
+        A joint passes there within a sample or two at each reversal: a network would be free to have any peak.
+        """
+        network = model.unknown
+        rest = jnp.zeros_like(network.scale) if network.rest is None else network.rest
+        rest = rest.at[self.joint - 1].set(self.knee)
+        return eqx.tree_at(lambda m: m.unknown.rest, model, rest, is_leaf=lambda leaf: leaf is None)
 
     def values(self):
         """Level, stiffness and damping at s = 0, and the distance over which that stiffness reaches the level."""

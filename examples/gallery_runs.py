@@ -21,9 +21,9 @@ import plant
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
-from nnap_em.residual.interventions import WINDOWS, averaged
-from nnap_em.residual.residual import residual
-from nnap_em.residual.undisturbed import disturbance_free
+from nnap_em.diagnosis.interventions import WINDOWS, averaged
+from nnap_em.diagnosis.residual import residual
+from nnap_em.diagnosis.undisturbed import disturbance_free
 
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = ROOT.parent / "shared" / "data" / "measured"

@@ -30,7 +30,7 @@ from recordings import RecordingError, beginning, recordings, write
 from nnap_em import Identified, horizon_errors, load, predict, read_logs
 from nnap_em.commands.cli import main as nnap_em
 from nnap_em.commands.common import set_up
-from nnap_em.residual.residual import residual
+from nnap_em.diagnosis.residual import residual
 
 RIG = Path(__file__).resolve().parent / "machines" / "dfki_acrobot.toml"
 TEST = 2

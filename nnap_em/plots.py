@@ -9,12 +9,12 @@ from jaxtyping import PRNGKeyArray
 from matplotlib.figure import Figure
 
 from .data.dataset import Dataset
+from .diagnosis.residual import names_of
+from .diagnosis.residual import residual as residual_of
 from .fit.identify import Identified, friction_table
 from .fit.predict import predict
 from .report.fit_plots import friction_figure, prediction_figure
 from .report.residual_plots import residual_figure
-from .residual.residual import names_of
-from .residual.residual import residual as residual_of
 
 __all__ = ["friction", "prediction", "residual"]
 

@@ -32,11 +32,11 @@ from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.findings import SuspectReport
 from nnap_em.diagnosis.outcome import Diagnosis
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
+from nnap_em.em.multistep import Grid
+from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
-from nnap_em.prediction_error.multistep import Grid
-from nnap_em.prediction_error.recorded import Risen, deleted, level, risen
 
 GROWN = 0.2
 """Growth of the Coulomb friction of a slide [N]; it is 1."""

@@ -25,11 +25,11 @@ from nnap_em.commands import smooth as smooth_command
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis.findings import Estimate
+from nnap_em.diagnosis.residual import residual
 from nnap_em.em.loop import FitError
 from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
 from nnap_em.report import tables
-from nnap_em.residual.residual import residual
 from nnap_em.smoother import AbstractSmoother
 from nnap_em.smoother.start import StartBank
 from nnap_em.storage import files

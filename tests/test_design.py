@@ -18,6 +18,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.diagnosis.residual import names_of
 from nnap_em.em.weights import Weights
 from nnap_em.experiment.criteria import Discrimination, Friction, Information, Several, after, share
 from nnap_em.experiment.experiment import design
@@ -32,7 +33,6 @@ from nnap_em.fit.predict import drawn_paths
 from nnap_em.fit.store import load
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.design import motion_figure
-from nnap_em.residual.residual import names_of
 from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs
 

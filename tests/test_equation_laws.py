@@ -18,11 +18,11 @@ from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
 from nnap_em.effects import Candidate, OperatingPoint, catalogue, flat
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
+from nnap_em.em.simulated import Simulated, Windows
 from nnap_em.fit.identify import begin, identify
 from nnap_em.init.equations import draft_equations
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.prediction_error.simulated import Simulated, Windows
 from nnap_em.report.document import unknown_terms as reported_terms
 from nnap_em.report.fit_plots import term_figure
 from nnap_em.systems import Equations, register_equations, specs

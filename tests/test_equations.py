@@ -17,13 +17,13 @@ from nnap_em.data.dataset import Dataset, pad
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig, write_rig
 from nnap_em.effects import catalogue
+from nnap_em.em import simulated
 from nnap_em.em.build import build_system
 from nnap_em.em.equations import motion
 from nnap_em.fit.identify import begin, identify
 from nnap_em.fit.store import load, save
 from nnap_em.model.hooks import reaching
 from nnap_em.model.state_space import Inputs
-from nnap_em.prediction_error import simulated
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.expression import FormulaError, parse
 

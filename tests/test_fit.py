@@ -12,14 +12,13 @@ from helpers import slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.diagnosis import refit as refits
-from nnap_em.em import loop
+from nnap_em.em import loop, multistep, stated
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import ScoringMStep
+from nnap_em.em.multistep import Followed, OpenLoop
 from nnap_em.fit import identify
 from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.prediction_error import multistep, stated
-from nnap_em.prediction_error.multistep import Followed, OpenLoop
 
 MODEL, RULE = slide()
 DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))

@@ -17,12 +17,8 @@ from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.model.simulate import paper_model
-from nnap_em.model.state_space import with_effects
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.prediction_error import multistep
-from nnap_em.prediction_error.multistep import (
+from nnap_em.em import multistep
+from nnap_em.em.multistep import (
     HORIZONS,
     SHORT_HORIZONS,
     OpenLoop,
@@ -36,8 +32,12 @@ from nnap_em.prediction_error.multistep import (
     robust_scale,
     weighed,
 )
-from nnap_em.prediction_error.noise import third_differences, white_readings
-from nnap_em.prediction_error.shape import friction_prior
+from nnap_em.em.noise import third_differences, white_readings
+from nnap_em.em.prior import ParameterPrior
+from nnap_em.em.shape import friction_prior
+from nnap_em.model.simulate import paper_model
+from nnap_em.model.state_space import with_effects
+from nnap_em.numerics.gaussian import Gaussian
 
 ROWS = 60
 

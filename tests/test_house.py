@@ -11,12 +11,12 @@ from shell import ROOT
 import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
-           "prediction_error", "fit", "residual", "curves", "diagnosis", "comparison", "experiment", "report",
+           "fit", "diagnosis", "comparison", "experiment", "report",
            "export", "init", "commands")  # fmt: skip
 PACKAGE = ROOT / "nnap_em"
 
 
-LINES, CONSTANTS = 35_127, 559
+LINES, CONSTANTS = 35_135, 559
 """Lines and module constants of the package: they may fall, and then these fall with them."""
 
 

@@ -7,12 +7,12 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnosis.interventions import Intervention, disturbances
+from nnap_em.diagnosis.residual import Names, Residual
+from nnap_em.diagnosis.undisturbed import without
 from nnap_em.report.diagnosis import _disturbance
 from nnap_em.report.page import page
 from nnap_em.report.tables import write_json
-from nnap_em.residual.interventions import Intervention, disturbances
-from nnap_em.residual.residual import Names, Residual
-from nnap_em.residual.undisturbed import without
 from nnap_em.systems import specs
 
 DT = 0.01

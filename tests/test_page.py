@@ -6,11 +6,11 @@ from html.parser import HTMLParser
 import pytest
 
 from nnap_em.diagnosis.keys import words
+from nnap_em.diagnosis.statistics import FAILS
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
 from nnap_em.report.page import MOST_PICTURES, Picture, page, write_page
 from nnap_em.report.wording import label, reached
-from nnap_em.residual.statistics import FAILS
 
 SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'
 VOID = {"meta", "img", "br", "link", "hr", "input"}

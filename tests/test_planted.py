@@ -17,6 +17,7 @@ from planted_table import cases, score, table
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.diagnosis.interventions import Intervention
 from nnap_em.effects import AbstractEffect
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss
 from nnap_em.effects.base import JointEffect, a
@@ -29,7 +30,6 @@ from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.diagnosis import _disturbance
-from nnap_em.residual.interventions import Intervention
 from nnap_em.systems import specs
 from nnap_em.systems.arm import TwoLinkArm
 

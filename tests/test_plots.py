@@ -9,6 +9,7 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
+from nnap_em.diagnosis.residual import Names, Residual
 from nnap_em.effects.base import Curve
 from nnap_em.fit.identify import FrictionTable
 from nnap_em.fit.predict import GIVEN, Prediction
@@ -16,7 +17,6 @@ from nnap_em.report.diagnosis import _prediction_pictures
 from nnap_em.report.fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
 from nnap_em.report.page import picture
 from nnap_em.report.residual_plots import innovation_figure, residual_figure
-from nnap_em.residual.residual import Names, Residual
 
 SEQUENCES, ROWS, DT = 8, 200, 0.01
 

@@ -14,12 +14,12 @@ from statsmodels.stats.stattools import jarque_bera
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.data.units import with_names
+from nnap_em.diagnosis.innovations import tests as run_tests
+from nnap_em.diagnosis.residual import Names, Residual, names_of, residual
+from nnap_em.diagnosis.statistics import FAILS, bias, dependence, holm, normality, spread, whiteness
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.fit.identify import begin
 from nnap_em.model.state_space import with_effects
-from nnap_em.residual.innovations import tests as run_tests
-from nnap_em.residual.residual import Names, Residual, names_of, residual
-from nnap_em.residual.statistics import FAILS, bias, dependence, holm, normality, spread, whiteness
 from nnap_em.smoother.particle import ParticleSmoother
 
 DT = 0.01

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.curves.shapes import shape
+from nnap_em.diagnosis.shapes import shape
 from nnap_em.effects import catalogue
 from nnap_em.effects.base import Curve
 from nnap_em.effects.function import Axis, InputAxis

@@ -9,7 +9,7 @@ from nnap_em.diagnosis.folds import fold_of, motions, times
 from nnap_em.diagnosis.losses import Linearised
 from nnap_em.diagnosis.screen import Rows, project, shares, shifted
 from nnap_em.effects import Candidate, catalogue
-from nnap_em.prediction_error.multistep import ratio
+from nnap_em.em.multistep import ratio
 
 GAIN = catalogue["motor_gain"](jnp.zeros(()), joint=1)
 WIDE = catalogue["motor_gain"](jnp.asarray(1e9), joint=1)

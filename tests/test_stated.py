@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers import slide
 
+from nnap_em.em import stated
 from nnap_em.em.loop import e_step
 from nnap_em.model.simulate import simulate
-from nnap_em.prediction_error import stated
 from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.smoother.start import StartBank
 

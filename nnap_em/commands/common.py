@@ -21,6 +21,7 @@ from ..data.dataset import DataError
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
+from ..diagnosis.residual import names_of
 from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
 from ..experiment.limits import DesignError
@@ -35,7 +36,6 @@ from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
-from ..residual.residual import names_of
 from ..storage.cache import Cache
 from ..storage.files import StoreError, cores, sweep
 from ..storage.journal import Journal, keeping

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from ..data.logs import Logs, read_logs
+from ..diagnosis.residual import residual
 from ..fit.branches import Branch, branches
 from ..fit.identify import Identified
 from ..fit.predict import smooth
 from ..fit.store import load, model_file
 from ..import_.mcap_writer import Channel, require_mcap, write_mcap
 from ..numerics.digits import counted
-from ..residual.residual import residual
 from ..storage.log import Log
 from .common import log_of, states_of, write_states
 

@@ -12,10 +12,10 @@ from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
 from ..em.loop import SEARCHED
+from ..em.recorded import errors_of, left_out, level, levels, risen
 from ..fit.identify import Identified
 from ..fit.known import known
 from ..numerics.digits import number
-from ..prediction_error.recorded import errors_of, left_out, level, levels, risen
 from ..storage.log import Log, silent
 from .compare import Cause, Comparison
 

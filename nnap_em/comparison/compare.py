@@ -14,12 +14,12 @@ from ..data.machine import unpacked
 from ..diagnosis.findings import Estimate, estimates
 from ..diagnosis.hypothesis import covariances
 from ..diagnosis.keys import Key, key_of, listed, words
+from ..diagnosis.statistics import holm
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, LAW_UNITS, fit_law
 from ..numerics.digits import counted
-from ..residual.statistics import holm
 from .pooling import JointTest, Pooled, joint_test, pool
 
 CHANGED = 0.01

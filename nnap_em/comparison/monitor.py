@@ -20,10 +20,10 @@ from ..effects import Candidate, flat
 from ..effects.change import CoulombChange, NumberChange, ViscousChange
 from ..effects.position import TorqueOffset
 from ..em.build import build_system, measure_scales, start_prior
+from ..em.multistep import HORIZONS, HUBER_STD, Grid, grid_of, huber
+from ..em.recorded import errors_of, left_out, level, levels
 from ..fit.identify import Identified
 from ..numerics.gaussian import Gaussian
-from ..prediction_error.multistep import HORIZONS, HUBER_STD, Grid, grid_of, huber
-from ..prediction_error.recorded import errors_of, left_out, level, levels
 
 SHIFT = 0.5
 """Half of the shift that a chart finds soonest [standard deviations of a recording]; smaller ones take longer."""
@@ -78,7 +78,7 @@ def reference(fitted: Identified, fit: SmoothedFit) -> tuple[Reference, list[Can
     candidates = numbers(fitted, fit)
     system, starts = fitted.model.system, [candidate.start for candidate in candidates]
     out = levels(left_out(fit.model, fit.m_step, fit.path, fit.data, fit.used))
-    linearised = MultiStep(bands=(HORIZONS,)).linearise(fit, candidates)[0]
+    ((linearised,),) = MultiStep(bands=(HORIZONS,)).linearise(fit, [candidates])
     own = tuple(
         Judged(lv, *_estimate(linearised, i, candidates, out.scale)) for i, lv in enumerate(out.level) if fit.used[i]
     )
@@ -118,7 +118,7 @@ def judge(fitted: Identified, reference: Reference, candidates: Sequence[Candida
     if not fit.used.all():  # it runs away: as far off as an error counts
         spread = np.diag([_probe(candidate)[1] ** 2 for candidate in candidates])
         return Judged(0.5 * math.log(float(huber(np.inf, 1.0))), np.zeros(len(candidates)), spread)
-    linearised = MultiStep(bands=(HORIZONS,)).linearise(fit, candidates)[0]
+    ((linearised,),) = MultiStep(bands=(HORIZONS,)).linearise(fit, [candidates])
     size = level(errors_of(fit.model, fit.m_step, fit.path, data), reference.scale)
     return Judged(float(size[0]), *_estimate(linearised, 0, candidates, reference.scale))
 

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import AbstractEffect, Candidate, OperatingPoint
+from ..em.multistep import Columns
 from ..model import hooks
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
 from ..numerics.parallel import each
-from ..prediction_error.multistep import Columns
 
 Blocks = Sequence[Sequence[Candidate]]
 

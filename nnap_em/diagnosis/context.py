@@ -15,10 +15,10 @@ from ..data.dataset import Dataset, horizon
 from ..effects import AbstractEffect, catalogue
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import not_diverged
+from ..em.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
-from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
 from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss

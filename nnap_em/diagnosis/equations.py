@@ -21,11 +21,11 @@ from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, flat
 from ..effects.actuator import DriveEffect
 from ..effects.equations import STRONG, PortEffect
+from ..em import simulated
 from ..em.equations import free_term, motion
 from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
-from ..prediction_error import simulated
 from ..storage.log import Log
 from .hypothesis import Evidence, Hypothesis
 from .keys import Key, complexity, key_of, words

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..curves.shapes import Shape, shape
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
 from ..fit.identify import friction_table
@@ -18,6 +17,7 @@ from ..numerics.digits import finite, number, share_of, with_std
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
 from .outcome import Diagnosis
+from .shapes import Shape, shape
 
 
 class Estimate(NamedTuple):

@@ -21,11 +21,7 @@ from jaxtyping import Array, Float, Int
 from ..data.dataset import Dataset
 from ..effects import flat
 from ..em.local import locals_along
-from ..em.quadratic import whitened_sensitivities
-from ..model.state_space import StateSpaceModel
-from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import batches, each
-from ..prediction_error.multistep import (
+from ..em.multistep import (
     HORIZONS,
     JUDGED,
     SHORT_HORIZONS,
@@ -39,6 +35,10 @@ from ..prediction_error.multistep import (
     starts,
     weighed,
 )
+from ..em.quadratic import whitened_sensitivities
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import batches, each
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .columns import Blocks, columns_by_block, tracks
 from .hypothesis import Hypothesis

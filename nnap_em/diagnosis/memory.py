@@ -1,19 +1,20 @@
 """Friction with memory: the search of `diagnose`, restricted to the contact of each joint."""
 
-import functools
 from typing import cast
 
 import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
-from ..fit.identify import Identified, finished
+from ..em.loop import EPOCHS, SCHEDULE, Schedule
+from ..em.noise import white_readings
+from ..fit.identify import Identified, MakeSmoother, Watch, finished, unwatched
 from ..fit.identify import identify as identify_static
 from ..model.dynamic_friction import DynamicFriction
 from ..numerics.digits import share_of
-from ..prediction_error.noise import white_readings
 from ..storage.log import Log, silent
 from .context import SEARCH_EFFORT, SearchContext
 from .hypothesis import Evidence
@@ -23,10 +24,46 @@ from .outcome import Diagnosis
 from .search import search, unbranched
 
 
-@functools.wraps(identify_static)
-def identify(rig: Rig, data: Dataset | Logs, *, start: Identified | None = None, **options) -> Identified:
-    """The fit; where `friction = "dynamic"` is declared with a contact in each joint whose friction has memory."""
-    fitted = identify_static(rig, data, start=start, **options)
+def identify(
+    rig: Rig,
+    data: Dataset | Logs,
+    *,
+    key: PRNGKeyArray,
+    smoother: MakeSmoother | None = None,
+    epochs: int = EPOCHS,
+    schedule: Schedule = SCHEDULE,
+    start: Identified | None = None,
+    watch: Watch = unwatched,
+) -> Identified:
+    """Fit the declared unknowns of a rig to logs by Expectation-Maximisation: friction, uncertain parameters, noise.
+
+    [Vantilborgh, Lefebvre & Crevecoeur, the paper that this library implements, algorithm 1]
+
+    Args:
+        rig: what is declared.
+        data: sequences to fit.
+        key: random key of the start.
+        smoother: makes the smoother, such as `nnap_em.smoothers.ParticleSmoother`; without it that of `start`, or the
+            cubature smoother.
+        epochs: of EM, at most.
+        schedule: the growing horizon.
+        start: a fit to go on from.
+        watch: called after every epoch with its state, the rows seen and the sequences used.
+
+    Returns:
+        The fitted model with what is needed to use it, to judge it and to go on; `print` shows a table.
+
+    Raises:
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
+        FitError: no sequence can be followed.
+
+    Example:
+        >>> fit = nnap_em.identify(rig, train, key=key, epochs=3)
+        >>> fit.model.log_r.shape  # one measured column
+        (1,)
+    """
+    options = {"key": key, "smoother": smoother, "epochs": epochs, "schedule": schedule, "start": start, "watch": watch}
+    fitted = identify_static(rig, data, **options)
     return with_memory(fitted, data) if rig.memory and start is None else fitted
 
 

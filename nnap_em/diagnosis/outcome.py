@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
+from ..em.recorded import Risen
 from ..fit.identify import Identified
-from ..prediction_error.recorded import Risen
-from ..residual.interventions import Intervention
 from .hypothesis import Evidence
+from .interventions import Intervention
 from .keys import Key, key_of, listed, words
 
 

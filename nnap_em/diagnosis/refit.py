@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 from ..data.dataset import Dataset
 from ..em.local import locals_along
 from ..em.mstep import Core, ScoringMStep, between
+from ..em.multistep import Followed
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..prediction_error.multistep import Followed
 from ..smoother.gaussian import linear_posterior
 from ..smoother.kalman import CUBATURE, kalman_filter, rts
 from ..smoother.posterior import Posterior

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
 from ..effects import Candidate, fields
-from ..prediction_error.shape import friction_prior
+from ..em.shape import friction_prior
 from ..storage.journal import HERE, step
 from .columns import blocks_of
 from .folds import members, parts

@@ -20,15 +20,13 @@ from ..data.rig import Rig
 from ..effects.sensor import SensorQuantization
 from ..em.loop import EMState, FitError, e_step
 from ..em.mstep import not_diverged
+from ..em.noise import white_readings
+from ..em.recorded import errors_of, left_out, level, levels, risen
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.programs import release_programs
-from ..prediction_error.noise import white_readings
-from ..prediction_error.recorded import errors_of, left_out, level, levels, risen
-from ..residual.innovations import white_innovations
-from ..residual.undisturbed import disturbance_free
 from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
 from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
@@ -37,6 +35,7 @@ from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
+from .innovations import white_innovations
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step, Suspect
@@ -44,6 +43,7 @@ from .quantised import quantised
 from .rounds import Round, screening_round
 from .smoothed import SmoothedFit, along
 from .trial import Trial, certainty
+from .undisturbed import disturbance_free
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
 
 

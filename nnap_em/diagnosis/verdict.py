@@ -2,9 +2,9 @@
 
 The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
 candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
-Elsewhere: READINGS (`prediction_error/noise.py`) and WHITE (`innovations.py`, `statistics.py`), which choose the loss;
-the bars of external disturbances (`interventions.py`, `undisturbed.py`); and counts of parts, placebos, laws
-and passes (`folds.py screen.py rounds.py refit.py context.py columns.py rivals.py equations.py`).
+Elsewhere: READINGS (`em/noise.py`) and WHITE (`innovations.py`, `statistics.py`), which choose the loss; the bars of
+external disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve (`shapes.py`); and counts of
+parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py rivals.py equations.py`).
 """
 
 import math

@@ -45,7 +45,7 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     """Share of the expected information of the `logs` of a fit that the covariance of the fit contains.
 
     It is one where noise is that of the model; on a real machine recordings disagree, the posterior is wider
-    (`prediction_error.stated.widened`), and new logs add as much less.
+    (`em.stated.widened`), and new logs add as much less.
     """
     before, variances = np.asarray(fit.prior_cov), np.diagonal(np.asarray(fit.cov))
     counts = variances > 1e-12 * variances.max()

@@ -14,6 +14,7 @@ from ..data.logs import Logs, sequences_of
 from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
+from ..em import simulated
 from ..em.build import build, build_system
 from ..em.loop import (
     EPOCHS,
@@ -29,16 +30,15 @@ from ..em.loop import (
     unsettled,
 )
 from ..em.mstep import ScoringMStep, not_diverged
+from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
+from ..em.noise import white_readings
 from ..em.prior import ParameterPrior
 from ..em.scale import holding, not_identifiable
+from ..em.stated import widened
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
 from ..numerics.profile import stage
-from ..prediction_error import simulated
-from ..prediction_error.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
-from ..prediction_error.noise import white_readings
-from ..prediction_error.stated import widened
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
@@ -142,33 +142,7 @@ def identify(
     start: Identified | None = None,
     watch: Watch = unwatched,
 ) -> Identified:
-    """Fit the declared unknowns of a rig to logs by Expectation-Maximisation: friction, uncertain parameters, noise.
-
-    [Vantilborgh, Lefebvre & Crevecoeur, the paper that this library implements, algorithm 1]
-
-    Args:
-        rig: what is declared.
-        data: sequences to fit.
-        key: random key of the start.
-        smoother: makes the smoother, such as `nnap_em.smoothers.ParticleSmoother`; without it that of `start`, or the
-            cubature smoother.
-        epochs: of EM, at most.
-        schedule: the growing horizon.
-        start: a fit to go on from.
-        watch: called after every epoch with its state, the rows seen and the sequences used.
-
-    Returns:
-        The fitted model with what is needed to use it, to judge it and to go on; `print` shows a table.
-
-    Raises:
-        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
-        FitError: no sequence can be followed.
-
-    Example:
-        >>> fit = nnap_em.identify(rig, train, key=key, epochs=3)
-        >>> fit.model.log_r.shape  # one measured column
-        (1,)
-    """
+    """Fit the declared unknowns of a rig to logs by EM, friction as a static map: `nnap_em.identify` without memory."""
     data = sequences_of(data, rig)
     if start is None:
         rig = holding(rig, not_identifiable(rig, build_system(rig), data))

@@ -11,11 +11,11 @@ from ..data.dataset import Dataset, fill_missing
 from ..data.logs import Logs, sequences_of
 from ..em.loop import SMOOTHED, e_step
 from ..em.prior import ParameterPrior
+from ..em.stated import of_states
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
-from ..prediction_error.stated import of_states
 from ..smoother.posterior import AbstractSmoother, Posterior
 from ..systems.plant import AbstractPlant
 from .identify import Identified, phi_samples

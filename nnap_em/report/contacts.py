@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from ..diagnosis.findings import Estimate, estimates, filled
 from ..diagnosis.hypothesis import covariances
+from ..diagnosis.residual import Names
 from ..effects import flat
 from ..fit.identify import Identified
 from ..model.dynamic_friction import DynamicFriction, Hysteresis, hysteresis
 from ..numerics.digits import with_std
-from ..residual.residual import Names
 from .style import AFTER, band, head, panels, styled, symbol
 
 CONTACT_WORDS = {

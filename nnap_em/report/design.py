@@ -12,10 +12,10 @@ from scipy import stats
 
 from ..data.formats import write_csv
 from ..diagnosis.keys import key_of, listed, words
+from ..diagnosis.residual import Names, names_of
 from ..experiment.criteria import Information, after
 from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
-from ..residual.residual import Names, names_of
 from ..storage.log import Log
 from .document import versions
 from .page import Picture, picture, rendered, write_report

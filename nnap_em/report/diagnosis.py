@@ -12,15 +12,15 @@ from ..data.logs import Logs
 from ..data.rig import Rig
 from ..diagnosis.change import changes
 from ..diagnosis.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
+from ..diagnosis.innovations import tests
+from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step
+from ..diagnosis.residual import Names, Residual, names_of, residual
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import GIVEN, Prediction
 from ..numerics.profile import stage
-from ..residual.innovations import tests
-from ..residual.interventions import Intervention
-from ..residual.residual import Names, Residual, names_of, residual
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
 from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure

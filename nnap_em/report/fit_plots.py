@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
+from ..diagnosis.residual import Names
 from ..effects.base import Curve
 from ..fit.identify import FrictionTable
-from ..residual.residual import Names
 from .style import (
     ACROSS,
     AFTER,

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..data.logs import Logs
 from ..diagnosis.keys import listed
+from ..diagnosis.residual import names_of
 from ..em.build import build_system
 from ..em.loop import STEP_REFUSED
 from ..fit.check import dynamics
@@ -20,7 +21,6 @@ from ..fit.misfit import misfits, moved
 from ..fit.predict import posterior_of
 from ..numerics.digits import counted
 from ..numerics.profile import stage
-from ..residual.residual import names_of
 from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .contacts import contacts, hysteresis_figure

@@ -16,9 +16,9 @@ import jinja2
 from matplotlib.figure import Figure
 
 from ..diagnosis.findings import growth
+from ..diagnosis.statistics import FAILS
 from ..effects import catalogue
 from ..numerics.digits import finite, number
-from ..residual.statistics import FAILS
 from ..storage.files import replace_text
 from . import wording
 from .tables import write_json

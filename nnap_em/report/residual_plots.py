@@ -10,8 +10,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..residual.residual import Names, Residual
-from ..residual.statistics import LAGS, autocorrelation
+from ..diagnosis.residual import Names, Residual
+from ..diagnosis.statistics import LAGS, autocorrelation
 from .style import ACROSS, AFTER, BEFORE, NORMAL_90, ZERO_LINE, dotted, head, styled, symbol
 
 

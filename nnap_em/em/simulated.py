@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
-from ..em.prior import ParameterPrior
 from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
+from .prior import ParameterPrior
 
 WINDOW = 2.0
 """Length of a simulation, in the pace of the model: a reading is one pace from its start on average."""

@@ -8,9 +8,9 @@ import scipy.stats
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
-from ..em.mstep import ScoringMStep
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
+from .mstep import ScoringMStep
 from .multistep import HORIZONS, errors, followed, huber, open_loop, weighed
 
 

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..em.local import locals_along
-from ..em.mstep import ScoringMStep
-from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
+from .local import locals_along
+from .mstep import ScoringMStep
 from .multistep import Columns, OpenLoop, followed, open_loop, sensitivities, weighed
+from .weights import Weights
 
 FEATURES = 48
 """Random functions of the state at every joint; twice as many gave the same within a tenth."""

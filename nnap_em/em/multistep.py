@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..data.dataset import Dataset
-from ..em.local import locals_along
-from ..em.mstep import ScoringMStep
-from ..em.prior import ParameterPrior
-from ..em.quadratic import Local, friction_columns, reading_columns
-from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import batches, each
 from ..smoother.kalman import CUBATURE, kalman_filter
+from .local import locals_along
+from .mstep import ScoringMStep
+from .prior import ParameterPrior
+from .quadratic import Local, friction_columns, reading_columns
 from .shape import friction_prior
+from .weights import Weights
 
 HORIZONS = (0.25, 0.5)
 """Horizons [s] at which errors are compared."""

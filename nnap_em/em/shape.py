@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel
+from .weights import Weights
 
 SHAPE = 0.1
 """Rms of a friction map beside the span of known laws, over that of the map; 0.03 to 0.3 gave the same answers."""

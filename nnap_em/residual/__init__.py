@@ -1,1 +1,0 @@
-"""Innovations of a fit and their tests, the generalised force that it lacks, external disturbances."""

@@ -31,7 +31,7 @@ from nnap_em.report.tables import plain
 from nnap_em.report.wording import p_value
 
 SEQUENCES, STEPS, EPOCHS = 8, 150, 9
-GROWN = 0.15
+GROWN = 0.25
 """Share by which the Coulomb friction grew."""
 
 

@@ -337,13 +337,7 @@ def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys)
         (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
     out = tmp_path / "fit"
     assert _run("identify", folder, "--more", new, "--out", out, "--epochs", 2, "--quiet") == 0
-    assert (
-        "fitted to 24 sequences"
-        in json.loads((out / "report.json").read_text())["verdict"]
-        .lower()
-        .replace("friction of 1 joint and m to", "fitted to")
-        or "8 sequences" in json.loads((out / "report.json").read_text())["verdict"]
-    )
+    assert "to 24 sequences" in json.loads((out / "report.json").read_text())["verdict"]
     from nnap_em.fit.store import read
 
     assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]

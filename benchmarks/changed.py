@@ -8,8 +8,9 @@
 
 planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
 planted in them; of `RIG-recorded` nothing is planted.  moved: 8 simulated recordings of 3 s, then 8 of the machine with
-a number that moved.  monitor: 16 recordings, then 200 of 1.5 s, of which the Coulomb friction grows by 1 % a recording
-from number 100 on, or which are of the same machine.  One JSON file a case; a case that has one is not run again.
+a number that moved; `slide-coulomb-2` is seed 2.  monitor: 16 recordings, then 200 of 1.5 s, of which the Coulomb
+friction grows by 1 % a recording from number 100 on, or which are of the same machine.  One JSON file a case; a case
+that has one is not run again.
 """
 
 import argparse
@@ -149,13 +150,13 @@ def write(folder: Path, system: str, kind: str, count: int, steps: int, seed: in
 
 def moved(name: str, out: Path) -> dict[str, Any]:
     """A simulated machine before and after a number moved."""
-    system, kind = name.split("-")
-    before, fit = out / "sim" / f"{system}", out / "fits" / f"sim-{system}"
+    system, kind, seed = (*name.split("-"), "0")[:3]
+    before, fit = out / "sim" / f"{system}-{seed}", out / "fits" / f"sim-{system}-{seed}"
     if not (fit / "model.npz").exists():
-        write(before, system, "none", 8, 300, 0)
+        write(before, system, "none", 8, 300, 2 * int(seed))
         command("identify", before, "--out", fit, "--quiet")
     after, found = out / "sim" / name, out / "found" / name
-    write(after, system, kind, 8, 300, 1)
+    write(after, system, kind, 8, 300, 2 * int(seed) + 1)
     status, spent, said = command("diagnose", after, "--from", fit, "--out", found)
     report = json.loads((found / "report.json").read_text()) if status == 0 else None
     return {"case": name, "report": report, "seconds": spent, "said": said}

@@ -142,11 +142,11 @@ def test_a_screen_in_blocks_is_that_of_all_at_once(question, monkeypatch):
     parts = screen(MultiStep(), q, candidates)
     for one, other in zip(parts.columns, whole.columns, strict=True):
         assert one.shape[1] == sum(len(candidate.probes) for candidate in candidates)
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(other).max())
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7 * np.abs(other).max())
     for one, other in zip(parts.screened, whole.screened, strict=True):
         assert one.candidate is other.candidate and one.band == other.band
-        np.testing.assert_allclose([one.chance, *one.share.folds], [other.chance, *other.share.folds], rtol=1e-3)
-        np.testing.assert_allclose(one.share[:2], other.share[:2], rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose([one.chance, *one.share.folds], [other.chance, *other.share.folds], rtol=1e-9)
+        np.testing.assert_allclose(one.share[:2], other.share[:2], rtol=1e-9)
 
 
 def test_blocks_keep_the_order_and_are_about_as_large_as_said(question, monkeypatch):

@@ -31,7 +31,7 @@ from nnap_em.data.rig import Declared, write_rig
 from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.findings import SuspectReport
 from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
+from nnap_em.diagnosis.verdict import CERTAIN, RISEN, veto
 from nnap_em.em.multistep import Grid
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
@@ -123,6 +123,14 @@ def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     )
 
 
+def test_what_the_recordings_of_the_fit_show_as_well_is_no_change(fit):
+    """The same recordings as above, and a fit whose own show the same friction: it is missing in it."""
+    said = []
+    closed = diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(3, GROWN), log=said.append)
+    assert not findings(closed)
+    assert any("coulomb" in line.lower() and "no certain change" in line for line in said)
+
+
 def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypatch):
     """The errors of each rise on those of the other, and the search goes from the first to the second."""
     second = identify(_rig(), _logs(1, GROWN), key=jax.random.key(0))
@@ -142,8 +150,8 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
     assert veto(**good) is None
-    assert veto(**good, before=KEEP * 0.15 - 0.01) is None
-    assert veto(**good, before=KEEP * 0.15 + 0.01).code == "before"
+    assert veto(**good, change=1.01 * CERTAIN) is None
+    assert veto(**good, change=0.99 * CERTAIN).code == "before"
 
 
 def test_where_nothing_explains_it_the_errors_decide(fit):

@@ -26,8 +26,6 @@ from .placement import Drive, OpenFile, acting_on, late, passive, placed, rotor,
 
 LONGEST_STEP = 5e-4
 """Longest time step of a written file [s]."""
-SHORTEST = 5e-5
-"""Shortest time step of a written file [s]."""
 LARGEST_RELAXATION = 1.5
 """Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
 
@@ -211,7 +209,8 @@ def _bristle(j: int, form: FrictionForm, model: StateSpaceModel, inertia: float)
 def _longest_step(forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> float:
     """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
     rates = [stiffness * forms[j].fastest / _level(forms[j]) for j, (stiffness, _) in bristles.items()]
-    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), SHORTEST)
+    shortest = 5e-5  # shortest time step of a written file [s]
+    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), shortest)
 
 
 def _level(form: FrictionForm) -> float:

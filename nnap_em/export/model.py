@@ -24,7 +24,7 @@ from . import program as portable
 from .placement import of_command
 from .unroll import Source, UnrollError, unroll
 
-PARAMETERS_FILE, PREDICTOR_FILE, STABLEHLO_FILE = "parameters.json", "predictor.py", "model.stablehlo"
+PREDICTOR_FILE, STABLEHLO_FILE = "predictor.py", "model.stablehlo"
 
 
 class ExportError(ValueError):
@@ -58,7 +58,7 @@ def write_model(fitted: Identified, out: Path | str) -> str:
     except ExportError as error:
         code, reason = "", str(error)
     step = stablehlo(fitted.model)
-    write_json(out / PARAMETERS_FILE, parameters(fitted))
+    write_json(out / "parameters.json", parameters(fitted))
     replace_bytes(out / STABLEHLO_FILE, step)
     if code:
         replace_text(out / PREDICTOR_FILE, code)

@@ -103,7 +103,8 @@ def design(
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
     discrimination = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
-    slow = _slow(fit, visited)
+    slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
+    slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
     friction = _friction(fit, visited, slow)
     criterion = _criterion(question, fitted, fit, friction, discrimination)
     rows = round(seconds / sequences / fitted.rig.dt)
@@ -181,12 +182,6 @@ def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, 
     """Velocities that were visited."""
     dof = fit.nodes.shape[0]
     return rows[np.isfinite(rows).all(axis=-1), dof : 2 * dof]
-
-
-def _slow(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, " dof"]:
-    """Speeds near rest; where the machine mostly stood still, as far as the map has its first nodes."""
-    slow_percent = 20  # percent of the rows that are near rest
-    return np.maximum(np.percentile(np.abs(visited), slow_percent, axis=0), np.sort(np.abs(fit.nodes), axis=1)[:, 2])
 
 
 def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:

@@ -83,7 +83,8 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
         if not set(keys) <= set(after):
             continue
         goal = numbers(body, after)
-        reached = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        step = stepped(*(_together(*numbers(body, values)) for values in (before, after)))
+        reached = [step.mass, *step.centre, *(step.inertia[i, j] for i, j in PAIRS)]  # in the order of `keys`
         fine = physical(goal[0], goal[2])
         out |= {name: jnp.where(fine, after[name], one) for name, one in zip(keys, reached, strict=True)}
     return out
@@ -91,11 +92,6 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
 
 def _together(mass: Scalar, centre: Three, tensor: Turn) -> Numbers:
     return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in tensor]))
-
-
-def _in_order(body: Numbers) -> list[Scalar]:
-    """Numbers in the order of `names`."""
-    return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 
 class LoadPoint(NamedTuple):

@@ -32,6 +32,7 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
     if of is None:
         _used(model, (*rates.values(), *readings.values()), parameters, inputs)
         _used(unknown, (*rates.values(), *readings.values()), named)
+    inherited = {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
     text = Text(
         states,
         inputs,
@@ -40,7 +41,7 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
         tuple(parameters),
         named,
         {name: (port, signals) for name, (port, signals) in terms.items() if port},
-        {**own.units, **_inherited(readings, states), **units},
+        {**own.units, **inherited, **units},
         own.function,
     )
     spec = SystemSpec(tuple(states), tuple(parameters), {}, 0, sensors=tuple(readings))
@@ -125,11 +126,6 @@ def _readings(measurement: Any, states: Collection[str], known: Collection[str])
                 name, "a column with the name of a state, but another formula", "name the state or the column otherwise"
             )
     return {name: formula for name, formula in every.items() if name not in states}
-
-
-def _inherited(readings: Mapping[str, Formula], states: Mapping[str, str]) -> dict[str, str]:
-    """Units of columns that read a state as it is."""
-    return {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
 
 
 def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:

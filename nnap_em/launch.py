@@ -26,9 +26,6 @@ from .storage.files import cores
 PATIENCE = 600
 """Time that processes wait for each other [s]: one may compile while the others are done, on a machine that is busy."""
 
-FAREWELL = 10
-"""Time for the first process to report its finished steps when it is stopped by Ctrl-C [s]."""
-
 
 def free_address() -> str:
     """An address on this machine at which nobody listens."""
@@ -65,6 +62,7 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
 
 def watch(children: list[subprocess.Popen], first: int) -> int:
     """Wait for all; where one dies, end the others, which would wait for it for ever.  The exit status."""
+    farewell = 10  # time for the first process to report its finished steps when it is stopped by Ctrl-C [s]
     try:
         while any(child.poll() is None for child in children):
             if any(child.poll() for child in children):
@@ -74,7 +72,7 @@ def watch(children: list[subprocess.Popen], first: int) -> int:
         return _blame(children, first) if any(child.returncode for child in children) else 0
     except KeyboardInterrupt:  # a terminal sends it to the children, too
         with suppress(subprocess.TimeoutExpired):
-            children[0].wait(FAREWELL)
+            children[0].wait(farewell)
         raise
     finally:
         for child in children:

@@ -1,7 +1,8 @@
 """What several tests make: logs and their text, a declared model, and what a search knows of it."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -112,45 +113,33 @@ def slide() -> tuple[StateSpaceModel, ScoringMStep]:
     return model, ScoringMStep(prior, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q)
 
 
-def pendulum_rig(columns: str = '"theta1", "dtheta1"') -> str:
-    """rig.toml of a pendulum with the input `u`, sampled every 0.01 s, of which these `columns` are measured."""
-    return f"""format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.3
-lc = 0.2
-I = 0.01
-g = 9.81
-friction = "unknown"
-[input]
-columns = ["u"]
-joints = [1]
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = [{columns}]
-"""
+def rig_text(model: str, columns: str | Sequence[str], dt: float = 0.01) -> str:
+    """rig.toml of the table [model] and those behind it, with the measured columns, by name or as the table itself."""
+    measured = columns if isinstance(columns, str) else json.dumps([*columns])
+    sampling = f'[sampling]\ndt = {dt}\ninput_hold = "zero-order"\nclock = "sequence"\n'
+    return f'format = 1\nname = "bench"\n[model]\n{model}\n{sampling}[measurement]\ncolumns = {measured}\n'
+
+
+def file_rig(file: str, columns: Sequence[str], more: str = "", friction: str = "unknown", dt: float = 0.01) -> str:
+    """`rig_text` of a machine from a file; `more` continues its table [model]."""
+    return rig_text(f'type = "mjcf"\nfile = "{file}"\nfriction = "{friction}"\n{more}', columns, dt)
+
+
+PENDULUM = 'type = "pendulum"\nm = 0.5\nlc = 0.2\nI = 0.002\ng = 9.81\nfriction = "unknown"\n'
+
+
+def pendulum_rig(columns: Sequence[str] = ("theta1", "dtheta1"), dt: float = 0.01) -> str:
+    """rig.toml of a pendulum with the input `u`, of which these `columns` are measured."""
+    return rig_text(f'{PENDULUM}[input]\ncolumns = ["u"]\njoints = [1]', columns, dt)
 
 
 def chain_rig(columns: str, unknown: str = "") -> str:
     """rig.toml of two states in a chain, written as equations, with these `columns` and `unknown` terms."""
-    return f"""format = 1
-name = "chain"
-[model]
-type = "equations"
-inputs = {{ u = "V" }}
-states = {{ a = "V", b = "V" }}
-rates = {{ a = "k*u - a/ta", b = "(a - b)/2" }}
-k = {{ mean = 1.0, std = 0.3 }}
-ta = {{ mean = 4.0, std = 1.0 }}
-{unknown}
-[sampling]
-dt = 0.5
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = {{ {columns} }}
+    model = """type = "equations"
+inputs = { u = "V" }
+states = { a = "V", b = "V" }
+rates = { a = "k*u - a/ta", b = "(a - b)/2" }
+k = { mean = 1.0, std = 0.3 }
+ta = { mean = 4.0, std = 1.0 }
 """
+    return rig_text(model + unknown, f"{{ {columns} }}", 0.5)

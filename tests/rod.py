@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from helpers import rig_text
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Rig, read_rig
@@ -54,10 +55,7 @@ def rig(folder: Path, *, pendulum: bool = False) -> Rig:
     if pendulum:
         joint, inputs = "theta1", '[input]\ncolumns = ["tau"]\njoints = [1]\n'
         model = f'type = "pendulum"\nm = {MASS}\nlc = {LENGTH}\nI = {INERTIA}\ng = {GRAVITY}'
-    (folder / "rig.toml").write_text(
-        f'format = 1\nname = "rod"\n[model]\n{model}\nfriction = "unknown"\n{inputs}'
-        f'[sampling]\ndt = {DT}\ninput_hold = "zero-order"\nclock = "sequence"\n'
-        f'[measurement]\ncolumns = ["{joint}", "d{joint}"]\n'
-        f"[measurement.noise_std]\n{joint} = {NOISE[0]}\nd{joint} = {NOISE[1]}\n"
-    )
+    text = rig_text(f'{model}\nfriction = "unknown"\n{inputs}', (joint, f"d{joint}"), DT)
+    noise = f"[measurement.noise_std]\n{joint} = {NOISE[0]}\nd{joint} = {NOISE[1]}\n"
+    (folder / "rig.toml").write_text(text + noise)
     return read_rig(folder / "rig.toml", specs)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import file_rig
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
@@ -83,11 +84,7 @@ of its own between them, 2 kg act 0.4 m off its axis: 7.8 N m."""
 def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
     """In the unit of the file all is well, a thousand times too large is not, and with loads at zero neither was."""
     (tmp_path / "arm.xml").write_text(UPRIGHT)
-    (tmp_path / "rig.toml").write_text(
-        'format = 1\nname = "arm"\n[model]\ntype = "mjcf"\nfile = "arm.xml"\nfriction = "unknown"\n'
-        '[sampling]\ndt = 0.1\ninput_hold = "zero-order"\nclock = "sequence"\n'
-        '[measurement]\ncolumns = ["pan", "shoulder", "twist", "elbow"]\n'
-    )
+    (tmp_path / "rig.toml").write_text(file_rig("arm.xml", ("pan", "shoulder", "twist", "elbow"), dt=0.1))
     rig = read_rig(tmp_path / "rig.toml", specs)
     t = 0.1 * np.arange(ROWS)
     way = 0.5 * (1 - np.cos(0.1 * np.pi * t))  # so slowly that inertia asks for nothing
@@ -156,55 +153,30 @@ def test_readings_that_tell_no_velocity_are_bad(slide):
     assert "the motion hardly rises above it" in report["noise"][0][1]
 
 
-CASES = {  # name: (change, subject, mark, words)
-    "few rows": (dict(valid=lambda v: v & (np.arange(ROWS) < 15)), "length", "error", "too few"),
-    "short sequences": (dict(valid=lambda v: v & (np.arange(ROWS) < 50)), "length", "warning", "0.5 s"),
-    "gaps": (
-        dict(y=lambda y: np.where((np.arange(ROWS) % 3 > 0)[None, :, None], np.nan, y)),
-        "missing",
-        "warning",
-        "x: 67 %",
+ROW = np.arange(ROWS)
+CASES = {  # the words of the check, then name: change
+    "length | error | too few": dict(valid=lambda v: v & (ROW < 15)),
+    "length | warning | 0.5 s": dict(valid=lambda v: v & (ROW < 50)),
+    "missing | warning | x: 67 %": dict(y=lambda y: np.where((ROW % 3 > 0)[None, :, None], np.nan, y)),
+    "missing | error | x: 80 %": dict(y=lambda y: np.where((ROW % 20 > 3)[None, :, None], np.nan, y)),
+    "torque | error | look at its unit (N)": dict(u=lambda u: 1000 * u),
+    "torque | error | its unit (N)": dict(u=lambda u: u / 1e5),
+    "motion | warning | one direction only": dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)),
+    "motion | error | hardly moves": dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)),
+    "motion | warning | it rests most of the time": dict(y=lambda y: y * np.where(ROW < 20, 1.0, 1e-3)[None, :, None]),
+    "noise | warning | declare more": dict(
+        y=lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0],
     ),
-    "hardly any reading": (
-        dict(y=lambda y: np.where((np.arange(ROWS) % 20 > 3)[None, :, None], np.nan, y)),
-        "missing",
-        "error",
-        "x: 80 %",
-    ),
-    "forces in mN": (dict(u=lambda u: 1000 * u), "torque", "error", "look at its unit (N)"),
-    "forces in kN": (dict(u=lambda u: u / 1e5), "torque", "error", "look at its unit (N)"),
-    "one way": (
-        dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)),
-        "motion",
-        "warning",
-        "one direction only",
-    ),
-    "no motion": (dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)), "motion", "error", "hardly moves"),
-    "rest": (
-        dict(y=lambda y: y * np.where(np.arange(ROWS) < 20, 1.0, 1e-3)[None, :, None]),
-        "motion",
-        "warning",
-        "it rests most of the time",
-    ),
-    "more noise than declared": (
-        dict(y=lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0]),
-        "noise",
-        "warning",
-        "declare more",
-    ),
+    "noise | warning | was filtered": dict(rig=_rig(noise={"x": 1e-3, "dx": 0.1})),
 }
 
 
-@pytest.mark.parametrize("change, subject, mark, words", CASES.values(), ids=CASES)
-def test_what_is_bad_is_found(slide, change, subject, mark, words):
-    answers = _report(_changed(slide, **change))[subject]
-    assert any(actual == mark and words in text for actual, text in answers), answers
-
-
-def test_a_filtered_log_is_noticed(slide):
-    answers = _report(slide, _rig(noise={"x": 1e-3, "dx": 0.1}))["noise"]
-    assert answers[1][0] == "warning"
-    assert "was filtered" in answers[1][1]
+@pytest.mark.parametrize("words", CASES)
+def test_what_is_bad_is_found(slide, words):
+    (subject, mark, text), change = words.split(" | "), {"rig": None} | CASES[words]
+    rig = change.pop("rig")
+    answers = _report(_changed(slide, **change), rig)[subject]
+    assert any(actual == mark and text in said for actual, said in answers), answers
 
 
 def test_with_hardly_any_rows_nothing_else_is_asked(slide):

@@ -90,7 +90,7 @@ def test_what_machines_do_is_no_counter(y, options):
 
 
 RIG = (
-    pendulum_rig('"theta1"')
+    pendulum_rig(("theta1",))
     + """[import.columns]
 theta1 = { from = "counts", scale = 0.00015339807878856412 }
 """

@@ -27,7 +27,7 @@ from nnap_em.import_.resample import resample
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
-RIG = pendulum_rig().replace("dt = 0.01", f"dt = {DT}")
+RIG = pendulum_rig(dt=DT)
 ARM = """<mujoco><worldbody><body name="link"><joint name="joint0" axis="0 1 0"/>
 <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.001"/></body></worldbody></mujoco>"""
 

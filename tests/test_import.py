@@ -441,15 +441,7 @@ def test_the_page_tells_what_was_done(tmp_path):
     log = _write(tmp_path / "a.mcap", t, DT * np.arange(1000), np.cos(DT * np.arange(1000)))
     assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 0
     page = (tmp_path / "out/import.html").read_text()
-    for text in (
-        "/js",
-        "/cmd",
-        "train/000.csv",
-        "test/000.csv",
-        "header stamp",
-        "log time",
-        "data:image",
-    ):
+    for text in ("/js", "/cmd", "train/000.csv", "test/000.csv", "header stamp", "log time", "data:image"):
         assert text in page
     assert "<script" not in page and "http" not in page.split("</style>")[1].split("data:image")[0]
     topic = json.loads((tmp_path / "out/import.json").read_text())["logs"][0]["topics"][0]

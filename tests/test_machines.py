@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import file_rig
 from machines import arm, tree
 
 from nnap_em.data.dataset import Dataset
@@ -142,11 +143,7 @@ def _rig(folder: Path, machine: Path | str, *, measured=("joint1",), model: str 
     """A rig.toml beside a machine file, which is copied or written."""
     name = machine.name if isinstance(machine, Path) else "machine.xml"
     (folder / name).write_text(machine.read_text() if isinstance(machine, Path) else machine)
-    columns = ", ".join(f'"{column}"' for column in measured)
-    (folder / "rig.toml").write_text(
-        f'format = 1\nname = "bench"\n[model]\ntype = "mjcf"\nfile = "{name}"\nfriction = "unknown"\n{model}\n{rest}\n'
-        f'[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n[measurement]\ncolumns = [{columns}]\n'
-    )
+    (folder / "rig.toml").write_text(file_rig(name, measured, f"{model}\n{rest}"))
     return folder / "rig.toml"
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slide
+from helpers import file_rig, slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig, read_rig
@@ -244,20 +244,7 @@ CART = """<mujoco><option gravity="0 0 0"/><worldbody><body name="cart">
 <joint name="x" type="slide" axis="1 0 0" stiffness="20"/>
 <geom type="box" size=".1 .1 .1" mass="1.2"/><site name="s"/></body></worldbody>
 <actuator><motor name="push" joint="x"/></actuator><sensor><accelerometer name="acc" site="s"/></sensor></mujoco>"""
-CART_RIG = """format = 1
-name = "cart"
-[model]
-type = "mjcf"
-file = "cart.xml"
-friction = "none"
-[sampling]
-dt = 0.05
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["x", "acc.x"]
-noise_std = { x = 0.05, "acc.x" = 0.1 }
-"""
+CART_RIG = file_rig("cart.xml", ("x", "acc.x"), friction="none", dt=0.05) + 'noise_std = { x = 0.05, "acc.x" = 0.1 }\n'
 
 
 def test_an_acceleration_counts_when_its_input_is_known(tmp_path):

@@ -67,33 +67,13 @@ def test_energy_is_that_of_two_rods():
     assert energy == pytest.approx(kinetic + height, rel=1e-8)
 
 
-NOTHING = {
-    "torsional_spring": {"k": 0.0},
-    "base_tilt": {"angle": 0.0},
-    "payload": {"mass": 0.0},
-    "link_inertia": {"dI": 0.0},
-    "link_length": {"dl": 0.0},
-    "center_of_mass": {"dlc": 0.0},
-    "air_drag": {"c": 0.0},
-    "motor_gain": {"gain": 1.0},
-    "dead_zone": {"width": 0.0},
-    "saturation": {"limit": 9.0},
-    "input_delay": {"delay": 0.0},
-    "actuator_lag": {"tau": 0.0},
-    "cogging": {"amplitude": 0.0},
-    "torque_offset": {"value": 0.0},
-    "position_dependent_friction": {"depth": 0.0},
-    "friction_drift": {"change": 0.0},
-    "sensor_bias": {"bias": 0.0},
-    "sensor_scale": {"scale": 1.0},
-    "sensor_delay": {"delay": 0.0},
-    "sensor_quantization": {"step": 0.0},
-    "base_vibration": {"amplitude": 0.0},
-    "payload_step": {"mass": 0.0, "time": 0.2},
-    "hard_stop": {"upper": 99.0, "lower": -99.0},
-    "eddy_brake": {"c": 0.0},
-    "motor_back_emf": {"b": 0.0},
-}
+ZERO = """torsional_spring k, base_tilt angle, payload mass, link_inertia dI, link_length dl, center_of_mass dlc,
+air_drag c, dead_zone width, input_delay delay, actuator_lag tau, cogging amplitude, torque_offset value,
+position_dependent_friction depth, friction_drift change, sensor_bias bias, sensor_delay delay,
+sensor_quantization step, base_vibration amplitude, eddy_brake c, motor_back_emf b"""
+NOTHING = {name: {number: 0.0} for name, number in map(str.split, ZERO.split(","))}
+NOTHING |= {"motor_gain": {"gain": 1.0}, "saturation": {"limit": 9.0}, "sensor_scale": {"scale": 1.0}}
+NOTHING |= {"payload_step": {"mass": 0.0, "time": 0.2}, "hard_stop": {"upper": 99.0, "lower": -99.0}}
 MOTORS = {"backlash", "joint_flexibility"}  # bring an inertia of their own
 
 

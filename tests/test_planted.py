@@ -93,14 +93,14 @@ def _unknown(tag: str, joint: int, **values: float):
     return tag, joint, values, _Force(tag, tuple(values.items()), joint=joint)
 
 
+def _wave(size: float, phase: float):
+    """Sine and cosine part of a wave."""
+    return a(size * np.cos(phase)), a(size * np.sin(phase))
+
+
 FORCES = [
     ("spring", 2, {"k": 0.5, "theta0": 0.3}, TorsionalSpring(a(0.5), a(0.15), a(0.0), a(0.0), joint=2)),
-    (
-        "cogging",
-        1,
-        {"k": 4.0, "amplitude": 0.3, "phase": 0.7},
-        Cogging(a(0.3 * np.cos(0.7)), a(0.3 * np.sin(0.7)), a(4.0), joint=1),
-    ),
+    ("cogging", 1, {"k": 4.0, "amplitude": 0.3, "phase": 0.7}, Cogging(*_wave(0.3, 0.7), a(4.0), joint=1)),
     (
         "ripple",
         2,
@@ -112,15 +112,10 @@ FORCES = [
         "friction",
         2,
         {"depth": 0.8, "n": 3.0, "phase": 0.6},
-        PositionDependentFriction(a(0.8 * np.cos(0.6)), a(-0.8 * np.sin(0.6)), a(3.0), joint=2),
+        PositionDependentFriction(*_wave(0.8, -0.6), a(3.0), joint=2),
     ),
-    ("brake", 1, {"c": 0.2, "center": 0.4}, EddyBrake(a(0.2 * np.cos(0.8)), a(0.2 * np.sin(0.8)), joint=1)),
-    (
-        "shake",
-        None,
-        {"amplitude": 2.0, "frequency": 1.7, "phase": 0.5},
-        BaseVibration(a(2 * np.cos(0.5)), a(2 * np.sin(0.5)), a(1.7)),
-    ),
+    ("brake", 1, {"c": 0.2, "center": 0.4}, EddyBrake(*_wave(0.2, 0.8), joint=1)),
+    ("shake", None, {"amplitude": 2.0, "frequency": 1.7, "phase": 0.5}, BaseVibration(*_wave(2.0, 0.5), a(1.7))),
     _unknown("bump", 2, amplitude=0.4, center=-0.2, width=0.3),
     _unknown("patch", 1, amplitude=0.4, center=0.2, width=0.3),
     _unknown("square", 2, amplitude=0.3, frequency=2.5, phase=0.0),
@@ -290,40 +285,31 @@ def _record(true: list[dict], entries: list[dict], after: float = 0.2, **more) -
     return record | {"report": {"effects": entries, "error": error} | more}
 
 
+SPRING_2, LATE = _true("spring", 2, k=0.3, theta0=0.1), _true("late", None, "all", delay=0.02)
+ONESIDED, SQUARE = _true("onesided", 2, loss=0.3), _true("square", 2, amplitude=0.3, frequency=1.0)
+RIPPLE = _true("ripple", 2, k=4.0, amplitude=0.3, phase=0.1)
 RIGHT = [
-    (_true("spring", 2, k=0.3, theta0=0.1), [_entry("torsional_spring", 2, k=0.31, theta0=0.2)]),
-    (_true("spring", 2, k=0.3, theta0=0.1), [_entry("unknown_function", 2, inputs=["theta2"])]),
+    (SPRING_2, [_entry("torsional_spring", 2, k=0.31, theta0=0.2)]),
+    (SPRING_2, [_entry("unknown_function", 2, inputs=["theta2"])]),
     (_true("bump", 1, amplitude=0.3), [_entry("unknown_function", 1, inputs=["theta1"])]),
     (_true("patch", 1, amplitude=0.3), [_entry("unknown_function", 1, inputs=["dtheta1", "theta1"])]),
-    (_true("onesided", 2, loss=0.3), [_entry("unknown_function", 2, inputs=["tau2"])]),
-    (_true("onesided", 2, loss=0.3), [_entry("unknown_function", 2, inputs=["tau2"], loss=0.31)]),
+    (ONESIDED, [_entry("unknown_function", 2, inputs=["tau2"])]),
+    (ONESIDED, [_entry("unknown_function", 2, inputs=["tau2"], loss=0.31)]),
     (_true("load", 1, mu=0.3), [_entry("unknown_function", 1, inputs=["tau1", "dtheta1"], mu=0.29)]),
     (_true("bias", None, "theta1", bias=0.1), [_entry("base_tilt", angle=-0.1)]),
-    (
-        _true("late", None, "all", delay=0.02),
-        [_entry("input_delay", 2, delay=0.02), _entry("input_delay", 1, delay=0.02)],
-    ),
+    (LATE, [_entry("input_delay", 2, delay=0.02), _entry("input_delay", 1, delay=0.02)]),
     (_true("gain", 1, gain=0.8), [_entry("motor_gain", 2, gain=1.25)]),
-    (
-        _true("ripple", 2, k=4.0, amplitude=0.3, phase=0.1),
-        [_entry("cogging", 2, k=k, amplitude=0.3, phase=0.1) for k in (4, 8)],
-    ),
-    (
-        _true("square", 2, amplitude=0.3, frequency=1.0),
-        [_entry("base_vibration", frequency=1.0, amplitude=1.0, phase=0.0)],
-    ),
+    (RIPPLE, [_entry("cogging", 2, k=k, amplitude=0.3, phase=0.1) for k in (4, 8)]),
+    (SQUARE, [_entry("base_vibration", frequency=1.0, amplitude=1.0, phase=0.0)]),
 ]
 WRONG = [
-    (_true("spring", 2, k=0.3, theta0=0.1), _entry("torsional_spring", 1, k=0.3, theta0=0.1)),
-    (_true("spring", 2, k=0.3, theta0=0.1), _entry("unknown_function", 2, inputs=["theta1"])),
-    (_true("onesided", 2, loss=0.3), _entry("unknown_function", 2, inputs=["tau1"])),
+    (SPRING_2, _entry("torsional_spring", 1, k=0.3, theta0=0.1)),
+    (SPRING_2, _entry("unknown_function", 2, inputs=["theta1"])),
+    (ONESIDED, _entry("unknown_function", 2, inputs=["tau1"])),
     (_true("bias", None, "theta2", bias=0.1), _entry("base_tilt", angle=-0.1)),
-    (_true("late", None, "all", delay=0.02), _entry("input_delay", 2, delay=0.02)),
+    (LATE, _entry("input_delay", 2, delay=0.02)),
     (_true("gain", 1, gain=0.8), _entry("motor_gain", 2, gain=0.8)),
-    (
-        _true("square", 2, amplitude=0.3, frequency=1.0),
-        _entry("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0),
-    ),
+    (SQUARE, _entry("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0)),
 ]
 
 

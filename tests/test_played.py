@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import optimised
+from helpers import file_rig, optimised
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
@@ -38,21 +38,7 @@ CART = """<mujoco model="two"><compiler angle="radian"/><worldbody>
 <inertial pos="0 0 -0.25" mass="0.5" diaginertia="0.005 0.005 0.0001"/><site name="hand" pos="0 0 -0.4"/></body></body>
 </worldbody><actuator><motor name="push" joint="rail"/><motor name="turn" joint="pole" gear="2"/></actuator></mujoco>"""
 ARM = CART.replace('name="rail" type="slide" axis="1 0 0"', 'name="rail" axis="0 1 0"')
-RIG = """format = 1
-name = "two"
-[model]
-type = "mjcf"
-file = "two.xml"
-friction = "none"
-[input]
-columns = ["push", "turn"]
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["rail", "pole"]
-"""
+RIG = file_rig("two.xml", ("rail", "pole"), '[input]\ncolumns = ["push", "turn"]', friction="none")
 ROWS, X0 = 150, np.array([0.0, 0.3, 0.0, 0.0])
 
 

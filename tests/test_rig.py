@@ -122,6 +122,7 @@ def test_byte_order_mark_and_windows_lines_are_accepted(tmp_path):
     assert _read(tmp_path, "\ufeff" + GOOD.replace("\n", "\r\n")) == _read(tmp_path, GOOD)
 
 
+INPUT = '[input]\ncolumns = ["tau1", "tau2"]\njoints = [1, 2]'
 MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what was found and the hint)
     "syntax": ("dt = 0.01", "dt = ", "line 22", "not TOML", "key = value"),
     "key twice": ("m2 = 0.25", "m2 = 0.25\nm2 = 0.3", "line 8", "not TOML", "no key twice"),
@@ -154,13 +155,7 @@ MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what 
     "friction missing": ('friction = "unknown"', "", "[model] friction:", "missing", '"none"'),
     "friction unheard of": ('"unknown"', '"unknwon"', "[model] friction:", "'unknwon'", "did you mean 'unknown'?"),
     "friction a boolean": ('"unknown"', "true", "[model] friction:", "True", '"unknown" (to be learned)'),
-    "no input at all": (
-        '[input]\ncolumns = ["tau1", "tau2"]\njoints = [1, 2]',
-        "",
-        "[model] actuated_joint:",
-        "missing",
-        "actuated_joint = 2",
-    ),
+    "no input at all": (INPUT, "", "[model] actuated_joint:", "missing", "actuated_joint = 2"),
     "joint out of range": ("[1, 2]", "[1, 3]", "[input] joints:", "[1, 3]", "from 1 to 2"),
     "joint zero": ("[1, 2]", "[0, 1]", "[input] joints:", "[0, 1]", "from 1 to 2"),
     "joint twice": ("[1, 2]", "[1, 1]", "[input] joints:", "[1, 1]", "different joints"),

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import PENDULUM, rig_text
 
 from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
@@ -17,34 +18,14 @@ from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
 from nnap_em.systems import specs
 
-RIG = """format = 1
-name = "bench"
-[model]
-type = "pendulum"
-m = 0.5
-lc = 0.2
-I = 0.002
-g = 9.81
-friction = "unknown"
-[input]
-columns = ["goal"]
-joints = [1]
-kind = "position"
-{lines}
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["theta1"]
-"""
 KP = "kp = { mean = 3.0, std = 1.0, at = { gain = 200.0, supply = 7.4 } }"
 LIMIT = "limit = { mean = 0.6, std = 0.0, at = { supply = 7.4 } }"
 GAIN, SUPPLY = 400.0, 5.5
 
 
 def _rig(path: Path, lines: str) -> Rig:
-    (path / "rig.toml").write_text(RIG.format(lines=lines))
+    servo = f'{PENDULUM}[input]\ncolumns = ["goal"]\njoints = [1]\nkind = "position"\n{lines}'
+    (path / "rig.toml").write_text(rig_text(servo, ("theta1",)))
     return read_rig(path / "rig.toml", specs)
 
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from arm import JOINTS, declared, friction, machine, recorded
-from helpers import csv_text, optimised
+from helpers import csv_text, file_rig, optimised, rig_text
 from machine_files import errors
 from machines import arm
 
@@ -82,12 +82,7 @@ def _columns(sites) -> list[str]:
 
 def _rig(folder: Path, text: str, columns, rest: str = "", model: str = "") -> Path:
     (folder / "machine.xml").write_text(text)
-    names = ", ".join(f'"{column}"' for column in columns)
-    (folder / "rig.toml").write_text(
-        f'format = 1\nname = "bench"\n[model]\ntype = "mjcf"\nfile = "machine.xml"\nfriction = "unknown"\n{model}\n'
-        f'[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n[measurement]\ncolumns = [{names}]\n'
-        f"{rest}"
-    )
+    (folder / "rig.toml").write_text(file_rig("machine.xml", columns, model) + rest)
     return folder / "rig.toml"
 
 
@@ -270,11 +265,8 @@ def test_sensors_of_sites_that_are_missing_are_refused_by_the_compiler(tmp_path)
 def test_a_machine_that_is_no_file_has_no_sensors(tmp_path):
     with pytest.raises(RigError, match=re.escape("'hand_gyro.x' is no state of this system; possible here: x, dx")):
         path = tmp_path / "rig.toml"
-        path.write_text(
-            'format = 1\nname = "bench"\n[model]\ntype = "slide"\nm = 1.0\nfriction = "unknown"\nactuated_joint = 1\n'
-            '[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n'
-            '[measurement]\ncolumns = ["x", "hand_gyro.x"]\n'
-        )
+        model = 'type = "slide"\nm = 1.0\nfriction = "unknown"\nactuated_joint = 1'
+        path.write_text(rig_text(model, ("x", "hand_gyro.x")))
         read_rig(path, specs)
 
 

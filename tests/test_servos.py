@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import PENDULUM, rig_text
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
@@ -46,25 +47,15 @@ ACTUATORS = {
     "general as a servo": '<general name="goal" joint="a" gainprm="9" biastype="affine" biasprm="0 -9 -1"/>',
     "offset": '<general name="goal" joint="a" gainprm="9" biastype="affine" biasprm=".5 -9 -1"/>',
 }
-RIG = """format = 1
-name = "bench"
-[model]
-type = "{type}"
-{model}
-friction = "unknown"
-{input}
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = [{read}]
+
+SLIDE = 'type = "slide"\nm = 1.0\nfriction = "unknown"\n'
+ACROBOT = """type = "acrobot"\nm1 = 0.3\nm2 = 0.25\nl1 = 0.2\nl2 = 0.2\nlc1 = 0.1\nlc2 = 0.1\nI1 = 0.001\nI2 = 0.001
+g = 9.81\nfriction = "unknown"
 """
-PENDULUM = "m = 0.5\nlc = 0.2\nI = 0.002\ng = 9.81"
 
 
-def _rig(path: Path, text: str, *, model: str = PENDULUM, kind: str = "pendulum", read: str = '"theta1"') -> Rig:
-    (path / "rig.toml").write_text(RIG.format(type=kind, model=model, input=text, read=read))
+def _rig(path: Path, text: str, *, model: str = PENDULUM, read: tuple[str, ...] = ("theta1",)) -> Rig:
+    (path / "rig.toml").write_text(rig_text(model + text, read))
     return read_rig(path / "rig.toml", specs)
 
 
@@ -74,7 +65,8 @@ def _servo(path: Path, lines: str, **model) -> Rig:
 
 def _of_file(path: Path, actuators: str, text: str = "", more: str = "") -> Rig:
     (path / "machine.xml").write_text((TWO % actuators).replace('axis="0 1 0"', f'axis="0 1 0" {more}'))
-    return _rig(path, text, model='file = "machine.xml"', kind="mjcf", read='"a", "rail"')
+    model = 'type = "mjcf"\nfile = "machine.xml"\nfriction = "unknown"\n'
+    return _rig(path, text, model=model, read=("a", "rail"))
 
 
 def _logs(u: np.ndarray, y: np.ndarray | None = None, dt: float = 0.01) -> Dataset:
@@ -122,7 +114,7 @@ def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
 
     Tolerance: the fourth-order method at STIFF = 0.5 loses (w h)^5 / 120 of the phase in a step.
     """
-    rig = _servo(tmp_path, 'kind = "position"\nkp = 160000.0', model="m = 1.0", kind="slide", read='"x"')
+    rig = _servo(tmp_path, 'kind = "position"\nkp = 160000.0', model=SLIDE, read=("x",))
     model = _model(dataclasses.replace(rig, friction=False))
     w, rows = 400.0, 12
     row = _row(model, 0.5)
@@ -184,15 +176,14 @@ def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
 def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
     """Laws of the input give a torque column the same beside a servo and without one."""
     text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
-    model = "m1 = 0.3\nm2 = 0.25\nl1 = 0.2\nl2 = 0.2\nlc1 = 0.1\nlc2 = 0.1\nI1 = 0.001\nI2 = 0.001\ng = 9.81"
-    both = _rig(tmp_path, text + '[input.goal]\nkind = "position"\nkp = 3.0', model=model, kind="acrobot")
+    both = _rig(tmp_path, text + '[input.goal]\nkind = "position"\nkp = 3.0', model=ACROBOT)
     assert both.input_kinds == ("position", "torque")
     laws = (InputDelay.of(0.013, joint=1), MotorGain.of(0.1, joint=1))
     rng = np.random.default_rng(1)
     seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2))))
     x = jnp.asarray(rng.normal(size=4))
     beside = _model(both, laws)
-    alone = _model(_rig(tmp_path, text, model=model, kind="acrobot"), laws)
+    alone = _model(_rig(tmp_path, text, model=ACROBOT), laws)
     for k in (0, 1, 7):
         rows = [jax.tree.map(lambda a, k=k: a[k], m.inputs(seq)) for m in (beside, alone)]
         one, two = (m.scene(x, row).drive[0] for m, row in zip((beside, alone), rows, strict=True))
@@ -214,8 +205,7 @@ kind = "velocity"
 kv = 0.4
 delay = { mean = 0.01, std = 0.005 }
 """
-    model = "m1 = 0.3\nm2 = 0.25\nl1 = 0.2\nl2 = 0.2\nlc1 = 0.1\nlc2 = 0.1\nI1 = 0.001\nI2 = 0.001\ng = 9.81"
-    rig = _rig(tmp_path, text, model=model, kind="acrobot")
+    rig = _rig(tmp_path, text, model=ACROBOT)
     assert rig.kinds == {"goal1": "position", "goal2": "velocity"}
     numbers = {name: value for name, value in rig.parameters.items() if name not in rig.bodies}
     assert numbers == {

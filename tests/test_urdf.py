@@ -6,6 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import file_rig
 from machines import tree
 
 from nnap_em.data.rig import Declared, RigWarning, read_rig
@@ -98,11 +99,8 @@ def test_a_rotor_behind_a_gear_counts_at_its_joint(tmp_path, dialect, number):
 
 def _rig(folder: Path, inside: str, uncertain: str = ""):
     _urdf(folder, inside)
-    (folder / "rig.toml").write_text(
-        'format = 1\nname = "r"\n[model]\ntype = "mjcf"\nfile = "m.urdf"\nfriction = "unknown"\n[model.uncertain]\n'
-        f'{uncertain}\n[input]\ncolumns = ["u"]\njoints = ["j1"]\n[sampling]\ndt = 0.01\ninput_hold = "zero-order"\n'
-        'clock = "sequence"\n[measurement]\ncolumns = ["j1"]\n'
-    )
+    more = f'[model.uncertain]\n{uncertain}\n[input]\ncolumns = ["u"]\njoints = ["j1"]'
+    (folder / "rig.toml").write_text(file_rig("m.urdf", ("j1",), more))
     return read_rig(folder / "rig.toml", specs)
 
 

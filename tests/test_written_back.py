@@ -12,6 +12,7 @@ import machine_files
 import mujoco
 import numpy as np
 import pytest
+from helpers import file_rig
 from machine_files import CASES, errors, friction, recorded
 
 from nnap_em import identify
@@ -106,11 +107,8 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     machine = read_machine(path)
     (tmp_path / file).write_text(path.read_text())
     joints = [joint.name for joint in machine.joints]
-    (tmp_path / "rig.toml").write_text(
-        f'format = 1\nname = "b"\n[model]\ntype = "mjcf"\nfile = "{file}"\nfriction = "none"\n[input]\n'
-        f'columns = ["u"]\njoints = [1]\n[sampling]\ndt = 0.01\ninput_hold = "zero-order"\nclock = "sequence"\n'
-        f'[measurement]\ncolumns = ["{joints[0]}"]\n'
-    )
+    text = file_rig(file, joints[:1], '[input]\ncolumns = ["u"]\njoints = [1]\n', friction="none")
+    (tmp_path / "rig.toml").write_text(text)
     rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
     logs = machine_files.Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
     assert write_mjcf(begin(rig, logs, key=jax.random.key(0)), tmp_path / "out.xml") == []
@@ -147,19 +145,7 @@ OWNED = """<mujoco model="owned">
 <sensor><jointpos name="encoder" joint="a"/></sensor>
 </mujoco>"""  # noqa: E501
 HULL = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-OWNED_RIG = """format = 1
-name = "owned"
-[model]
-type = "mjcf"
-file = "owned.xml"
-friction = "none"
-[sampling]
-dt = 0.01
-input_hold = "zero-order"
-clock = "sequence"
-[measurement]
-columns = ["encoder", "b"]
-"""
+OWNED_RIG = file_rig("owned.xml", ("encoder", "b"), friction="none")
 
 
 def _owned(folder: Path) -> Identified:

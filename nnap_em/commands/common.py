@@ -51,10 +51,6 @@ MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError
 WARNINGS = (RigWarning, DataWarning)
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
-TRACED = "traced"
-"""Folder of the programs before they were compiled, in that of the compiled ones."""
-MOST_DEVICES = 64
-"""Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more."""
 OPTIONS = ("start", "smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
 
@@ -62,14 +58,17 @@ OPTIONS = ("start", "smoother", "particles", "for", "rival", "seconds", "sequenc
 def set_up() -> None:
     """64-bit numbers, every core, and programs kept for the next call, traced and compiled, if there is a place."""
     jax.config.update("jax_enable_x64", True)
+    # Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more
+    most_devices = 64
     if not jax.distributed.is_initialized():  # or they are dealt out
         if "JAX_NUM_CPU_DEVICES" not in os.environ:
             with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
-                jax.config.update("jax_num_cpu_devices", min(MOST_DEVICES, cores()))
+                jax.config.update("jax_num_cpu_devices", min(most_devices, cores()))
         use_every_device()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    traced = "traced"  # folder of the programs before they were compiled, in that of the compiled ones
     if chosen:
-        use_cache(Cache(Path(chosen) / TRACED))
+        use_cache(Cache(Path(chosen) / traced))
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -81,7 +80,7 @@ def set_up() -> None:
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
-        use_cache(Cache(folder / TRACED))
+        use_cache(Cache(folder / traced))
 
 
 def _processor(about: Path = Path("/proc/cpuinfo")) -> str:

@@ -24,17 +24,14 @@ from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
 from .common import go_on, origin, read_bench, remove_reports, resumable, warn_of_torques
 
-SEARCH_SHARE = 0.8
-"""Share of the minutes given after which the search begins no new step.
-
-The fit of the last law over the whole length and the page come after it: 17 of 105 s on a real double pendulum.
-"""
-
 
 def run(args: argparse.Namespace, log: Log) -> None:
     """Find it, and report; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
-    seconds = SEARCH_SHARE * 60.0 * args.minutes if args.minutes else math.inf
+    # Share of the minutes given after which the search begins no new step. The fit of the last law over the whole
+    # length and the page come after it: 17 of 105 s on a real double pendulum.
+    search_share = 0.8
+    seconds = search_share * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
     start, own = origin(args, bench, log)

@@ -40,12 +40,6 @@ from ..report.monitored import write_monitor
 from ..storage.log import Log
 from .common import logs_of, require_joints
 
-CHANGED_STATUS = 4
-"""Exit status of a machine that changed."""
-READINGS_LEFT = 0.5
-"""Share of the readings of a column that must be left for a recording to be judged."""
-STATE = "monitor.json"
-
 
 def run(args: argparse.Namespace, log: Log) -> int:
     """Judge the recordings that are new, then all together."""
@@ -54,7 +48,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
     require_joints(stored.fitted.rig, "monitor")
     rig, own = logs_of(file, stored, args.logs, args.trust_readings)
     fitted, digest = stored.fitted, hashlib.sha256(file.read_bytes()).hexdigest()
-    before = _kept(args.out / STATE, digest) if args.resume else []
+    before = _kept(args.out / "monitor.json", digest) if args.resume else []
     paths = log_files(args.folder)
     fit = along(fitted, jax.device_put(own.data), fitted.smoother)
     beside, candidates = reference(fitted, fit)
@@ -82,7 +76,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
         accepted = findings(diagnosis)
         document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted, None)}
     write_monitor(args.out, fitted, beside, seen, document, log)
-    return CHANGED_STATUS if seen.alarm is not None else 0
+    return 4 if seen.alarm is not None else 0
 
 
 def _row(fitted: Identified, beside: Reference, candidates, rig: Rig, path: Path, trust: bool) -> dict[str, Any]:
@@ -107,8 +101,9 @@ def _row(fitted: Identified, beside: Reference, candidates, rig: Rig, path: Path
 def _broken(rig: Rig, logs: Logs) -> str:
     """Reason against the sensors or inputs of a recording, as `check` has it; empty where there is none."""
     y, read = np.asarray(logs.data.y)[0], np.asarray(logs.as_read.y)[0]
+    readings_left = 0.5  # share of the readings of a column that must be left for a recording to be judged
     for name, used, all_ in zip(rig.measured, y.T, read.T, strict=True):
-        if np.isfinite(used).sum() < READINGS_LEFT * np.isfinite(all_).sum():
+        if np.isfinite(used).sum() < readings_left * np.isfinite(all_).sum():
             kinds = ", ".join(dict.fromkeys(m.kind for m in logs.masked if m.column == name))
             return f"most readings of {name} are not used: {kinds}"
     system = build_system(rig)

@@ -32,16 +32,6 @@ LEAST_SHARED = 0.5
 
 Friction depends on velocity and on load: where most of a range was visited by one fit only, the curves can differ
 there by what the other had to guess."""
-MEANINGLESS = "a change of its friction may be one of the motion, not of the machine"
-SEVERAL = 2
-"""Friction curves from which on a change of all at once has another cause: joints wear one by one; a load, a sensor or
-the supply bends every curve."""
-SEEN, GONE = 5.0, 2.0
-"""Standard deviations from 0 of a viscous number in one fit, and in the other, from which on it cannot have gone so."""
-COMPARED_VELOCITIES = 41
-"""Velocities of a friction curve: as many as the M-step has."""
-PERIODIC = "phase of"
-"""Beginning of parameters of effects that are the same after a whole turn [rad]."""
 
 
 class CompareError(ValueError):
@@ -121,7 +111,8 @@ class Curve(NamedTuple):
         if self.changed and numbers["constant"].changed:
             return f"joint {self.joint} by a constant"
         far = numbers["viscous"].value / np.where(numbers["viscous"].std > 0, numbers["viscous"].std, np.inf)
-        gone = self.changed and np.nanmax(far) > SEEN and np.nanmin(far) < GONE
+        # standard deviations from 0 in one fit, and in the other, from which on it cannot have gone so
+        gone = self.changed and np.nanmax(far) > 5.0 and np.nanmin(far) < 2.0
         return f"joint {self.joint} to a viscous friction of 0" if gone and numbers["viscous"].changed else ""
 
     @property
@@ -175,7 +166,8 @@ class Comparison(NamedTuple):
         bent = [curve for curve in self.curves if curve.changed]
         if self.cause is not None:
             return "" if self.cause.friction or not bent else "which is this change seen through friction"
-        reasons = ["several at once"] if len(bent) >= SEVERAL else []
+        # joints wear one by one; a load, a sensor or the supply bends every curve
+        reasons = ["several at once"] if len(bent) >= 2 else []
         reasons += [curve.impossible for curve in bent if curve.impossible]
         return (
             f"{listed(reasons)}: something other than friction changed, such as a load or a sensor" if reasons else ""
@@ -354,7 +346,8 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
     ranges = np.stack([fits[i].velocity for i in places])
     low, high = ranges[:, :, 0].max(axis=0), ranges[:, :, 1].min(axis=0)
     common = low < high
-    nodes = nodes_between(np.where(common, low, -1.0), np.where(common, high, 1.0), COMPARED_VELOCITIES)
+    compared_velocities = 41  # velocities of a friction curve: as many as the M-step has
+    nodes = nodes_between(np.where(common, low, -1.0), np.where(common, high, 1.0), compared_velocities)
     tables = [friction_table(fits[i].fitted, jnp.asarray(nodes)) for i in places]
     for j in np.flatnonzero(common):
         torque, cov = (
@@ -383,10 +376,11 @@ def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) 
 def _numbers(fits: Sequence[Fit]) -> Iterator[Number]:
     """The estimated parameters of the machine and of effects."""
     tables = [{**_parameters(fit.fitted), **_effects(fit.fitted)} for fit in fits]
+    periodic = "phase of"  # beginning of parameters of effects that are the same after a whole turn [rad]
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
         value, std = (np.asarray([np.nan if entry is None else entry[i] for entry in entries], float) for i in range(2))
-        if name.startswith(PERIODIC):
+        if name.startswith(periodic):
             first = value[np.isfinite(value)][0]
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
         priors = (fit.fitted.rig.parameters[name].std for fit in fits if name in fit.fitted.rig.parameters)
@@ -452,6 +446,7 @@ def _warnings(fits: Sequence[Fit]) -> Iterator[str]:
     system = fits[0].fitted.model.system
     units = {"velocity": [system.unit(rate) for rate in system.rates]}
     units["load"] = [system.force_unit(j + 1) for j in range(len(system.rates))]
+    meaningless = "a change of its friction may be one of the motion, not of the machine"
     for kind, j in itertools.product(units, range(len(system.rates))):
         pairs = [(shared(getattr(a, kind)[j], getattr(b, kind)[j]), a, b) for a, b in itertools.combinations(fits, 2)]
         share, one, two = min(pairs, key=lambda pair: pair[0])
@@ -460,7 +455,7 @@ def _warnings(fits: Sequence[Fit]) -> Iterator[str]:
                 f"{fit.name} {getattr(fit, kind)[j][0]:.3g} to {getattr(fit, kind)[j][1]:.3g}" for fit in (one, two)
             )
             unmeasured = kind == "velocity" and share == 0
-            means = "its friction is not compared" if unmeasured else MEANINGLESS
+            means = "its friction is not compared" if unmeasured else meaningless
             yield f"joint {j + 1}: the {kind} ranges of {ranges} {units[kind][j]} share {share:.0%}; {means}"
 
 

@@ -33,8 +33,6 @@ FALSE = 1e-3
 """False alarms a recording where nothing changes, of all charts together."""
 MEMORY = 0.9
 """Weight of what is known of a number after one more recording: a band is that of the last ten or so."""
-ROW_MULTIPLE = 64
-"""Recordings are padded to a multiple of so many rows, so that they share their programs."""
 
 
 class Judged(NamedTuple):
@@ -111,7 +109,8 @@ def judge(fitted: Identified, reference: Reference, candidates: Sequence[Candida
     grid = grid_of(fitted.rig.dt, int(np.sum(data.valid)), HORIZONS, fitted.model.pace)
     if grid.ages != reference.grid.ages:
         return f"too short to be compared: {3 * reference.grid.ages[-1] * fitted.rig.dt:.3g} s are needed"
-    rows = ROW_MULTIPLE * math.ceil(max(reference.rows, data.t.shape[1]) / ROW_MULTIPLE)
+    multiple = 64  # recordings are padded to a multiple of so many rows, so that they share their programs
+    rows = multiple * math.ceil(max(reference.rows, data.t.shape[1]) / multiple)
     fills = ("edge", 0.0, np.nan, False)
     data = Dataset(*(_longer(np.asarray(part), rows, fill) for part, fill in zip(data, fills, strict=True)))
     fit = along(_starting(fitted, data), data, fitted.smoother)

@@ -17,13 +17,7 @@ from .plausible import Columns, bridge
 FULL = "saturated"
 STILL = 5  # equal rows in a run that may be a stuck sensor
 _PARABOLA_ROWS = 10  # rows before and after a run that show its motion: fewer vanish in noise, more are no parabola
-_AHEAD = 3  # rows that a parabola through `_PARABOLA_ROWS` rows is trusted beyond its end
-_SURE = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
 _MORE = 4.0  # times a usual step, or a usual disagreement of two columns, that one must be to contradict a sensor
-_DELAY = 5  # rows by which a filtered rate may be late
-_SHORT_RUNS = 0.002  # runs of two to four rows, per row, above which a column is coarse
-_NEAR_NEIGHBOUR = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
-_REPEATS = 3  # such rows of the 20 about a run that are a held value: of white noise 0.2 % of the runs have as many
 _USUAL = 95  # percentile of the steps of a column
 
 
@@ -51,7 +45,8 @@ def constant_readings(
         return
     others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
     usual = float(np.median(np.repeat(others, others)))
-    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= _SHORT_RUNS * y.size
+    short_runs = 0.002  # runs of two to four rows, per row, above which a column is coarse
+    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= short_runs * y.size
     both = [_disagreement(name, columns, dt) for columns in (readings, as_read)]
     apart = [each for each in both if each is not None]
     full = np.zeros(y.size, bool)
@@ -113,7 +108,8 @@ def _disagreement(name: str, readings: Columns, dt: float) -> _Apart | None:
     way, step = travel(w, dt) - bridge(q), 3 * quantum(q)
     if rate:
         return _Apart(-way, np.full(q.size, step + 9 * reading_noise(q[None])), 0.0, q, rate)
-    return _Apart(way, step + _DELAY * dt * np.abs(bridge(w)), reading_noise(w[None]) * dt, w, rate)
+    delay = 5  # rows by which a filtered rate may be late
+    return _Apart(way, step + delay * dt * np.abs(bridge(w)), reading_noise(w[None]) * dt, w, rate)
 
 
 def travel(rate: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray, " time"]:
@@ -196,7 +192,9 @@ def _alive(y: Float[np.ndarray, " time"], run: Run) -> bool:
     """
     usual = reading_noise(y[None])
     around = np.concatenate([_steps(y[: run.first + 1][::-1]), _steps(y[run.end - 1 :])])
-    if usual < 3 * quantum(y) or np.sum(around < _NEAR_NEIGHBOUR * usual) >= _REPEATS:
+    near_neighbour = 0.02  # of the noise: nearer than that neighbours lie in 1.1 % of the rows of white noise
+    repeats = 3  # such rows of the 20 about a run that are a held value: of white noise 0.2 % of the runs have as many
+    if usual < 3 * quantum(y) or np.sum(around < near_neighbour * usual) >= repeats:
         return False
     sides = [part[np.isfinite(part)][:_PARABOLA_ROWS] for part in (y[: run.first][::-1], y[run.end :])]
     sides = [side for side in sides if side.size >= 8]
@@ -236,11 +234,13 @@ def _beyond(y: Float[np.ndarray, " time"], run: Run, sign: float, dt: float, apa
         moves = _moves(y, run, apart, dt, sign)
         if moves or not apart[0].rate:
             return moves
-    rows = np.arange(1, math.ceil(min(run.length / 2, _AHEAD)) + 1)
+    trusted = 3  # rows that a parabola through `_PARABOLA_ROWS` rows is trusted beyond its end
+    rows = np.arange(1, math.ceil(min(run.length / 2, trusted)) + 1)
     spread, coarse = reading_noise(y[None]), 4 * quantum(y)
+    sure = 3.0  # standard deviations of such a prediction, on either side, by which a reading lies beyond a limit
     for side in (before, after[::-1]):
         expected, uncertainty = _ahead(side, rows, spread)
-        if np.all(sign * (expected - y[run.first]) <= _SURE * uncertainty + coarse):
+        if np.all(sign * (expected - y[run.first]) <= sure * uncertainty + coarse):
             return False
     return True
 

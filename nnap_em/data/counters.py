@@ -15,15 +15,9 @@ from .noise import reading_noise
 from .spikes import LONGEST_SPIKE
 
 _JUMP = 0.4  # share of the range of the readings: sign and magnitude jump by half of theirs
-_FULL_JUMP = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
 _SMOOTH = 0.2  # of the size: steps that deviate by less from those around, once unwrapped
-_FEW = 0.01  # share of the steps that may deviate by more: impacts, spikes
-_SPANS = (5, 20, 80)  # readings on either side of a jump that show the motion: slow ones need many
-_MOVES = 3.0  # times the noise by which readings move over one of these
 _MOST = 0.5  # share of the jumps that must look so: about the others the motion turns round, or readings are missing
-_LEVELS = 32  # steps of the sensor that a counter has at least: an encoder at rest may go to and fro between two
 _TURNS = (2 * math.pi, 360.0)
-_TURN = 0.15  # of a turn, by which a jump may miss it where the readings have left its range
 _TURN_PARTS = 400  # of a turn, one of which a counter behind a gear may cover
 _FIT = 4  # readings on either side of a jump through which a cubic is laid to measure its size
 
@@ -57,7 +51,8 @@ def counter(
     if k.size < 2 * _FIT or np.max(np.abs(np.diff(x))) <= 0.5 * _JUMP * (reach := float(np.ptp(x))):
         return None
     found = _over(x, t, reach, rate) or _sign(x, t, reach) or (_lost_turn(x, t, k) if angle else None)
-    if found is None or found[0] < _LEVELS * _quantum(x):
+    levels = 32  # steps of the sensor that a counter has at least: an encoder at rest may go to and fro between two
+    if found is None or found[0] < levels * _quantum(x):
         return None
     size, turns, mirrored = found
     last = np.maximum(np.searchsorted(k, np.arange(y.size), side="right") - 1, 0)
@@ -87,7 +82,8 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
     """A counter that goes on at the other end of its range."""
     miss = np.abs(_miss(x, t))
     size = float(np.median(miss[jumps])) if (jumps := miss > _JUMP * reach).any() else 0.0
-    if size < _FULL_JUMP * reach:
+    full_jump = 0.9  # of the range, that a jump from one end to the other has: its step is measured from those around
+    if size < full_jump * reach:
         return None
     size = max(size, reach)
     size = _measured(x, t, _turns(x, t, size), size)
@@ -97,10 +93,12 @@ def _over(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], reach: f
         return None
     if rate and (np.mean(_near_zero(x, z, at)) < _MOST or np.ptp(z) > size or not _sure(at.size, size, x)):
         return None
-    up, least = np.diff(turns)[at - 1], _MOVES * reading_noise(z[None])
+    moves = 3.0  # times the noise by which readings move over one of `spans`
+    up, least = np.diff(turns)[at - 1], moves * reading_noise(z[None])
     back = (np.diff(at) <= LONGEST_SPIKE) & (up[1:] == -up[:-1])  # of a spike, or where the motion turns round
     alone = ~(np.append(back, False) | np.append(False, back))
-    ways = [[np.sign(up) * way > least for way in _travel(z, at, span)] for span in _SPANS]
+    spans = (5, 20, 80)  # readings on either side of a jump that show the motion: slow ones need many
+    ways = [[np.sign(up) * way > least for way in _travel(z, at, span)] for span in spans]
     runs_on = alone.any() and any(np.mean((before & after)[alone]) >= _MOST for before, after in ways)
     return (size, turns, False) if runs_on else None
 
@@ -157,7 +155,8 @@ def _turns(x: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], size: f
 
 def _smooth(z: Float[np.ndarray, " seen"], t: Float[np.ndarray, " seen"], size: float) -> bool:
     """True where next to no step deviates from those around."""
-    return bool(np.mean(np.abs(_miss(z, t)) > _SMOOTH * size) <= _FEW)
+    few = 0.01  # share of the steps that may deviate by more: impacts, spikes
+    return bool(np.mean(np.abs(_miss(z, t)) > _SMOOTH * size) <= few)
 
 
 def _travel(
@@ -172,8 +171,9 @@ def _lost_turn(
 ) -> _Found | None:
     """Jumps by a turn, where most steps are small."""
     step = np.abs(np.diff(x))
+    missed = 0.15  # of a turn, by which a jump may miss it where the readings have left its range
     for turn in _TURNS:
-        if np.median(step) < 0.1 * turn and np.any((np.abs(step - turn) < _TURN * turn) & (np.diff(k) <= 2)):
+        if np.median(step) < 0.1 * turn and np.any((np.abs(step - turn) < missed * turn) & (np.diff(k) <= 2)):
             return turn, _turns(x, t, turn), False
     return None
 

@@ -9,10 +9,6 @@ from .constant import runs
 
 HELD_ROWS = 1.5
 """Mean rows of a reading from which on the repeats are taken as missing: below, most rows hold one of their own."""
-_QUANTA = 3.5  # steps of the sensor: a reading that has moved on by more would have changed every row
-_CHANGES = 8  # of a moving signal, from which on the rows between them show a hold
-_JITTER = 0.3  # share of the rows by which a hold varies; one at least
-_REGULAR = 0.9  # share of the holds that keep to it
 
 
 def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
@@ -25,14 +21,16 @@ def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
     sizes = np.concatenate([size for _, size in changes]) if changes else np.zeros(0)
     if not sizes.size:
         return 1.0
-    moving = _QUANTA * float(np.percentile(sizes, 1))
+    quanta = 3.5  # steps of the sensor: a reading that has moved on by more would have changed every row
+    moving = quanta * float(np.percentile(sizes, 1))
     rows = np.concatenate([np.diff(at)[(size[1:] > moving) & (size[:-1] > moving)] for at, size in changes])
-    if rows.size < _CHANGES:
+    if rows.size < 8:  # of a moving signal, from which on the rows between them show a hold
         return 1.0
     typical = float(np.median(rows))
-    usual = np.abs(rows - typical) <= max(_JITTER * typical, 1.0)
+    usual = np.abs(rows - typical) <= max(0.3 * typical, 1.0)  # share of the rows by which a hold varies; one at least
     mean = float(np.mean(rows[usual]))
-    return mean if typical > 1 and np.mean(usual) >= _REGULAR and mean >= HELD_ROWS else 1.0
+    regular = 0.9  # share of the holds that keep to it
+    return mean if typical > 1 and np.mean(usual) >= regular and mean >= HELD_ROWS else 1.0
 
 
 def repeats(y: Float[np.ndarray, " time"], rows: float) -> Int[np.ndarray, " row"]:

@@ -23,8 +23,6 @@ from .rough import Rough, rough
 from .units import other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
-LOST = 0.25  # share of the rows of a file that may be lost in gaps
-INTERPOLATION_ERROR = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
 REPEAT, RANGE = "held", "range"
 _REASONS = {
@@ -308,7 +306,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE
     missing = int(np.sum(intervals[~wrong] - 1))
-    if not wrong.any() and missing > LOST * (t.size + missing):
+    if not wrong.any() and missing > 0.25 * (t.size + missing):  # share of the rows of a file that may be lost in gaps
         wrong = intervals > 1
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
@@ -333,7 +331,8 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
     filled = [interpolated(u, missing) for u in full[:, inputs].T]
     full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
-    dark = np.any([error > INTERPOLATION_ERROR for _, error in filled], axis=0) if filled else np.zeros(size, bool)
+    allowed = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
+    dark = np.any([error > allowed for _, error in filled], axis=0) if filled else np.zeros(size, bool)
     end = int(np.argmax(dark)) if dark.any() else size
     used, masked = rows[rows < end], []
     for first, count, kind, hint in (

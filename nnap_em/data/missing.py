@@ -8,9 +8,6 @@ from jaxtyping import Bool, Float
 
 from .constant import runs
 
-_ORDER = 16  # of the linear prediction of an input
-_TRIALS = 40  # gaps that are made on purpose to measure the error of interpolation
-
 
 class Interpolated(NamedTuple):
     """An input with its missing rows."""
@@ -44,7 +41,8 @@ def _worst(
 ) -> float:
     """The largest error, summed over a gap, of gaps of one length made on purpose."""
     reach, errors = 3 * weights.size, []
-    for first in np.linspace(1, u.size - length - 1, _TRIALS).astype(int) if u.size > length + 2 else ():
+    trials = 40  # gaps that are made on purpose to measure the error of interpolation
+    for first in np.linspace(1, u.size - length - 1, trials).astype(int) if u.size > length + 2 else ():
         if not missing[first - 1 : first + length + 1].any():
             part = slice(max(first - reach, 0), first + length + reach)
             cut = (np.arange(u.size) >= first) & (np.arange(u.size) < first + length)
@@ -54,7 +52,7 @@ def _worst(
 
 def _prediction(u: Float[np.ndarray, " time"], missing: Bool[np.ndarray, " time"]) -> Float[np.ndarray, " lag"]:
     """Weights of the rows before, the nearest first, that predict an input best."""
-    order = min(_ORDER, u.size // 8)
+    order = min(16, u.size // 8)  # of the linear prediction of an input
     complete = ~np.lib.stride_tricks.sliding_window_view(missing, order + 1).any(axis=1)
     rows = np.lib.stride_tricks.sliding_window_view(u, order + 1)[complete]
     if len(rows) < 2 * order:

@@ -5,21 +5,16 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-EQUAL_NEIGHBOURS, CODE = 0.02, 0.02
-"""Share of equal neighbours from which on readings are counted as codes, and the quantile of the other changes that is
-the step between two codes: the smallest, but for a share of rounding."""
-MULTIPLE = 0.05
-"""Median distance of changes from multiples of that step; a quarter where they are none [steps]."""
-
 
 def resolution(signal: Float[np.ndarray, "seq time"]) -> float:
     """Step between the codes of a reading that repeats them; 0 where neighbours hardly ever are equal."""
     change = np.abs(np.concatenate([np.diff(y[np.isfinite(y)]) for y in signal]))
     moved = change[change > 0]
-    if not 0 < moved.size < (1 - EQUAL_NEIGHBOURS) * change.size:
+    if not 0 < moved.size < (1 - 0.02) * change.size:  # share of them from which on readings are counted as codes
         return 0.0
-    step = float(np.quantile(moved, CODE))
-    return step if np.median(np.abs(moved / step - np.round(moved / step))) < MULTIPLE else 0.0
+    step = float(np.quantile(moved, 0.02))  # the smallest, but for a share of rounding
+    multiple = 0.05  # median distance of changes from multiples of that step; a quarter where they are none [steps]
+    return step if np.median(np.abs(moved / step - np.round(moved / step))) < multiple else 0.0
 
 
 def reading_noise(signal: Float[np.ndarray, "seq time"]) -> float:

@@ -14,7 +14,6 @@ from .counters import counter
 from .units import parameter_unit
 
 Columns = Mapping[str, Float[np.ndarray, " time"]]
-IMPLAUSIBLE = 30.0  # rad/s, as the median speed of a joint
 STRETCH = 20  # rows that two sequences do not have in common by chance
 _DEGREES = "it looks like degrees: write rad and rad/s"
 _ANGLE = (  # factor of an angle's rate of change over its rate column, the wrong one of the two, and the hint
@@ -78,9 +77,10 @@ def implausible(
     for name, rate in pairs if pairs is not None else [(name, f"d{name}") for name in readings]:
         if name in readings and rate in readings:
             yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
+    fastest = 30.0  # rad/s, as the median speed of a joint
     for name, values in readings.items():
         rate = unit(name) == "rad/s"
-        if (rate or unit(name) == "rad") and (speed := _speed(values, dt, rate)) > IMPLAUSIBLE:
+        if (rate or unit(name) == "rad") and (speed := _speed(values, dt, rate)) > fastest:
             yield Implausible(False, name, None, f"turns at {speed:.0f} rad/s", "is it in degrees? write rad and rad/s")
 
 

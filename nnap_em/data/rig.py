@@ -22,8 +22,6 @@ from .servo import lines as drive_lines
 from .servo import named as drive_numbers
 from .units import parameter_unit, quantities, with_names
 
-_FRICTION = ("unknown", "dynamic", "none")
-_CLOCKS = ("sequence", "session")
 _HINTS = {  # how the line of a key or table should look
     "format": "format = 1",
     "name": 'name = "my_rig"',
@@ -209,7 +207,9 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     sampling.choice("input_hold", ("zero-order",))
     start.check((), spec.states)
     measured, noise_std, ranges = _measurement(root.table("measurement"), spec, bool(declaration.equations))
-    friction = "none" if declaration.equations else model.choice("friction", _FRICTION)
+    kinds = ("unknown", "dynamic", "none")
+    friction = "none" if declaration.equations else model.choice("friction", kinds)
+    clocks = ("sequence", "session")
     return Rig(
         name=root.text("name"),
         system=system,
@@ -218,7 +218,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         input_columns=declaration.input_columns,
         input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
-        clock=sampling.choice("clock", _CLOCKS),
+        clock=sampling.choice("clock", clocks),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},

@@ -40,7 +40,6 @@ RESERVED = ("columns", "joints", "kind", *KEYS)
 _LINE = 'kind = "position"'
 AT = "at"
 """Key of the columns that a number is proportional to."""
-_AT = "at = { gain = 400.0 }: a column of the logs, and its value at which the number is as declared"
 
 
 class Drive(NamedTuple):
@@ -129,7 +128,8 @@ def _scale(table: Any, key: str) -> dict[str, float]:
     if not isinstance(value, dict) or AT not in value:
         return {}
     pair = table.table(key)
-    at = pair.table(AT) if isinstance(value[AT], dict) and value[AT] else pair.refuse(AT, None, f"write {_AT}")
+    line = "at = { gain = 400.0 }: a column of the logs, and its value at which the number is as declared"
+    at = pair.table(AT) if isinstance(value[AT], dict) and value[AT] else pair.refuse(AT, None, f"write {line}")
     if key == "delay":
         pair.refuse(AT, "a delay is the same in all rows", "take it out")
     for column in at.items:

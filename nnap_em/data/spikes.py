@@ -15,15 +15,6 @@ from .noise import reading_noise
 SPIKE = 6.0  # standard deviations of a reading from the value of its neighbours
 LONGEST_SPIKE = 3  # rows of a spike
 _SIDE, _NEAR = 5, 3  # rows on either side of a spike that are compared, and where the signal is too quick for these
-_MARGIN = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
-_END = 5.0  # times as large it must be in the first and last three rows, which have neighbours on one side
-_PAIR = 2.5  # times as large it must be where another row near by has to be left out to see it
-_AROUND = 10  # rows before and after a spike that show the activity of the signal
-_RESTLESS = 5.0  # times its own jerks that a spike must be
-_LEAST = 0.015  # of the standard deviation of the column: a smaller spike does no harm, and machines make small wiggles
-_QUICK = 3.0  # times what the curve of `_SIDE` neighbours misses that a spike from that of `_NEAR` must be
-_DOUBT = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them show little
-_SHORT = 5.0  # times as large a run must be as a single reading: machines make short wiggles too
 
 
 def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
@@ -83,11 +74,12 @@ def _is_spike(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone
     """True where the neighbours agree without the run; one of them that may be a spike itself may be left out."""
     if _stands_out(y, run, sigma, _SIDE) or _stands_out(y, run, sigma, _NEAR):
         return True
+    pair = 2.5  # times as large it must be where another row near by has to be left out to see it
     for other in alone:
         if 2 <= np.min(np.abs(run - other)) <= _SIDE:
             without = y.copy()
             without[other] = np.nan
-            if _stands_out(without, run, sigma, _SIDE, _PAIR):
+            if _stands_out(without, run, sigma, _SIDE, pair):
                 return True
     return False
 
@@ -130,18 +122,24 @@ def _stands_out(
     worse.
     """
     fit = _fit(y, run, side)
-    excess = max(fit.residual / fit.freedom - _MARGIN / 3 * sigma**2, 0.0)
-    spread = max(sigma, math.sqrt(fit.residual / fit.freedom), (1.0 + _DOUBT / fit.freedom) * math.sqrt(excess))
-    size = fit.size / strict / (_END if fit.end else 1.0 if run.size == 1 else _SHORT)
-    if size < 1.1 * SPIKE * spread or size < _LEAST * float(np.std(y[np.isfinite(y)])):
+    margin = 9.0  # twice the log-likelihood by which a spike must explain better than a jump or a kink
+    excess = max(fit.residual / fit.freedom - margin / 3 * sigma**2, 0.0)
+    doubt = 10.0  # of a curve that fits ill, over its degrees of freedom: two of them show little
+    spread = max(sigma, math.sqrt(fit.residual / fit.freedom), (1.0 + doubt / fit.freedom) * math.sqrt(excess))
+    at_end = 5.0  # times as large it must be in the first and last three rows, which have neighbours on one side
+    short = 5.0  # times as large a run must be as a single reading: machines make short wiggles too
+    size = fit.size / strict / (at_end if fit.end else 1.0 if run.size == 1 else short)
+    # Of the standard deviation of the column: a smaller spike does no harm, and machines make small wiggles
+    if size < 1.1 * SPIKE * spread or size < 0.015 * float(np.std(y[np.isfinite(y)])):
         return False
-    if size < _RESTLESS * _activity(y, run, sigma):
+    if size < 5.0 * _activity(y, run, sigma):  # times its own jerks that a spike must be
         return False
     if fit.end:
         return True
-    if side < _SIDE and size < _QUICK * math.sqrt((wide := _fit(y, run, _SIDE)).residual / wide.freedom):
+    quick = 3.0  # times what the curve of `_SIDE` neighbours misses that a spike from that of `_NEAR` must be
+    if side < _SIDE and size < quick * math.sqrt((wide := _fit(y, run, _SIDE)).residual / wide.freedom):
         return False
-    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.residual + _MARGIN * sigma**2
+    worse = _broken(fit.x, fit.base, fit.y) > 1.5 * fit.residual + margin * sigma**2
     return worse and _in_two(fit.x, fit.y) > 1.5 * fit.residual
 
 
@@ -171,8 +169,9 @@ def _activity(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], sigma
 
     The upper quartile: one more spike near by does not hide this one.
     """
-    first = max(run[0] - _AROUND, 0)
-    window = y[first : run[-1] + _AROUND + 1].copy()
+    around = 10  # rows before and after a spike that show the activity of the signal
+    first = max(run[0] - around, 0)
+    window = y[first : run[-1] + around + 1].copy()
     window[run - first] = np.nan
     left = _left(np.flatnonzero(np.isfinite(window)), window, 1)
     beside = (left.rows < run[0] - first - 2) | (left.rows > run[-1] - first + 2)

@@ -301,7 +301,9 @@ def advice(
 ) -> list[str]:
     """Sentences on the next measurement."""
     out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
-    out += [RECORD_MORE] if suspects else []
+    # Advice for every suspect: what three recordings of a real arm left open, eleven decided
+    record_more = "To be sure of a suspect, record as many different motions again and diagnose all together."
+    out += [record_more] if suspects else []
     out += [
         f"To see {with_article(suspect.law)} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm
     ]
@@ -316,10 +318,6 @@ def advice(
             "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
         )
     return out
-
-
-RECORD_MORE = "To be sure of a suspect, record as many different motions again and diagnose all together."
-"""Advice for every suspect: what three recordings of a real arm left open, eleven decided."""
 
 
 def entry(finding: Finding) -> dict[str, Any]:

@@ -12,8 +12,6 @@ from .verdict import REPEATS
 
 MOTION_PARTS = 5
 """Parts of motions, as far as there are recordings."""
-TIME_PARTS = 5
-"""Parts of time: what happens at one moment of every recording is no law."""
 QUARTERS = 4
 """Parts of each motion, where there are fewer than three motions."""
 
@@ -74,7 +72,8 @@ def parts(
     state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
     motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
     clock = np.asarray(data.t)[:, rows]
-    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, TIME_PARTS)
+    time_parts = 5  # parts of time: what happens at one moment of every recording is no law
+    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, time_parts)
 
 
 def members(fold: Int[np.ndarray, "seq time"], counts: Bool[np.ndarray, "seq time"]) -> Bool[np.ndarray, "fold seq"]:

@@ -15,8 +15,6 @@ from ..fit.identify import Identified
 from .residual import Names, Residual, residual
 from .statistics import FAILS, LAGS, bias, dependence, holm, normality, spread, whiteness
 
-SMALL_MISFIT = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
-"""Sizes below which a failed test is called small."""
 WHITE = 0.25
 """Largest autocorrelation at which innovations count as white; 0.4 to 0.5 on real machines."""
 
@@ -79,8 +77,10 @@ def tests(residual: Residual, names: Names) -> list[Test]:
         rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(residual, names)]
     corrected = holm([p for _, _, (_, p, _) in rows])
     out = []
+    # Sizes below which a failed test is called small
+    small_misfit = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
     for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
-        slight = bool(p < FAILS and abs(size) < SMALL_MISFIT[name.split()[0]])
+        slight = bool(p < FAILS and abs(size) < small_misfit[name.split()[0]])
         out.append(
             Test(
                 name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < FAILS), size, slight), slight

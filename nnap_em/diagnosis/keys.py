@@ -35,13 +35,11 @@ def words(key: Key) -> str:
     return text + (f" at joint {joint}" if joint else "") + (f" on {on}" if on else "")
 
 
-MASS_NOUNS = ("air drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "emf")
-"""Last words of the laws that take no article."""
-
-
 def with_article(name: str) -> str:
     """Name of an effect, as `words` writes it, with its article."""
-    if re.split(" of | at | on ", name)[0].endswith(MASS_NOUNS):
+    # Last words of the laws that take no article
+    mass_nouns = ("air drag", "cogging", "backlash", "friction", "inertia", "flexibility", "saturation", "emf")
+    if re.split(" of | at | on ", name)[0].endswith(mass_nouns):
         return name
     return ("an " if re.match("[aeiu]|o(?!ne)", name) else "a ") + name
 

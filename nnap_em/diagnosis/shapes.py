@@ -12,10 +12,6 @@ from .forms import Description, Form, Quantity, View, forms
 
 EXPLAINS = 0.85
 """Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square."""
-FLOOR = 0.05
-"""Smallest difference that counts, in rms of the curve: curves bend with all else that the model lacks."""
-KNOWN_STD = 0.5
-"""Largest standard deviation, in rms of the curve, at which the curve counts as known."""
 INDISTINGUISHABLE = 2.0
 """Largest difference in the Schwarz criterion that is no evidence, so the simpler shape wins [Kass & Raftery 1995]."""
 
@@ -97,7 +93,7 @@ def _known(curve: Curve) -> np.ndarray | None:
     weight = 1 / np.maximum(curve.std, 1e-3 * np.ptp(curve.mean) + 1e-300) ** 2
     level = np.average(curve.mean, weights=weight)
     rms = np.sqrt(np.average((curve.mean - level) ** 2, weights=weight))
-    known = curve.std < KNOWN_STD * rms
+    known = curve.std < 0.5 * rms  # largest standard deviation, in rms of the curve, at which the curve counts as known
     return known if rms > 0 and known.mean() > 0.25 else None
 
 
@@ -119,7 +115,8 @@ def _view(curve: Curve, known: np.ndarray) -> View:
 def _seen(curve: Curve, known: np.ndarray) -> _Seen:
     """Orthonormal directions that the basis has where the curve is known, in units of its error there."""
     y = curve.mean[known]
-    root = 1 / np.hypot(curve.std[known], FLOOR * np.std(y))
+    floor = 0.05  # smallest difference that counts, in rms of the curve: curves bend with all else that the model lacks
+    root = 1 / np.hypot(curve.std[known], floor * np.std(y))
     basis = np.eye(y.size) if curve.basis is None else curve.basis[known]
     one = root / np.linalg.norm(root)
     left, size, _ = np.linalg.svd(root[:, None] * basis - one[:, None] * (one @ (root[:, None] * basis)))

@@ -15,8 +15,6 @@ LAGS = 20
 """Samples over which innovations are tested for whiteness."""
 FAILS = 0.05
 """Corrected p-value below which a test counts as failed."""
-_GROUPS, _GROUP = 20, 50
-"""Least number of groups, and least number of readings in a group where there are enough."""
 
 
 def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
@@ -108,7 +106,8 @@ def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "s
     """Sums over groups of about equally many readings: parts of sequences."""
     active = seen.any(1)
     values, seen = values[active], seen[active]
-    parts = max(1, -(-_GROUPS // max(len(values), 1)), int(np.median(seen.sum(1)) // _GROUP) if len(seen) else 1)
+    groups, readings = 20, 50  # least number of groups, and of readings in a group where there are enough
+    parts = max(1, -(-groups // max(len(values), 1)), int(np.median(seen.sum(1)) // readings) if len(seen) else 1)
     sums = []
     for row, known in zip(values, seen, strict=True):
         sums += [piece.sum() for piece in np.array_split(row[known], parts) if piece.size]

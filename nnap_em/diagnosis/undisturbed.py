@@ -10,8 +10,6 @@ from ..em.loop import FitError
 from ..fit.identify import Identified
 from .interventions import LEVEL, MORE, Intervention, in_order, interventions, overlap
 
-CUT_MARGIN, SHORTEST_PIECE = 0.1, 0.5
-"""Time left out before and after a disturbance, and shortest piece between two that is of use [s]."""
 ROUNDS = 3
 """Largest number of new fits: a fit without one disturbance shows another more clearly."""
 
@@ -24,7 +22,8 @@ def without(
     The rows between two disturbances become a sequence of their own, if they are enough.  Without `restart`, where the
     state of the first row is declared and holds there alone, only the rows before the first disturbance stay.
     """
-    margin, least = round(CUT_MARGIN / dt), max(2, round(SHORTEST_PIECE / dt))
+    cut_margin, shortest = 0.1, 0.5  # time left out around a disturbance, and shortest piece that is of use [s]
+    margin, least = round(cut_margin / dt), max(2, round(shortest / dt))
     pieces: list[tuple[int, int, int]] = []
     for i, valid in enumerate(np.asarray(data.valid)):
         use = np.append(valid, False)

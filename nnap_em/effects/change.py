@@ -13,8 +13,6 @@ from .base import AbstractEffect, JointEffect, Scalar, a, known, one
 
 PROBED, PRIOR_STD = 0.05, 0.5
 """Torque of a probe, and standard deviation of a change, in the typical torque of the joint."""
-SIGN_BEND = 0.01
-"""Rate over which Coulomb friction changes its sign, in the largest rate of the joint: as `Weights` has it."""
 
 
 class CoulombChange(JointEffect):
@@ -31,7 +29,8 @@ class CoulombChange(JointEffect):
     @classmethod
     def candidates(cls, around):
         learned = around.joints if around.moved is not None and around.learned else ()
-        knees = [partial(cls, knee=a(SIGN_BEND * float(around.speed[j - 1])), joint=j) for j in learned]
+        # Rate over which Coulomb friction changes its sign, in the largest rate of the joint: as `Weights` has it
+        knees = [partial(cls, knee=a(0.01 * float(around.speed[j - 1])), joint=j) for j in learned]
         sizes = zip(knees, map(float, around.torque), strict=False)
         return [one(make, 0.0, PROBED * torque, PRIOR_STD * torque) for make, torque in sizes]
 

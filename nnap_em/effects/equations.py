@@ -16,13 +16,9 @@ from jaxtyping import Array, Float
 
 from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known
 
-EDGE = 0.02
-"""Width of a step at a level, as a share of the range of its signal."""
 STRONG = 5.0
 """Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
 the signal."""
-LEVELS = (0.3, 0.6, 0.8)
-"""Places in the range of a signal where the search for a level begins."""
 
 
 FORMS = (
@@ -146,9 +142,10 @@ class PortEffect(AbstractEffect):
     @classmethod
     def candidates(cls, around):
         out = []
+        places = (0.3, 0.6, 0.8)  # places in the range of a signal where the search for a level begins
         for port, of, to in cls.places(around):
             low, high = around.sizes[of[0]] if "level" in cls.reports else (0.0, 0.0)
-            levels = [low + share * (high - low) for share in (LEVELS if "level" in cls.reports else (0.0,))]
+            levels = [low + share * (high - low) for share in (places if "level" in cls.reports else (0.0,))]
             out += [cls.at(around, port, of, to, level) for level in levels]
         return out
 
@@ -164,7 +161,7 @@ class PortEffect(AbstractEffect):
         spread = STRONG * rate / max(typical[cls.kind] if of else 1.0, 1e-12)
 
         def make(strength: float, level: float, share: float):
-            edge = EDGE * width[0] if of else 0.0
+            edge = 0.02 * width[0] if of else 0.0  # width of a step at a level, as a share of the range of its signal
             return cls(strength=strength, level=level, share=share, edge=edge, channel=port, reads=of, to=to)
 
         has, none = cls.reports, 1e-12

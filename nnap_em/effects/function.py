@@ -16,9 +16,6 @@ from jaxtyping import Array, Float
 from ..systems.base import AbstractSystem
 from .base import AbstractEffect, Candidate, Curve, JointEffect, OperatingPoint, Scalar, SearchScales, a, input_of
 
-BACKWARDS = 0.1
-"""Share of its range by which a drive may seem to fall with its input: noise of what was learned."""
-
 
 class AbstractAxis(eqx.Module):
     """One axis of the function: what it reads, and where its basis functions stand."""
@@ -152,7 +149,8 @@ class UnknownFunction(JointEffect):
         u = np.linspace(float(axis.low), float(axis.high), 8 * axis.count)
         total = u + np.asarray(jax.vmap(lambda one: self.torque([one]))(jnp.asarray(u)))
         rise = np.diff(total)
-        return bool(-rise[rise < 0].sum() < BACKWARDS * np.ptp(total))
+        # Share of its range by which a drive may seem to fall with its input: noise of what was learned
+        return bool(-rise[rise < 0].sum() < 0.1 * np.ptp(total))
 
     def torque(self, values: Sequence[Scalar]) -> Scalar:
         """The learned function at a value of every axis [N m]."""

@@ -42,10 +42,6 @@ class BaseTilt(AbstractEffect):
         return self.turned(scene.system, scene.q, scene.v)
 
 
-GRID = 64
-"""The number of frequencies is a multiple of this, so that few programs serve all durations."""
-
-
 class BaseVibration(AbstractEffect):
     """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
 
@@ -65,7 +61,8 @@ class BaseVibration(AbstractEffect):
         if around.system.shake(jnp.zeros(len(around.system.coordinates))) is None:
             return []
         span = around.duration[1] - around.duration[0]
-        count = GRID * math.ceil(min(8.0 * span / 0.4, 400) / GRID)
+        grid = 64  # the number of frequencies is a multiple of this, so that few programs serve all durations
+        count = grid * math.ceil(min(8.0 * span / 0.4, 400) / grid)
         make = lambda *numbers: cls.of(*numbers, 1 / span)  # noqa: E731
         return [pair(make, 0.1, 5.0, (float(f), 0.3 / span)) for f in np.linspace(1 / span, 8.0, count)]
 

@@ -9,12 +9,8 @@ from jaxtyping import Array, Float
 
 from .base import Candidate, Curve, JointEffect, Scalar, a
 
-HIGHEST_FREQUENCY = 4.0
-"""Frequency [Hz] up to which is looked: a faster force moves little."""
 OVERTONES = 7
 """Harmonics of the waveform, once its period is known: they hold 95 % of the power of a square wave."""
-COUNTS = (50, 200)
-"""Frequencies that are tried: numbers shared by recordings of many lengths, for programs are compiled for them."""
 
 
 class PeriodicForce(JointEffect):
@@ -34,8 +30,11 @@ class PeriodicForce(JointEffect):
     @classmethod
     def candidates(cls, around):
         span = around.duration[1] - around.duration[0]
-        count = next((n for n in COUNTS if n >= HIGHEST_FREQUENCY * span / 0.4), COUNTS[-1])
-        tried = [HIGHEST_FREQUENCY / count * i for i in range(1, count + 1)]
+        highest = 4.0  # frequency [Hz] up to which is looked: a faster force moves little
+        # Frequencies that are tried: numbers shared by recordings of many lengths, for programs are compiled for them
+        counts = (50, 200)
+        count = next((n for n in counts if n >= highest * span / 0.4), counts[-1])
+        tried = [highest / count * i for i in range(1, count + 1)]
         return [_at(j, f, 1, around) for j in around.joints for f in tried if f * span >= 1.0]  # one period at least
 
     def values(self):

@@ -20,16 +20,6 @@ from ..systems.equations import Equations
 from .prior import ParameterPrior
 from .readings import reading_noise
 
-PACE = 8.0
-"""Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more, and
-errors are those of a free simulation."""
-HORIZON_SHARE = 1 / 3
-"""Longest such time, as a share of a recording: a prediction needs a start before it."""
-EQUATION_STEP = 0.5
-"""Integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8."""
-HIDDEN = 0.5
-"""Standard deviation of the start of a state that nobody declares or reads, in its size where the equations rest."""
-
 
 class Motion(NamedTuple):
     """A free simulation of the declared equations, by which scales are measured."""
@@ -89,6 +79,8 @@ def start_prior(rig: Rig, system: Equations, data: Dataset) -> tuple[Gaussian, t
     known |= {i: rig.start[name].mean for i, name in enumerate(system.states) if name in rig.start and i not in known}
     rest = resting(system, known, u.mean(axis=0))
     means, stds, learned = [], [], []
+    # Standard deviation of the start of a state that nobody declares or reads, in its size where the equations rest
+    hidden = 0.5
     for i, name in enumerate(system.states):
         read = name in columns
         if name in rig.start:
@@ -98,7 +90,7 @@ def start_prior(rig: Rig, system: Equations, data: Dataset) -> tuple[Gaussian, t
             first = np.array([s[np.isfinite(s)][0] for s in signal if np.any(np.isfinite(s))])
             mean, std = float(first.mean()), float(np.hypot(first.std(), 0.3 * np.nanstd(signal)) + 1e-9)
         else:
-            mean, std = float(rest[i]), HIDDEN * abs(float(rest[i])) + 1e-9
+            mean, std = float(rest[i]), hidden * abs(float(rest[i])) + 1e-9
             std = std if std > 1e-6 else 1.0
         means.append(mean)
         stds.append(std)
@@ -130,7 +122,11 @@ def pace_of(rig: Rig, slowest: float, rows: int) -> float:
     """The declared horizon, or some time constants, as far as the recordings are long [s]; of two digits: programs are
     shared.
     """
-    pace = rig.horizon or min(PACE * slowest, HORIZON_SHARE * rows * rig.dt)
+    # Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more,
+    # and errors are those of a free simulation
+    constants = 8.0
+    horizon_share = 1 / 3  # longest such time, as a share of a recording: a prediction needs a start before it
+    pace = rig.horizon or min(constants * slowest, horizon_share * rows * rig.dt)
     return float(f"{max(pace, 8 * rig.dt):.2g}")
 
 
@@ -217,11 +213,12 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
     pairs = np.array([(rig.parameters[n].mean, rig.parameters[n].std) for n in free]).reshape(-1, 2)
     prior = ParameterPrior(free, jnp.asarray(pairs[:, 0], float), jnp.asarray(pairs[:, 1], float))
+    stretch = 0.5  # integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8
     model = dataclasses.replace(
         model,
         unknown=NoFriction(jnp.asarray(scale, float), jointless=True),
         log_q=jnp.asarray(2 * np.log(size * rig.dt), float),
-        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / EQUATION_STEP, 1.0)))), MOST_STEPS),
+        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / stretch, 1.0)))), MOST_STEPS),
         pace=pace_of(rig, seen.slowest, rows),
     )
     terms = unknown_terms(system, seen, free)

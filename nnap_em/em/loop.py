@@ -196,8 +196,6 @@ EPOCHS = 40
 """Epochs of a fit at most."""
 REST = 0.05
 """Change of the log-likelihood, twice running, at which EM is at rest [nat a sequence]."""
-HELD_REST = 0.5
-"""The same before the M-step is released: likelihoods are compared no more exactly."""
 
 
 @stage("EM")
@@ -226,9 +224,10 @@ def fit(
     if state.epoch == 0:
         model = _settle_noise(state.model, horizon(data, schedule.first, still), smoother, state.key)
         state = state._replace(model=model, best=model)
+    held_rest = 0.5  # the same before the M-step is released: likelihoods are compared no more exactly
     while state.epoch < epochs:
         seen = schedule.horizon(state.epoch, longest)
-        ended = _ended(state, schedule, longest, tolerance if state.stage == last else HELD_REST)
+        ended = _ended(state, schedule, longest, tolerance if state.stage == last else held_rest)
         if ended and state.stage == last:
             return state._replace(stop=ended)
         if ended:
@@ -265,10 +264,6 @@ def _released(state: EMState) -> EMState:
     return _afresh(state._replace(best=best, proposal=best, stage=state.stage + 1))
 
 
-LEAST_RISE = 2 * REST
-"""Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]."""
-
-
 def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
     """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest.
 
@@ -277,7 +272,9 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
     whole = [value for epoch, value in enumerate(state.loglik) if schedule.horizon(epoch, longest) == longest]
     if len(whole) < 3:
         return math.inf
-    least = LEAST_RISE if math.isinf(state.ess) else max(LEAST_RISE, float(np.max(-np.diff(whole))))
+    # Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]
+    least_rise = 2 * REST
+    least = least_rise if math.isinf(state.ess) else max(least_rise, float(np.max(-np.diff(whole))))
     rise = float(max(whole[-2:]) - max(whole[:-2]))
     return rise if rise >= least else 0.0
 

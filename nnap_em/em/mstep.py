@@ -96,10 +96,6 @@ def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
     return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
 
 
-PARAMETER_MULTIPLE = 8
-"""The number of parameters is padded to a multiple of this, and to one at least: one program for most models."""
-
-
 def _quadratic(common, one) -> Quadratic:
     (log_q, log_r, start, nodes), (linear, posterior, read) = common, one
     return quadratic(log_q, log_r, start, linear, nodes, posterior, read)
@@ -257,7 +253,9 @@ class ScoringMStep(AbstractMStep):
 
         With it the posterior precision where it began, and which of the sequences `used` could be.
         """
-        pad = PARAMETER_MULTIPLE * max(1, -(-self.prior.size // PARAMETER_MULTIPLE)) - self.prior.size
+        # The number of parameters is padded to a multiple of this, and to one at least: one program for most models
+        multiple = 8
+        pad = multiple * max(1, -(-self.prior.size // multiple)) - self.prior.size
         prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
         rule = eqx.tree_at(lambda r: (r.prior, r.least), self, (prior, bounds(self.least, prior.size)))
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)

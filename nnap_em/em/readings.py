@@ -5,9 +5,9 @@ from jaxtyping import Bool, Float, Int
 
 from ..data.noise import reading_noise
 
-OVER, MOVES, ROWS_BEFORE = 5, 6.0, 30
-"""Rows over which a change counts as motion, from how many standard deviations of the noise on, and the rows at rest
-before the first motion that are kept: as many as show where the machine rests."""
+OVER, ROWS_BEFORE = 5, 30
+"""Rows over which a change counts as motion, and the rows at rest before the first motion that are kept: as many as
+show where the machine rests."""
 RESTS = 0.35
 """Share of rows at rest from which on a log determines hardly more of friction than its size: machines that were shaken
 for the purpose rest in 0 to 0.2 of the rows, those that stick in 0.5 to 0.8."""
@@ -20,7 +20,7 @@ def _moves(signal: Float[np.ndarray, "seq time"]) -> Bool[np.ndarray, "seq row"]
     for y, known, bridged in zip(signal, np.isfinite(signal), whole, strict=True):
         if known.any():
             bridged[:] = np.interp(rows, rows[known], y[known])
-    return np.abs(whole[:, OVER:] - whole[:, :-OVER]) > MOVES * noise
+    return np.abs(whole[:, OVER:] - whole[:, :-OVER]) > 6.0 * noise
 
 
 def at_rest(signal: Float[np.ndarray, "seq time"]) -> float:

@@ -10,9 +10,6 @@ import numpy as np
 from ..data.dataset import Dataset
 from ..data.rig import Declared, Rig
 
-SCALE_ROUNDING = 1e-4
-"""Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too."""
-
 
 def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
@@ -34,10 +31,12 @@ def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     values = [jnp.asarray(rig.parameters[name].mean, float) for name in names]
     whole, slopes = np.asarray(terms(values)), [np.asarray(slope) for slope in jax.jacfwd(terms)(values)]
     left, held = list(range(len(names))), []
+    # Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too
+    rounding = 1e-4
     while left:
         columns = np.stack([rig.parameters[names[i]].std * slopes[i] for i in left], axis=1)
         steps = np.linalg.lstsq(columns, whole, rcond=1e-9)[0]
-        if np.linalg.norm(columns @ steps - whole) > SCALE_ROUNDING * np.linalg.norm(whole):
+        if np.linalg.norm(columns @ steps - whole) > rounding * np.linalg.norm(whole):
             break
         held.append(left.pop(int(np.argmax(np.abs(steps)))))
     return tuple(names[i] for i in held)

@@ -13,10 +13,6 @@ from ..model import hooks
 from ..model.servo import Servo, unlimited
 from ..systems import AbstractSystem
 
-SERVO_STEP = 0.5
-"""Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
-bears 2.8."""
-
 LAG = 5
 """Rows over which differences are taken."""
 
@@ -49,7 +45,9 @@ def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], data: Dat
     q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
     slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
     state = np.concatenate([np.concatenate([np.zeros((32, dof, dof)), np.tile(np.eye(dof), (32, 1, 1))], 2), slopes], 1)
-    return float(np.max(np.abs(np.linalg.eigvals(state)))) * dt / SERVO_STEP
+    # Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
+    # bears 2.8
+    return float(np.max(np.abs(np.linalg.eigvals(state)))) * dt / 0.5
 
 
 @eqx.filter_jit

@@ -26,18 +26,8 @@ from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
 from .prior import ParameterPrior
 
-WINDOW = 2.0
-"""Length of a simulation, in the pace of the model: a reading is one pace from its start on average."""
-SETTLES = 0.5
-"""Time after which 2 % of an error of a start are left, in the pace of the model: four slowest time constants."""
-FINE = 128
-"""Errors in a pace at most, sixteen in a slowest time constant: closer ones are the same but for noise."""
 HUBER = 3.0
 """Errors of more standard deviations weigh less: of Gaussian ones three in a thousand."""
-FALLS = 0.01
-"""Gain in the log of the posterior [nat] below which a fit ends."""
-STEPS = 40
-"""Steps of a fit at most."""
 
 
 class Windows(eqx.Module):
@@ -58,8 +48,12 @@ class Windows(eqx.Module):
 def windows(model: StateSpaceModel, data: Dataset) -> Windows:
     """Windows of the errors of a model: each sequence in equal parts."""
     rows, pace = int(np.max(np.sum(np.asarray(data.valid), axis=1))), model.pace / model.dt
-    count = max(1, round(rows / (WINDOW * pace)))
-    return Windows(count, rows // count, max(1, round(pace / FINE)), round(SETTLES * pace))
+    length = 2.0  # length of a simulation, in the pace of the model: a reading is one pace from its start on average
+    count = max(1, round(rows / (length * pace)))
+    # Time after which 2 % of an error of a start are left, in the pace of the model: four slowest time constants
+    settles = 0.5
+    fine = 128  # errors in a pace at most, sixteen in a slowest time constant: closer ones are the same but for noise
+    return Windows(count, rows // count, max(1, round(pace / fine)), round(settles * pace))
 
 
 Errors = Float[np.ndarray, "seq window place obs"]
@@ -117,10 +111,6 @@ def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begi
     return together([model], [prior], [np.zeros_like(begin.mean)], data, begin)[0]
 
 
-GROUPS = (1, 4, 16, 64)
-"""Numbers of models whose errors are computed at once, a program for each; copies of the last model fill one up."""
-
-
 def together(
     models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], starts: Sequence, data: Dataset, begin: Starts
 ) -> list[Simulated]:
@@ -129,9 +119,11 @@ def together(
     numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
     static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
     out = []
-    for first in range(0, len(models), GROUPS[-1]):
-        some, begun = numbers[first : first + GROUPS[-1]], list(starts[first : first + GROUPS[-1]])
-        size = next(size for size in GROUPS if size >= len(some))
+    # Numbers of models whose errors are computed at once, a program for each; copies of the last model fill one up
+    groups = (1, 4, 16, 64)
+    for first in range(0, len(models), groups[-1]):
+        some, begun = numbers[first : first + groups[-1]], list(starts[first : first + groups[-1]])
+        size = next(size for size in groups if size >= len(some))
         filled = [*some, *some[-1:] * (size - len(some))]
         stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *filled)
         tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
@@ -271,7 +263,7 @@ def fit_all(
     begin: Starts,
     scale: Scale,
     counts: Counts | None = None,
-    steps: int = STEPS,
+    steps: int = 40,
 ) -> list[Simulated]:
     """Models of one structure with the parameters of the largest `log_posterior`, side by side; their noise stays.
 
@@ -281,6 +273,7 @@ def fit_all(
     known = best[0].observed & (True if counts is None else counts)
     values = [log_posterior(one, scale, known) for one in best]
     damping, open_ = [1e-2] * len(best), list(range(len(best)))
+    falls = 0.01  # gain in the log of the posterior [nat] below which a fit ends
     for _ in range(steps):
         ahead, moved = [], []
         for i in open_:
@@ -295,7 +288,7 @@ def fit_all(
                 damping[i] = max(0.4 * damping[i], 1e-6)
             else:
                 gain, damping[i] = math.inf, 4 * damping[i]
-            if (gain < FALLS and damping[i] < 1.0) or damping[i] > 1e6:  # a damped step is short, whatever it gains
+            if (gain < falls and damping[i] < 1.0) or damping[i] > 1e6:  # a damped step is short, whatever it gains
                 open_.remove(i)
     return best
 

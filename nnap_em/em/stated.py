@@ -22,11 +22,6 @@ from .mstep import ScoringMStep
 from .multistep import Columns, OpenLoop, followed, open_loop, sensitivities, weighed
 from .weights import Weights
 
-FEATURES = 48
-"""Random functions of the state at every joint; twice as many gave the same within a tenth."""
-SMALLEST_FORCE, LARGEST_FORCE, FORCE_SIZES = 1e-3, 1e5, 49
-"""Sizes of such forces that are tried: variance of what they add over that of the rest, where it is known best."""
-
 
 class Stated(NamedTuple):
     """Reported uncertainty of a fit."""
@@ -151,10 +146,11 @@ def discrepancy_columns(
     spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)
     unit = (signals - jnp.nanmean(seen, axis=(0, 1), keepdims=True)) / jnp.where(spread > 0, spread, 1.0)
     turned, shifted = jax.random.split(key)
-    slope = jax.random.normal(turned, (unit.shape[-1], dof * FEATURES), unit.dtype)
-    phase = jax.random.uniform(shifted, (1, 1, dof * FEATURES), unit.dtype, maxval=2 * math.pi)
-    value = math.sqrt(2 / FEATURES) * jnp.cos(unit @ slope + phase)
-    acts = jnp.repeat(jnp.diag(weights.asymmetry), FEATURES, axis=0)
+    features = 48  # random functions of the state at every joint; twice as many gave the same within a tenth
+    slope = jax.random.normal(turned, (unit.shape[-1], dof * features), unit.dtype)
+    phase = jax.random.uniform(shifted, (1, 1, dof * features), unit.dtype, maxval=2 * math.pi)
+    value = math.sqrt(2 / features) * jnp.cos(unit @ slope + phase)
+    acts = jnp.repeat(jnp.diag(weights.asymmetry), features, axis=0)
     force = jnp.moveaxis(value, -1, 1)[..., None] * acts[None, :, None]
     return Columns(force, jnp.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
 
@@ -172,7 +168,8 @@ def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> flo
     strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
     if whole == 0.0 or not strength.any():
         return 0.0
-    ratios = np.concatenate([[0.0], np.geomspace(SMALLEST_FORCE, LARGEST_FORCE, FORCE_SIZES)])[:, None] / strength[-1]
+    # variance of what such forces add over that of the rest, where it is known best
+    ratios = np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 49)])[:, None] / strength[-1]
     noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / errors.rows
     best = np.argmin(0.5 * errors.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
     return math.sqrt(float(ratios[best, 0] * noise[best]))

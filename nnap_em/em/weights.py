@@ -107,9 +107,13 @@ class Weights(eqx.Module):
         w = jnp.concatenate([unknown.weights(), jnp.zeros(self.prior.size, dtype)])
         torque = self.phi(unknown, w)[: self.nodes.size].reshape(self.nodes.shape)
         variance = jnp.mean(torque**2, axis=1) + self.asymmetry[: len(self.nodes)] ** 2
-        place = jnp.arange(count, dtype=dtype) / BEND
+        # Nodes over which the maps of the prior bend, of 41 a factor of 7 in velocity: on slides, pendulums and
+        # acrobots with Stribeck friction 97 to 100 % of the truth near rest is then within two standard deviations;
+        # with 9, of a slide 88 %
+        place = jnp.arange(count, dtype=dtype) / 6.0
         apart = math.sqrt(5.0) * jnp.abs(place[:, None] - place[None])
-        smooth = (1 + apart + apart**2 / 3) * jnp.exp(-apart) + GRAIN**2 * jnp.eye(count, dtype=dtype)
+        grain = 1e-3  # standard deviation of a torque beside that, as a share of its own: what the curve itself may err
+        smooth = (1 + apart + apart**2 / 3) * jnp.exp(-apart) + grain**2 * jnp.eye(count, dtype=dtype)
         own = jnp.linalg.inv(smooth)[None] / variance[:, None, None]
         own = jax.scipy.linalg.block_diag(*own, jnp.eye(self.prior.size, dtype=dtype))
         return self.symmetry(unknown, w) + own
@@ -184,11 +188,6 @@ def bounds(least: Float[Array, " bounded"], size: int) -> Float[Array, " param"]
     return jnp.concatenate([least, jnp.full(size, -jnp.inf, least.dtype)])[:size]
 
 
-BEND = 6.0
-"""Nodes over which the maps of the prior bend, of 41 a factor of 7 in velocity: on slides, pendulums and acrobots with
-Stribeck friction 97 to 100 % of the truth near rest is then within two standard deviations; with 9, of a slide 88 %."""
-GRAIN = 1e-3
-"""Standard deviation of a torque beside that, as a share of its own: what the curve itself may err."""
 AT_REST = 0.03
 """Even part at a node where the odd part is zero, in those of the other nodes: hardly any, without a singular prior."""
 COULOMB = 0.01

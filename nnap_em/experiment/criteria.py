@@ -102,12 +102,6 @@ class Parameters(AbstractCriterion):
         return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
 
 
-ENOUGH_DISTANCE = 9.0
-"""Distance of two models [standard deviations of their log-likelihood ratio] beyond which more adds nothing.
-
-At 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md)."""
-
-
 class Discrimination(AbstractCriterion):
     """Discrimination between laws: the pair that is hardest to discriminate counts.
 
@@ -129,8 +123,11 @@ class Discrimination(AbstractCriterion):
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """Half the distance still to go."""
-        far = np.minimum(self.distance(expected), ENOUGH_DISTANCE)
-        return np.asarray(0.5 * np.mean(ENOUGH_DISTANCE - far, axis=-1) + 0.5 * np.max(ENOUGH_DISTANCE - far, axis=-1))
+        # Distance of two models [standard deviations of their log-likelihood ratio] beyond which more adds nothing. At
+        # 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md).
+        enough = 9.0
+        far = np.minimum(self.distance(expected), enough)
+        return np.asarray(0.5 * np.mean(enough - far, axis=-1) + 0.5 * np.max(enough - far, axis=-1))
 
 
 class Several(AbstractCriterion):

@@ -22,14 +22,8 @@ from .rivals import Rivals
 from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, expected_information, search
 from .signals import Proposal, played, starts
 
-TRIAL_MODELS = 32
-"""Models from the posterior by which every proposal is tried."""
 CHECKED, DRAWN_IN = 500, 200
 """Models by which the chosen ones are tried, and how many of these are drawn in a figure."""
-SLOW_PERCENT = 20
-"""Percent of the rows that are near rest."""
-NEAR_REST = 0.05
-"""Share of the largest velocity: below it velocities count alike, above it the less the denser they would be."""
 
 
 class Design(NamedTuple):
@@ -109,7 +103,8 @@ def design(
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
     discrimination = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
-    slow = _slow(fit, visited)
+    slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
+    slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
     friction = _friction(fit, visited, slow)
     criterion = _criterion(question, fitted, fit, friction, discrimination)
     rows = round(seconds / sequences / fitted.rig.dt)
@@ -118,7 +113,8 @@ def design(
             f"{counted(sequences, 'sequence')} in {seconds:g} s: {counted(rows, 'row')} each; give more --seconds"
         )
     t = fitted.rig.dt * np.arange(rows + 1)
-    setup = Setup(fit, pairs, drawn_paths(fitted, TRIAL_MODELS, key=key_paths), limits, t, key_noise)
+    trial_models = 32  # models from the posterior by which every proposal is tried
+    setup = Setup(fit, pairs, drawn_paths(fitted, trial_models, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
     count = float(np.sum(np.asarray(data.valid)[used]))
     setup = setup._replace(share=share(fit, count * row.information))
@@ -188,16 +184,12 @@ def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, 
     return rows[np.isfinite(rows).all(axis=-1), dof : 2 * dof]
 
 
-def _slow(fit: Fit, visited: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, " dof"]:
-    """Speeds near rest; where the machine mostly stood still, as far as the map has its first nodes."""
-    return np.maximum(np.percentile(np.abs(visited), SLOW_PERCENT, axis=0), np.sort(np.abs(fit.nodes), axis=1)[:, 2])
-
-
 def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:
     """Over the visited velocities, near rest no more than its share; and near rest alone."""
     nodes, dof = np.asarray(fit.nodes), fit.nodes.shape[0]
     low, high = np.percentile(visited, [0.5, 99.5], axis=0)
-    place = np.arcsinh(nodes / (NEAR_REST * np.abs(nodes).max(axis=1, keepdims=True)))
+    # Share of the largest velocity: below it velocities count alike, above it the less the denser they would be
+    place = np.arcsinh(nodes / (0.05 * np.abs(nodes).max(axis=1, keepdims=True)))
     everywhere = np.gradient(place, axis=1) * ((nodes >= low[:, None]) & (nodes <= high[:, None]))
     near = np.gradient(nodes, axis=1) * (np.abs(nodes) <= slow[:, None])
     weight = np.stack([everywhere, near])
@@ -207,21 +199,17 @@ def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.nd
     return Friction(fit, np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight)
 
 
-LIMIT_FACTOR, LAST = 0.85, 12
-"""Factor on a sequence that breaks a limit after all, and the largest number of repetitions."""
-
-
 def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log):
     """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
     proposal = Proposal(*map(np.array, plan.proposal))
-    for _ in range(LAST):
+    for _ in range(12):
         u, start = played(proposal, setup.limits, setup.t), starts(proposal, setup.limits)
         trials = motions(checked.paths, setup.limits, setup.t, u, start, DRAWN_IN, key=checked.key)
         ok = allowed(trials, setup.limits)
         if ok.all():
             break
         log(f"too near a limit in {CHECKED} trials: {counted(np.sum(~ok), 'sequence')} made smaller")
-        proposal.shape[~ok, :, -1] *= LIMIT_FACTOR
+        proposal.shape[~ok, :, -1] *= 0.85
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
     count = len(proposal.family)

@@ -72,15 +72,13 @@ def linearised(fit: Fit, seq: Dataset, x: Float[Array, "time state"]) -> tuple[L
     return linear, kalman_filter(model.log_q, model.log_r, start, linear.affine, linear.reading, linear.seq), path
 
 
-POINTS = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
-"""Three points of the same mean and variance as a normal distribution [standard deviations]."""
-
-
 def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
     """All that the path may have."""
     v = path.mean[:, None, dof : 2 * dof]
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(path.cov, axis1=1, axis2=2), 0.0))[:, None, dof : 2 * dof]
-    return v + std * jnp.asarray(POINTS, v.dtype)[None, :, None]
+    # Three points of the same mean and variance as a normal distribution [standard deviations]
+    points = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
+    return v + std * jnp.asarray(points, v.dtype)[None, :, None]
 
 
 def columns_of(fit: Fit, linear: Local, path: Gaussian) -> Float[Array, "time state phi"]:

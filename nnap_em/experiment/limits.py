@@ -12,9 +12,6 @@ from ..data.limits import Range
 from ..data.rig import Rig
 from ..systems import AbstractSystem
 
-OUTER = 0.1
-"""Percent of the rows on either side that may be a slip of the smoother."""
-
 
 class DesignError(ValueError):
     """No experiment can be designed: the message has the reason and a hint."""
@@ -60,7 +57,8 @@ def limits_of(
     bounds = rig.limits
     inputs = _bounds(rig.input_columns, bounds.values, u[valid].min(axis=0), u[valid].max(axis=0))
     rate = _bounds(rig.input_columns, bounds.rate, -change.max(axis=0), change.max(axis=0))[1]
-    low, high = _bounds(names, bounds.values, *np.percentile(reached, [OUTER, 100 - OUTER], axis=0))
+    outer = 0.1  # percent of the rows on either side that may be a slip of the smoother
+    low, high = _bounds(names, bounds.values, *np.percentile(reached, [outer, 100 - outer], axis=0))
     still, begun = jnp.zeros(dof), mean[used, 0]
     stays = bool(jnp.all(jnp.abs(system.bias(still, still)) < 1e-9))
     rest = np.zeros(2 * dof)

@@ -12,11 +12,6 @@ from ..fit.predict import Paths
 from ..numerics.parallel import each
 from .limits import Limits
 
-BY_HAND = 0.01
-"""Standard deviation of a start that is set by hand, over the range that the coordinate may have, or over a turn."""
-SAFE = 3.5
-"""Standard deviations by which the largest excursion of a motion stays inside a limit: 1 in 4000 if it is normal."""
-
 
 class Motions(NamedTuple):
     """Motions under some inputs, by models drawn from the posterior."""
@@ -49,7 +44,8 @@ def motions(
     """Every proposal by every model; the same noise for all proposals, so that they can be compared."""
     angle = np.asarray(paths.model.system.angles)
     reach = (limits.highest - limits.lowest)[: angle.size]
-    spread = BY_HAND * np.where(angle, np.minimum(reach, 2 * np.pi), reach)
+    # Standard deviation of a start that is set by hand, over the range that the coordinate may have, or over a turn
+    spread = 0.01 * np.where(angle, np.minimum(reach, 2 * np.pi), reach)
     common = _Common(paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(recorded))
     keys = jax.random.split(key, 1)[np.zeros(len(u), int)]
     return each(_motions, common, (blank(t, u, len(paths.model.measured)), jnp.asarray(start), keys))
@@ -90,8 +86,10 @@ def _motions(common: _Common, one) -> Motions:
 def allowed(trials: Motions, limits: Limits) -> Bool[np.ndarray, " proposal"]:
     """True where all motions stay inside the limits, and their excursions far enough for those that were not drawn."""
     low, high = np.asarray(trials.lowest), np.asarray(trials.highest)
+    # Standard deviations by which the largest excursion of a motion stays inside a limit: 1 in 4000 if it is normal
+    safe = 3.5
     with np.errstate(invalid="ignore", over="ignore"):
         inside = (low >= limits.lowest).all(axis=(1, 2)) & (high <= limits.highest).all(axis=(1, 2))
-        below = (low.mean(axis=1) - SAFE * low.std(axis=1) >= limits.lowest).all(axis=1)
-        above = (high.mean(axis=1) + SAFE * high.std(axis=1) <= limits.highest).all(axis=1)
+        below = (low.mean(axis=1) - safe * low.std(axis=1) >= limits.lowest).all(axis=1)
+        above = (high.mean(axis=1) + safe * high.std(axis=1) <= limits.highest).all(axis=1)
     return inside & below & above

@@ -37,10 +37,6 @@ class Effort(NamedTuple):
 
 
 DESIGN_EFFORT = Effort()
-SHRINKS = 0.7
-"""Factor on the size of a proposal that breaks a limit."""
-PROPOSAL_CHANGE = (0.3, 0.05)
-"""Change of the numbers of a proposal in the first round and in the last."""
 
 
 class Setup(NamedTuple):
@@ -105,10 +101,11 @@ def search(
         total = added if total is None else total + added
     plan = some(pool, np.asarray(chosen))
     log(f"the best {count} of {len(pool.proposal.family)}: cost {float(criterion.cost(plan.expected.sum())):.3f}")
+    change = (0.3, 0.05)  # change of the numbers of a proposal in the first round and in the last
     for number in range(effort.rounds):
         if float(criterion.cost(plan.expected.sum())) <= criterion.least:
             break
-        reach = PROPOSAL_CHANGE[0] * (PROPOSAL_CHANGE[1] / PROPOSAL_CHANGE[0]) ** (number / max(effort.rounds - 1, 1))
+        reach = change[0] * (change[1] / change[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(setup, criterion, plan, rng, reach, effort)
         cost = float(criterion.cost(plan.expected.sum()))
         log(
@@ -121,6 +118,7 @@ def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, lo
     """Proposals that stay inside the limits; one that does not is tried again with smaller inputs."""
     inputs, states = setup.limits.low.size, setup.limits.first.size
     plans, waiting = [], drawn(rng, effort.batch, inputs, states)
+    shrinks = 0.7  # factor on the size of a proposal that breaks a limit
     for _ in range(effort.tries):
         ok, expected = evaluated(setup, waiting, effort.few)
         plans.append(some(Plan(waiting, expected), ok))
@@ -128,9 +126,9 @@ def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, lo
         log(f"{have} of {effort.pool} proposals inside the limits")
         if have >= effort.pool:
             break
-        waiting.shape[~ok, :, -1] *= SHRINKS
+        waiting.shape[~ok, :, -1] *= shrinks
         fresh = drawn(rng, effort.batch, inputs, states)
-        again = ~ok & (waiting.shape[..., -1].max(axis=1) > SHRINKS**6)
+        again = ~ok & (waiting.shape[..., -1].max(axis=1) > shrinks**6)
         waiting = Proposal(*(_where(again, a, b) for a, b in zip(waiting, fresh, strict=True)))
     plan = _joined(plans)
     if len(plan.proposal.family) < count:

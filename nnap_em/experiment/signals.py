@@ -9,11 +9,6 @@ from jaxtyping import Float
 
 from .limits import Limits
 
-FASTEST = 0.1
-"""Highest frequency of a tone, in samples^-1: ten samples make a wave."""
-SIZE = 18
-"""Numbers between 0 and 1 that shape the signal of one input."""
-
 
 class AbstractSignal(eqx.Module):
     """A family of signals."""
@@ -25,7 +20,8 @@ class AbstractSignal(eqx.Module):
 
 def _frequency(z, t):
     """Frequency from one wave in the whole to the fastest, evenly in its logarithm [Hz]."""
-    slow, fast = 1.0 / (t[-1] - t[0]), FASTEST / (t[1] - t[0])
+    fastest = 0.1  # highest frequency of a tone, in samples^-1: ten samples make a wave
+    slow, fast = 1.0 / (t[-1] - t[0]), fastest / (t[1] - t[0])
     return slow * (fast / slow) ** z
 
 
@@ -84,7 +80,7 @@ class Proposal(NamedTuple):
 
 def drawn(rng: np.random.Generator, count: int, inputs: int, states: int) -> Proposal:
     """Proposals of every family in turn."""
-    shape = rng.uniform(size=(count, inputs, SIZE + 1))
+    shape = rng.uniform(size=(count, inputs, 18 + 1))  # numbers between 0 and 1 that shape the signal of one input
     return Proposal(np.arange(count) % len(FAMILIES), shape, rng.uniform(size=(count, states)))
 
 

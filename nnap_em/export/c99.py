@@ -78,8 +78,7 @@ def write_c(fitted: Identified, out: Path | str) -> list[str]:
         ExportError: a law has no plain C form; nothing is written.
     """
     out = Path(out)
-    name = re.sub(r"\W", "_", out.stem)
-    name = f"model_{name}" if name[:1].isdigit() else name
+    name = identifier(out.stem)
     functions, sizes, left, lines = (_equations if fitted.rig.equations else _joints)(fitted, name)
     absent = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in left]
     first, last = (
@@ -96,6 +95,12 @@ enum {{ {sizes} }};
 """
     replace_text(out, head + "\n" + "\n".join(functions))
     return absent
+
+
+def identifier(stem: str) -> str:
+    """The name of a file as one in C."""
+    name = re.sub(r"\W", "_", stem)
+    return f"model_{name}" if name[:1].isdigit() else name
 
 
 def _joints(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:

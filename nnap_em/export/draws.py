@@ -35,7 +35,7 @@ def write_draws(fitted: Identified, out: Path | str, count: int, *, key: PRNGKey
     for i in range(count):
         drawn = paths.prior.write(paths.model, paths.parameters[i])
         if isinstance(drawn.system, Tree):
-            drawn = _physical(drawn, paths.model)
+            drawn = dataclasses.replace(drawn, system=drawn.system.reached_from(paths.model.system))
         forms = friction_forms(fitted, np.asarray(paths.tables[i]))
         row: dict[str, float] = {"draw": i}
         for name, form in zip(drawn.system.coordinates, forms, strict=True):
@@ -49,8 +49,3 @@ def write_draws(fitted: Identified, out: Path | str, count: int, *, key: PRNGKey
         if isinstance(drawn.system, Tree):
             write_variant(fitted, drawn, forms, out / f"draw_{i:0{width}d}.xml")
     write_csv(out / TABLE, {name: np.asarray(values, float) for name, values in columns.items()})
-
-
-def _physical(drawn, model):
-    """A draw whose bodies can be, on the way from those of the fit."""
-    return dataclasses.replace(drawn, system=drawn.system.reached_from(model.system))

@@ -17,6 +17,8 @@ from pathlib import Path
 from .. import __version__
 from ..fit.identify import Identified
 from ..storage.files import replace_bytes
+from .c99 import identifier
+from .model import states_of
 from .online import numbers, observer_c
 
 
@@ -39,8 +41,7 @@ def write_fmu(fitted: Identified, out: Path | str, *, single: bool = False) -> b
         ExportError: a law has no plain C form; nothing is written.
     """
     out = Path(out)
-    name = re.sub(r"\W", "_", out.stem)
-    name = f"model_{name}" if name[:1].isdigit() else name
+    name = identifier(out.stem)
     source, header = observer_c(fitted, name, single=single)
     token = hashlib.sha256(source.encode()).hexdigest()[:32]
     wrapper = Path(__file__).with_name("fmu.c").read_text(encoding="utf-8")
@@ -76,8 +77,7 @@ def _binary(name: str, files: dict[str, str]) -> bytes:
 
 def _description(fitted: Identified, name: str, token: str) -> ET.Element:
     rig, system, own = fitted.rig, fitted.model.system, numbers(fitted)
-    states = system.coordinates + system.rates
-    states += tuple(f"memory{i + 1}" for i in range(fitted.model.log_q.shape[0] - len(states)))
+    states = states_of(fitted.model)
     forces = ["" if rig.input_kinds else system.force_unit(joint) for joint in rig.input_joints]
     forces += [""] * len(rig.scale_columns)
     units = [system.unit(state) if state in system.readable else "" for state in states]

@@ -13,14 +13,6 @@ from ..systems.tree import KNEE, Tree
 
 REPORTED_MISS = 0.1
 """Share of a learned curve beyond which the part that its form misses is reported [1]."""
-SIMPLER = 0.005
-"""Least share of a learned curve that a dip or a constant must explain to be written [1]."""
-EXPLAINED_PER_STD = 0.3
-"""Least share that it must explain, over the standard deviation of the curve relative to the curve [1]."""
-CURVE_WEIGHT = 1e3
-"""Weight of the curve over the prior of the law, and of its largest torque over one that is none [1]."""
-CURVE_VELOCITIES = 160
-"""Velocities at which a learned curve is read."""
 
 
 class FrictionForm(NamedTuple):
@@ -54,14 +46,16 @@ def friction_form(
 ) -> FrictionForm:
     """Form nearest to a curve of friction torque [N m] over velocity [rad/s] of standard deviation `std` [N m].
 
-    A dip or a constant is kept only where it explains more than `SIMPLER` of the curve, and more than a part of its
+    A dip or a constant is kept only where it explains more than 0.005 of the curve, and more than a part of its
     uncertainty; a dip narrower than the sign is none, as its breakaway torque is never reached.
     """
     weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
     fits = {kind: _form(v, torque, weight, *kind) for kind in itertools.product((False, True), repeat=2)}
     fits = {kind: form for kind, form in fits.items() if not kind[1] or form.stribeck > form.smooth}
     least = min(form.missed for form in fits.values())
-    bar = max(SIMPLER, EXPLAINED_PER_STD * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
+    simpler = 0.005  # least share of a learned curve that a dip or a constant must explain to be written [1]
+    # Least share that it must explain, over the standard deviation of the curve relative to the curve [1]
+    bar = max(simpler, 0.3 * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
     order = sorted(fits, key=sum)  # fewer terms first
     return next(fits[kind] for kind in order if fits[kind].missed <= least + bar)
 
@@ -77,7 +71,8 @@ def friction_forms(fitted: Identified, deviation: Float[np.ndarray, "dof node"] 
         forms = [FrictionForm(j.dry, j.dry, 1.0, j.damping, 0.0, KNEE) for j in joints]
         return forms or [FrictionForm()] * len(system.coordinates)
     nodes = np.asarray(fitted.m_step.weights(fitted.model).nodes)
-    velocity = np.linspace(-1.0, 1.0, CURVE_VELOCITIES)[None] * np.max(np.abs(nodes), axis=1)[:, None]
+    curve_velocities = 160  # velocities at which a learned curve is read
+    velocity = np.linspace(-1.0, 1.0, curve_velocities)[None] * np.max(np.abs(nodes), axis=1)[:, None]
     table = friction_table(fitted, jnp.asarray(velocity))
     torque = np.asarray(table.torque)
     if deviation is not None:
@@ -93,8 +88,10 @@ def _form(
     dip: bool,
 ) -> FrictionForm:
     """Nearest form with or without a constant and a dip."""
-    top, least = float(np.max(np.abs(v))), max(np.max(np.abs(torque)), 1e-9) / CURVE_WEIGHT**2
-    value = nearest(v, torque, np.diag(CURVE_WEIGHT * weight), dip=dip, constant=constant)
+    # Weight of the curve over the prior of the law, and of its largest torque over one that is none [1]
+    curve_weight = 1e3
+    top, least = float(np.max(np.abs(v))), max(np.max(np.abs(torque)), 1e-9) / curve_weight**2
+    value = nearest(v, torque, np.diag(curve_weight * weight), dip=dip, constant=constant)
     torques, bars = value * [1.0, 1.0, 1.0, top, 1.0, 1.0], [least, least, 0.0, least, 0.0, -np.inf]
     value = np.where(torques < bars, 0.0, value)
     coulomb, breakaway, stribeck, viscous, smooth, offset = value.tolist()

@@ -26,8 +26,6 @@ from .placement import Drive, OpenFile, acting_on, late, passive, placed, rotor,
 
 LONGEST_STEP = 5e-4
 """Longest time step of a written file [s]."""
-SHORTEST = 5e-5
-"""Shortest time step of a written file [s]."""
 LARGEST_RELAXATION = 1.5
 """Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
 
@@ -101,7 +99,9 @@ def write_variant(
         for effect, reason in unplaced
     ]
     _springs(file)
-    _bristled(file, forms, bristles)
+    for j, bristle in bristles.items():
+        numbers = (*bristle, _level(forms[j]), forms[j].breakaway, forms[j].stribeck)
+        passive(file, system.machine.joints[j].name, "bristle", lugre=numbers)
     _noise(file, np.exp(0.5 * np.asarray(model.log_r)))
     for motor, element in zip(motors_of(fitted, system), list(file.spec.actuators), strict=False):
         _motor(file, motor, element)
@@ -211,7 +211,8 @@ def _bristle(j: int, form: FrictionForm, model: StateSpaceModel, inertia: float)
 def _longest_step(forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> float:
     """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
     rates = [stiffness * forms[j].fastest / _level(forms[j]) for j, (stiffness, _) in bristles.items()]
-    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), SHORTEST)
+    shortest = 5e-5  # shortest time step of a written file [s]
+    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), shortest)
 
 
 def _level(form: FrictionForm) -> float:
@@ -240,12 +241,6 @@ def _rest(a: float, b: float, c: float, d: float) -> float:
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
     real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])
     return float(min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0))
-
-
-def _bristled(file: OpenFile, forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> None:
-    for j, bristle in bristles.items():
-        numbers = (*bristle, _level(forms[j]), forms[j].breakaway, forms[j].stribeck)
-        passive(file, file.system.machine.joints[j].name, "bristle", lugre=numbers)
 
 
 def _noise(file: OpenFile, noise: Float[np.ndarray, " obs"]) -> None:

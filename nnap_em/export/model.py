@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from .. import __version__
 from ..effects import AbstractEffect
-from ..em.weights import Weights
 from ..fit.identify import Identified, friction_table, parameter_table
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
@@ -24,7 +23,7 @@ from . import program as portable
 from .placement import of_command
 from .unroll import Source, UnrollError, unroll
 
-PARAMETERS_FILE, PREDICTOR_FILE, STABLEHLO_FILE = "parameters.json", "predictor.py", "model.stablehlo"
+PREDICTOR_FILE, STABLEHLO_FILE = "predictor.py", "model.stablehlo"
 
 
 class ExportError(ValueError):
@@ -58,7 +57,7 @@ def write_model(fitted: Identified, out: Path | str) -> str:
     except ExportError as error:
         code, reason = "", str(error)
     step = stablehlo(fitted.model)
-    write_json(out / PARAMETERS_FILE, parameters(fitted))
+    write_json(out / "parameters.json", parameters(fitted))
     replace_bytes(out / STABLEHLO_FILE, step)
     if code:
         replace_text(out / PREDICTOR_FILE, code)
@@ -166,7 +165,7 @@ def predictor(fitted: Identified) -> str:
         "offsets": bank.offsets,
         "shrink": bank.shrink,
         "nodes": weights.nodes,
-        "spread": _spread(fitted, weights),
+        "spread": _spread(fitted),
         "parameters": z,
         "nominal": model.system.simulated,
     }
@@ -253,7 +252,7 @@ def _row(model: StateSpaceModel, columns: Float[Array, " input"]) -> Inputs:
     return Inputs(columns[:drives], columns[drives + 1 : -1], columns[drives], columns[-1])
 
 
-def _spread(fitted: Identified, weights: Weights) -> Float[np.ndarray, "phi rank"]:
+def _spread(fitted: Identified) -> Float[np.ndarray, "phi rank"]:
     """Factor of the covariance that `phi_samples` draws from, without directions that are rounding."""
     half = np.linalg.inv(np.linalg.cholesky(np.asarray(fitted.state.hessian))).T
     left, size, _ = np.linalg.svd(half, full_matrices=False)

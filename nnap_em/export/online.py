@@ -22,17 +22,12 @@ from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_text
-from .c99 import WHOLE, Dialect, function
-from .model import ExportError, unrolled
+from .c99 import WHOLE, Dialect, function, identifier
+from .model import ExportError, states_of, unrolled
 from .unroll import named
 
-BRANCHES = 16
-"""Gaussians at most, where an angle is not read."""
-DEGREE, HALVINGS, BEYOND = 7, 5, 6.0
-"""Polynomials of a friction table: their degree, the halvings of an octave at most, and the end of the table over the
-largest rate of interest: the first estimates of a machine in motion are that wide."""
-EXACT = {False: 1e-11, True: 1e-6}
-"""Largest error of a friction table over the size of the torque, in 64 and 32 bits; else the network is kept."""
+DEGREE = 7
+"""Degree of the polynomials of a friction table."""
 
 
 class Table(NamedTuple):
@@ -68,8 +63,9 @@ class Table(NamedTuple):
 def table(curve: Any, name: str, speed: float, knee: float, share: float) -> Table | None:
     """A curve as a table that errs by `share` of its size at most, if one does."""
     unit = 0.5 - 0.5 * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))  # Chebyshev's nodes
-    checks, octaves = np.linspace(0.0, 1.0, 13), math.ceil(math.log2(1 + BEYOND * speed / knee))
-    for bits in range(2, HALVINGS + 1):
+    beyond = 6.0  # end of the table over the largest rate of interest: the first estimates in motion are that wide
+    checks, octaves = np.linspace(0.0, 1.0, 13), math.ceil(math.log2(1 + beyond * speed / knee))
+    for bits in range(2, 6):  # halvings of an octave
         width = np.repeat(2.0 ** (np.arange(octaves) - bits), 2**bits)
         edge = 1 + np.cumsum(width) - width
 
@@ -118,8 +114,7 @@ def numbers(fitted: Identified) -> Numbers:
     """Estimated numbers of the machine, standard deviations of the readings, and those of the kicks of a row."""
     model, system = fitted.model, fitted.model.system
     own = _estimated(fitted)
-    states = system.coordinates + system.rates
-    kicks = states + tuple(f"memory{i + 1}" for i in range(model.log_q.shape[0] - len(states)))
+    states, kicks = system.states, states_of(model)
     values = [*(float(own.read(model)[i]) for i in range(own.size))]
     values += [float(x) for x in np.exp(0.5 * np.concatenate([model.log_r, model.log_q]))]
     names = (*own.names, *(f"noise.{name}" for name in fitted.rig.measured), *(f"kick.{name}" for name in kicks))
@@ -137,8 +132,7 @@ def _estimated(fitted: Identified) -> ParameterPrior:
 
 def observer_c(fitted: Identified, stem: str, *, single: bool = False) -> tuple[str, str]:
     """Source and header of the observer of a fit."""
-    name = re.sub(r"\W", "_", stem)
-    name = f"model_{name}" if name[:1].isdigit() else name
+    name = identifier(stem)
     dialect = Dialect("real", "static void", single)
     with jax.enable_x64(not single):
         model, prior = jax.tree.map(_cast, (fitted.model, _estimated(fitted)))
@@ -152,7 +146,9 @@ def _cast(a: Any) -> Any:
 
 def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) -> tuple[list[str], int]:
     """Friction tables, rate, reading and commands in C, and the size of the memory of the commands."""
-    system, share = model.system, EXACT[dialect.single]
+    # Largest error of a friction table over the size of the torque, in 64 and 32 bits; else the network is kept
+    exact = {False: 1e-11, True: 1e-6}
+    system, share = model.system, exact[dialect.single]
     dof, drives = len(system.coordinates), len(system.joints)
     scales = len({place for servo in model.servos or () for _, place, _ in servo.scales})
     network, tables, texts = model.unknown, {}, []
@@ -279,7 +275,7 @@ def _template(file: str, name: str) -> str:
 
 
 def _branches(fitted: Identified) -> int:
-    return BRANCHES if fitted.bank.angles else 1
+    return 16 if fitted.bank.angles else 1  # Gaussians at most, where an angle is not read
 
 
 def _comment(text: str) -> str:

@@ -14,8 +14,6 @@ from ..systems.tree import Tree
 
 SOFT = 1e-4
 """Impedance of a contact, MuJoCo's smallest: the contact force is then that of its spring and damper to this share."""
-ROOM = 10
-"""Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step."""
 MASSLESS = 1e-12
 """Mass of the body that carries a rotor [kg], whose inertia is the armature of its joint."""
 
@@ -299,9 +297,11 @@ def _joint_sensor(file: OpenFile, column: str) -> Any:
 
 def late(element: Any, delay: float, step: float) -> None:
     """Delay a motor or a sensor, interpolated between steps; MuJoCo's shortest delay is one step."""
+    # Steps that a buffer of delayed values holds, over those of the delay: a file still plays at a shorter time step
+    room = 10
     if delay > 0:
         element.delay = max(delay + 0.5 * step, step)  # interpolation begins to rise half a step early, on average
-        element.nsample, element.interp = ROOM * (math.ceil(delay / step) + 1), 1
+        element.nsample, element.interp = room * (math.ceil(delay / step) + 1), 1
 
 
 def _quantisation(file: OpenFile, effect: Any) -> None:

@@ -26,8 +26,6 @@ _ELEMENTWISE = {  # primitive to NumPy
 } | {name: f"np.{name}({{}})" for name in (
     "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil"
 )}  # fmt: skip
-_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
-_IDENTITIES = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
 _STEERED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}
 """Operands that are moved, where others give the destination."""
 _MOVERS = (
@@ -36,8 +34,6 @@ _MOVERS = (
 )  # fmt: skip
 _SCATTERED = {"scatter-add": ("{} + {}", 0.0), "scatter-mul": ("{} * {}", 1.0)}
 """Their form, and the number that changes nothing."""
-_CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-_LONGEST = 1000  # passes of a loop
 
 
 class UnrollError(ValueError):
@@ -182,7 +178,8 @@ def _symbolic(value: np.ndarray) -> bool:
 
 def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     name, params = equation.primitive.name, equation.params
-    inner = next((params[key] for key in _CALLS if key in params), None)
+    calls = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+    inner = next((params[key] for key in calls if key in params), None)
     if name == "scan":
         return _scan(writer, params, operands)
     if name == "cond":
@@ -193,7 +190,8 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return _constant(equation, operands)
     if refused := _refused(equation):
         raise UnrollError(f"JAX's {name!r} {refused} has no plain NumPy form here")
-    if name in _IDENTITIES:
+    identities = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
+    if name in identities:
         return operands
     if name == "convert_element_type":
         return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]
@@ -203,8 +201,9 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return [_each(writer, f"{params['function']}({{}})", operands)]
     if name in _ELEMENTWISE:
         return [_each(writer, _ELEMENTWISE[name], operands)]
-    if name in _REDUCTIONS:
-        return [_reduce(writer, _ELEMENTWISE[_REDUCTIONS[name]], operands[0], params["axes"])]
+    reductions = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
+    if name in reductions:
+        return [_reduce(writer, _ELEMENTWISE[reductions[name]], operands[0], params["axes"])]
     if name == "dot_general":
         return [_dot(writer, operands[0], operands[1], params["dimension_numbers"])]
     return [_scatter(writer, equation, operands)] if name in _SCATTERED else _move(equation, operands)
@@ -333,7 +332,7 @@ def _cond(writer: _Writer, branches: Sequence[core.ClosedJaxpr], operands: list[
 
 def _scan(writer: _Writer, params: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
     """A loop of fixed length, pass by pass."""
-    if params["length"] > _LONGEST:
+    if params["length"] > 1000:  # passes of a loop
         raise UnrollError(f"a loop of {params['length']} passes")
     if "ft_in" in params:  # jax 0.11 and newer
         fixed, carry, along = map(list, params["ft_in"].update(operands).unpack())

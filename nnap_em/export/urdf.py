@@ -16,8 +16,6 @@ from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .mjcf import as_it_is, named
 from .placement import MASSLESS
 
-URDF_LAWS = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
-"""Laws that URDF holds, by name: in the numbers of the bodies and in the damping."""
 NO_LIMIT = 1e9
 """Limit of a slide without stops, of an effort or a rate without limit: URDF requires one."""
 
@@ -39,7 +37,9 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
     left = [_of_servo(servo) for servo in fitted.model.servos or () if servo.feeds_back]
-    left += [named(effect) for effect in fitted.model.effects if effect.name not in URDF_LAWS]
+    # Laws that URDF holds, by name: in the numbers of the bodies and in the damping
+    laws = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
+    left += [named(effect) for effect in fitted.model.effects if effect.name not in laws]
     for joint, form in zip(system.machine.joints, forms, strict=True):
         form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > REPORTED_MISS
         left += [f"friction of {joint.name} beside Coulomb and viscous"] if form_misses else []

@@ -11,28 +11,10 @@ from ..data.units import UNITS
 from ..numerics.digits import counted
 from .recording import SECOND, Lag, Track, refuse
 
-APART = 10.0
-"""Seconds between stamp and log time from which on they are those of two clocks."""
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
-LONGEST_SILENCE = 30 * 86400.0
-"""Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set."""
-FEW = 0.05
-"""Largest share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log."""
-LITTLE = 50
-"""Wrong times beyond a silence at most: as many rows as a sequence needs."""
 RUNS = 4096
 """Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
-TOPIC_PARTS = 20
-"""Parts of a topic for each of which its stamps are compared with the log times."""
-PART = 50
-"""Messages of such a part at least, so that its median is no chance."""
-SINCE_1970 = (1.0e9, 4.1e9)
-"""Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms, ..."""
-UPTIME = 1e14
-"""Numbers from which on times are in ns: 28 hours of uptime, or 3 years in us."""
-LATEST = 4_600_000_000 * SECOND
-"""ns within which times are held, so that their differences are no overflow: a wild stamp is wild there too."""
 
 
 class Clock(NamedTuple):
@@ -102,26 +84,31 @@ def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) 
     """
     if not np.isfinite(t).all():
         refuse(path, where, "holds times that are no numbers", "cut the rows without a time")
-    low, high = SINCE_1970
+    # Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms
+    since_1970 = (1.0e9, 4.1e9)
+    low, high = since_1970
     size = float(np.median(np.abs(t.astype(np.float64)), overwrite_input=True))
     shown = next((name for name in ("s", "ms", "us", "ns") if low <= size * UNITS[name] < high), "")
+    uptime = 1e14  # numbers from which on times are in ns: 28 hours of uptime, or 3 years in us
     if unit not in UNITS:
-        unit = shown or ("ns" if size > UPTIME else "s")
+        unit = shown or ("ns" if size > uptime else "s")
     if size * UNITS[unit] > high:
         problem = f"holds times of {size:.4g}, too large for {unit}: they look like times in {shown or 'us or ns'}"
         refuse(path, where, problem, f"name it {f'time_{shown}' if shown else 'time_us or time_ns'}")
+    # Nanoseconds within which times are held, so that their differences are no overflow: a wild stamp is wild there too
+    latest = 4_600_000_000 * SECOND
     if t.dtype.kind in "iu":
         each = round(UNITS[unit] * SECOND)
-        return np.clip(t.astype(np.int64), -LATEST // each, LATEST // each) * each
+        return np.clip(t.astype(np.int64), -latest // each, latest // each) * each
     t = t * (UNITS[unit] * SECOND)
-    return np.round(np.clip(t, -LATEST, LATEST, out=t), out=t).astype(np.int64)
+    return np.round(np.clip(t, -latest, latest, out=t), out=t).astype(np.int64)
 
 
 def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     """Messages whose times [ns] are of one clock that goes on; None where it was set in the middle of the log.
 
     Times are wrong if they go back by more than `BACK` from, or on to, those of the most messages, or if they are few
-    and lie `LONGEST_SILENCE` from the others: zeros before a clock was set, a wild stamp.
+    and lie 30 days from the others: zeros before a clock was set, a wild stamp.
     """
     steps = np.diff(t)
     first = np.append(0, np.flatnonzero((steps > BACK * SECOND) | (steps < -BACK * SECOND)) + 1)
@@ -133,12 +120,14 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     weight = np.add.reduceat(rises.astype(int), first)
     low, high = np.minimum.reduceat(t, first), np.maximum.reduceat(t, first)
     chain = _longest(low, high, weight) if back else np.arange(first.size)
-    budget = max(FEW * weight.sum(), 1)
+    # Largest share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log
+    budget = max(0.05 * weight.sum(), 1)
     if weight.sum() - weight[chain].sum() > budget:
         return None
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > LONGEST_SILENCE * SECOND))
+    # Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * 86400.0 * SECOND))
     size = np.bincount(groups, weight[chain])
-    few = (size < LITTLE) & (size <= budget)
+    few = (size < 50) & (size <= budget)  # wrong times beyond a silence at most: as many rows as a sequence needs
     if few.any() and not few.all() and size[few].sum() <= budget:
         chain = chain[~few[groups]]
     keep = np.zeros(first.size, bool)
@@ -149,7 +138,9 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
 
 def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:
     """Median of stamp minus log time in parts of a topic, at the median stamp of each [ns]."""
-    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // PART, 1), TOPIC_PARTS))
+    most = 20  # parts of a topic for each of which its stamps are compared with the log times
+    least = 50  # messages of such a part at least, so that its median is no chance
+    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // least, 1), most))
     return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
 
 
@@ -204,7 +195,7 @@ def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -
     if back.size:
         return f"run backwards ({back.size} times)"
     offset = float(np.median(np.abs(stamp - log))) * 1e-9
-    if offset > APART:
+    if offset > 10.0:  # seconds between stamp and log time from which on they are those of two clocks
         return f"are of another clock, {offset:.4g} s from that of the log"
     knots = np.array(lags(stamp, log), dtype=float)
     set_ = np.abs(np.diff(knots[:, 1])) > 0.5 * np.diff(knots[:, 0])

@@ -7,9 +7,6 @@ from pathlib import Path
 from ..data.dataset import DataError
 from .recording import Address, Topic, field_of, near, places
 
-_PARTS = (("", "position"), ("d", "velocity"))
-"""Prefix of the name of a joint for its angle and its rate, and the array that holds them."""
-
 
 def resolve(
     path: Path, topics: Sequence[Topic], inputs: Sequence[str], measured: Sequence[str], declared: Mapping[str, Address]
@@ -54,7 +51,9 @@ def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -
 def _names(column: str, is_input: bool) -> list[str]:
     if is_input:
         return [column, f"effort[{column}]"]
-    return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in _PARTS if column.startswith(d))]
+    # Prefix of the name of a joint for its angle and its rate, and the array that holds them
+    parts = (("", "position"), ("d", "velocity"))
+    return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in parts if column.startswith(d))]
 
 
 def _nearest(column: str, addresses: Sequence[Address]) -> str:

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from ..data.rig import whole_table
 from .recording import Address, address
 
-INPUTS = ("hold", "mean")
-
 
 class Plan(NamedTuple):
     """Parameters of resampling logs to one grid."""
@@ -30,7 +28,6 @@ class Plan(NamedTuple):
 
 LONGEST = 30.0
 """Sequences are cut to this, where nothing is declared [s]: a hidden joint is lost in longer ones."""
-_KEYS = ("columns", "duplicates", "input", "gap", "shortest", "longest")
 
 
 def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
@@ -39,11 +36,13 @@ def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
     Raises RigError at the first mistake.
     """
     table = whole_table(path).table("import", absent={})
-    table.check((), _KEYS)
+    keys = ("columns", "duplicates", "input", "gap", "shortest", "longest")
+    table.check((), keys)
+    inputs = ("hold", "mean")
     return Plan(
         _addresses(table, "columns", columns),
         _addresses(table, "duplicates", columns),
-        "input" in table.items and table.choice("input", INPUTS) == INPUTS[1],
+        "input" in table.items and table.choice("input", inputs) == inputs[1],
         *(_seconds(table, key) for key in ("gap", "shortest", "longest")),
     )
 

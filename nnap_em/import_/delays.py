@@ -11,18 +11,6 @@ from .signals import Signal, between, integrals
 
 REACH = 0.25
 """Longest delay that is looked for [s]."""
-PARTS = 3
-"""The readings are cut in so many parts, whose delays must agree."""
-BIAS = 0.25
-"""Intervals of the readings that parts which agree may all be wrong by; a third was observed for angles."""
-SPREAD = 0.01
-"""Largest difference between the delays of the parts [s]."""
-ROWS = 12_000
-"""Readings used for a delay at most: those around the liveliest input."""
-WIDTHS = (1, 2, 4, 8)
-"""Differences are over so many times the shortest stretch that shows anything; the most significant is used."""
-SURE = 0.3
-"""Smallest correlation of the residual signals at which a delay is reported."""
 
 
 class Pair(NamedTuple):
@@ -85,8 +73,10 @@ def delay(pair: Pair, signals: Mapping[str, Signal], around: Sequence[str]) -> D
     cause, effect = signals[pair.cause], signals[pair.effect]
     regressors = [signals[name] for name in around if name in signals]
     least = max(round(max(2 * cause.interval, 4 * effect.interval) / effect.interval), 1)
+    # Differences are over so many times the shortest stretch that shows anything; the most significant is used
+    widths = (1, 2, 4, 8)
     estimates = [
-        _over(pair, cause, effect, regressors, least * times) for times in WIDTHS[: 1 if pair.order == 0 else None]
+        _over(pair, cause, effect, regressors, least * times) for times in widths[: 1 if pair.order == 0 else None]
     ]
     sure = [each for each in estimates if each.std > 0]
     best = min(sure, key=lambda each: each.std) if sure else max(estimates, key=lambda each: each.correlation)
@@ -107,11 +97,12 @@ def _over(pair: Pair, cause: Signal, effect: Signal, around: Sequence[Signal], w
     It is the mean of those of parts of the readings, and known as well as they agree.
     """
     every = _liveliest(cause, effect)
-    parts = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, PARTS)]
+    parts = [_part(pair, cause, effect, around, wide, at) for at in np.array_split(every, 3)]  # their delays must agree
     shifts, like = np.array([shift for shift, _ in parts]), float(np.mean([r for _, r in parts]))
-    if np.isnan(shifts).any() or np.ptp(shifts) > SPREAD:
+    if np.isnan(shifts).any() or np.ptp(shifts) > 0.01:  # largest difference between the delays of the parts [s]
         return _Best(math.nan, math.nan, like)
-    std = math.hypot(float(np.std(shifts, ddof=1)) / math.sqrt(PARTS), BIAS * effect.interval)
+    bias = 0.25  # intervals of the readings that parts which agree may all be wrong by; a third was observed for angles
+    std = math.hypot(float(np.std(shifts, ddof=1)) / math.sqrt(len(parts)), bias * effect.interval)
     return _Best(float(shifts.mean()), std, like)
 
 
@@ -138,7 +129,8 @@ def _part(
     shifts = np.arange(-REACH, REACH + coarse / 2, coarse)
     correlations = np.array([likeness(shift) for shift in shifts])
     k = int(np.argmax(correlations))
-    if correlations[k] < SURE or k in (0, shifts.size - 1):
+    sure = 0.3  # smallest correlation of the residual signals at which a delay is reported
+    if correlations[k] < sure or k in (0, shifts.size - 1):
         return math.nan, float(correlations[k])
     best, fine = float(shifts[k]), coarse
     for _ in range(4):
@@ -152,13 +144,14 @@ def _liveliest(cause: Signal, effect: Signal) -> Float[np.ndarray, " x"]:
     step, first = effect.interval, max(cause.t[0], effect.t[0]) + REACH
     end = min(cause.t[-1], effect.t[-1]) - REACH
     count = int((end - first) / step) if end > first else 0
-    if count <= ROWS:
+    most = 12_000  # readings used for a delay at most: those around the liveliest input
+    if count <= most:
         return first + step * np.arange(max(count, 0))
-    starts = np.linspace(first, end - ROWS * step, 20)
-    ends = np.searchsorted(cause.t, starts + ROWS * step)
+    starts = np.linspace(first, end - most * step, 20)
+    ends = np.searchsorted(cause.t, starts + most * step)
     places = zip(np.searchsorted(cause.t, starts).tolist(), ends.tolist(), strict=True)
     spread = [float(np.std(cause.y[a:b])) if b > a + 1 else 0.0 for a, b in places]
-    return starts[int(np.argmax(spread))] + step * np.arange(ROWS)
+    return starts[int(np.argmax(spread))] + step * np.arange(most)
 
 
 def _difference(y: Float[np.ndarray, " x"], order: int, wide: int) -> Float[np.ndarray, " less"]:

@@ -15,11 +15,6 @@ from .clock import nanoseconds, rising
 from .objects import LISTED_ENTRIES
 from .recording import EXTRA, Recording, Topic, Track, refuse
 
-TIME_ATTRIBUTES = ("axis", "kind", "role", "standard_name")
-"""Attributes that mark a data set as the time."""
-_BLOCK = 2**18
-"""Rows of a wide data set that are read at once."""
-
 
 def topics(path: Path) -> tuple[Topic, ...]:
     """Every group that holds numbers, with a time axis of its own or of a group above."""
@@ -63,8 +58,9 @@ def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
     data = group[name]
     if data.ndim == 1:
         return data[:].astype(np.float64)
-    blocks = range(0, data.shape[0], _BLOCK)
-    return np.concatenate([data[k : k + _BLOCK, int(index)].astype(np.float64) for k in blocks])
+    block = 2**18  # rows of a wide data set that are read at once
+    blocks = range(0, data.shape[0], block)
+    return np.concatenate([data[k : k + block, int(index)].astype(np.float64) for k in blocks])
 
 
 def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
@@ -79,8 +75,9 @@ def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
 def _axis(group: Any) -> Any | None:
     """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
     inside = [(name, data) for name, data in _numeric(group, "iufOS")]
+    time_attributes = ("axis", "kind", "role", "standard_name")  # attributes that mark a data set as the time
     for _, data in inside:
-        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in TIME_ATTRIBUTES):
+        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in time_attributes):
             return data
     named = [(name, data) for name, data in inside if data.ndim == 1 and is_time(name)]
     if named:  # the stamp of a sensor may be of another clock than the times of other groups

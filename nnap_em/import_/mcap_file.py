@@ -17,12 +17,6 @@ from .recording import EXTRA, OTHER, Recording, Topic, Track, refuse
 
 SAMPLES = 20
 """Messages of a channel that are looked at for its fields: not every message needs to have them all."""
-STAMPS = [
-    (f"{place}.{seconds}", f"{place}.{nanoseconds}")
-    for place in ("header.stamp", "stamp", "timestamp", "header.timestamp")
-    for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
-]
-"""Fields of a message that are the time at which it was measured: seconds, and nanoseconds of a second."""
 
 
 class _Open(NamedTuple):
@@ -184,7 +178,13 @@ def _codec(log: _Open, number: int) -> Codec:
 def _stamp(reader: Codec, batch: Batch) -> tuple[str, ...]:
     """The fields that hold the header stamp, if there are such."""
     fields = reader.fields(batch.data[batch.start[0] : batch.start[0] + batch.size[0]].tobytes())
-    return next((pair for pair in STAMPS if all(name in fields for name in pair)), ())
+    # Fields of a message that are the time at which it was measured: seconds, and nanoseconds of a second
+    stamps = [
+        (f"{place}.{seconds}", f"{place}.{nanoseconds}")
+        for place in ("header.stamp", "stamp", "timestamp", "header.timestamp")
+        for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
+    ]
+    return next((pair for pair in stamps if all(name in fields for name in pair)), ())
 
 
 def _cut(log: _Open) -> tuple[str, ...]:

@@ -16,9 +16,7 @@ from jaxtyping import Int, UInt8
 from .recording import EXTRA
 
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, END = 3, 4, 5, 6, 7, (2, 15)
-_LOOSE = 2**22
-"""Bytes of messages outside chunks that are taken at once."""
+SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 3, 4, 5, 6, 7
 
 
 class Batch(NamedTuple):
@@ -71,7 +69,7 @@ class Frames:
             if chunk is not None and code != INDEX:
                 yield from self._chunk(chunk, index, channels)
                 chunk, index = None, {}
-            if loose and (code not in (SCHEMA, CHANNEL, MESSAGE) or len(loose) > _LOOSE):
+            if loose and (code not in (SCHEMA, CHANNEL, MESSAGE) or len(loose) > 2**22):
                 yield from self._piece(np.frombuffer(bytes(loose), np.uint8), {}, channels)
                 loose = bytearray()
             if code == CHUNK:
@@ -95,7 +93,7 @@ class Frames:
             if len(head) == 9:
                 code, size = struct.unpack("<BQ", head)
                 if position + 9 + size <= self.end:
-                    if code in END:
+                    if code in (2, 15):  # footer, end of the data
                         return
                     yield code, position + 9, size
                     self.file.seek(position + 9 + size)

@@ -17,9 +17,6 @@ from ..data.logs import Logs
 from ..storage.files import replace_bytes
 from .recording import EXTRA
 
-GAP = 1.0
-"""Between the sequences of logs whose clocks all begin at the same time [s]."""
-
 
 class Channel(NamedTuple):
     """Columns of one topic, for every sequence."""
@@ -41,7 +38,7 @@ def write_mcap(path: Path, logs: Logs, channels: Mapping[str, Channel]) -> None:
     """Write a message per topic and row: `file`, `time` [s] of the log, and every column that is a finite number.
 
     The file is whole or absent. Log times are those of the logs; a sequence that would begin before the end of the one
-    before follows it by `GAP`.
+    before follows it by a second.
     Raises DataError where mcap is not installed.
     """
     require_mcap(path)
@@ -75,9 +72,10 @@ def _schema(units: Mapping[str, str]) -> bytes:
 
 def _stamps(logs: Logs) -> list[np.ndarray]:
     """Log times of the rows of every sequence [ns]."""
-    out, end = [], -GAP
+    gap = 1.0  # between the sequences of logs whose clocks all begin at the same time [s]
+    out, end = [], -gap
     for t, valid in zip(np.asarray(logs.data.t, np.float64), np.asarray(logs.data.valid), strict=True):
-        shift = end + GAP - t[0] if t[0] <= end or t[0] < 0 else 0.0
+        shift = end + gap - t[0] if t[0] <= end or t[0] < 0 else 0.0
         end = float(t[valid][-1] + shift)
         out.append(np.round((t + shift) * 1e9).astype(np.int64))
     return out

@@ -37,11 +37,6 @@ from .segments import (
 )
 from .signals import SLOW, Signal, averaged, held, interpolated
 
-FINEST_GRID = 4.0
-"""Rows from one reading to the next of the fastest topic from which on the grid is refused as too fine."""
-SPARSE = 50.0
-"""Rows for each reading of the fastest topic from which on they are refused: without a declared gap there are 20."""
-
 
 class TopicFacts(NamedTuple):
     """Properties of a topic."""
@@ -208,7 +203,8 @@ def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans
 def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:
     """Refuse rows that would be empty for the most part: memory is that of the readings."""
     rows = float(np.sum(seen[:, 1] - seen[:, 0])) / dt
-    if rows > SPARSE * fastest.t.size:
+    # Rows for each reading of the fastest topic from which on they are refused: without a declared gap there are 20
+    if rows > 50.0 * fastest.t.size:
         problem = f"{rows:.3g} rows of {fastest.t.size} readings would be empty for the most part"
         refuse(path, "[import] gap", problem, "lower it, so that sequences end where the readings do")
 
@@ -216,7 +212,8 @@ def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:
 def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
-    if best.interval > FINEST_GRID * dt:
+    finest = 4.0  # rows from one reading to the next of the fastest topic from which on the grid is refused as too fine
+    if best.interval > finest * dt:
         place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
         problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
         other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"

@@ -19,8 +19,6 @@ Field = tuple[str, str | None, str]
 """Type, brackets and name."""
 Types = Mapping[str, list[Field]]
 """The fields of every message."""
-_TIME: list[Field] = [("int32", None, "sec"), ("uint32", None, "nanosec")]
-_FIELD = re.compile(r"([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=)?")
 _HEAD = 4
 """Bytes of the encapsulation, from whose end alignment counts."""
 
@@ -84,12 +82,14 @@ def _place(run: Run, index: str | None) -> int | None:
 
 def definitions(name: str, text: str) -> Types:
     """The messages of a concatenated definition; UnknownLayout where a line is of no known form."""
-    types: dict[str, list[Field]] = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME}
+    time: list[Field] = [("int32", None, "sec"), ("uint32", None, "nanosec")]
+    types: dict[str, list[Field]] = {"builtin_interfaces/Time": time, "builtin_interfaces/Duration": time}
+    field = re.compile(r"([\w/]+)(?:<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=)?")
     for part in re.split(r"(?m)^=+\s*$", f"MSG: {name}\n{text}"):
         head, *lines = [line for each in part.splitlines() if (line := each.split("#")[0].strip())] or [""]
         owner, fields = head.removeprefix("MSG:").strip().replace("/msg/", "/"), []
         for line in lines:
-            match = _FIELD.match(line)
+            match = field.match(line)
             if not match:
                 raise UnknownLayout(line)
             if not match[4]:  # else a constant

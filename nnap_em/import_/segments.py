@@ -9,24 +9,8 @@ from jaxtyping import Float
 
 from .signals import SAME_TIME, Signal
 
-INTERVALS = 5
-"""Silence of so many of its own intervals, and of so many rows, is a gap of a topic where none is declared."""
-WIDEST_GAP = 2.5
-"""Intervals of a topic between neighbours that are interpolated at most: one message may be lost."""
 FEWEST_ROWS = 50
 """Rows of a sequence, where no shortest one is declared."""
-FEWEST_INTERVALS = 10
-"""Intervals between commands from which on they may have a rate."""
-SET_POINT = 0.5
-"""Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream."""
-REGULAR = 0.45
-"""Share of intervals near their median, or near the one before, from which on commands have a rate.
-
-With half the messages lost it is 0.5 or more, for times by chance 0.35.
-"""
-STILL_CHANCE = 0.01
-"""Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
-stood still in them."""
 
 Spans = Float[np.ndarray, "_ 2"]
 """Starts and ends [s] of stretches of time that follow each other."""
@@ -51,12 +35,14 @@ class Segment(NamedTuple):
 
 def reach(signal: Signal, dt: float) -> float:
     """Largest distance of neighbours between which values are interpolated [s]."""
-    return max(WIDEST_GAP * signal.interval, dt)
+    widest_gap = 2.5  # intervals of a topic between neighbours that are interpolated at most: one message may be lost
+    return max(widest_gap * signal.interval, dt)
 
 
 def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:
     """Shortest silence that is a gap of a topic [s]."""
-    return INTERVALS * max(signal.interval, dt) if declared is None else declared
+    # Silence of so many of its own intervals, and of so many rows, is a gap of a topic where none is declared
+    return 5 * max(signal.interval, dt) if declared is None else declared
 
 
 def sent_on_change(signal: Signal, dt: float) -> bool:
@@ -65,11 +51,15 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     They are a few, set points, or irregular; or they go on after each silence as if there had been none.
     """
     steps = np.diff(signal.t)
-    if steps.size < FEWEST_INTERVALS or signal.interval >= SET_POINT:
+    fewest_intervals = 10  # intervals between commands from which on they may have a rate
+    # Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream
+    if steps.size < fewest_intervals or signal.interval >= 0.5:
         return True
     usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
     alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes
-    if max(usual, alike) < REGULAR:
+    # Share of intervals near their median, or near the one before, from which on commands have a rate. With half the
+    # messages lost it is 0.5 or more, for times by chance 0.35.
+    if max(usual, alike) < 0.45:
         return True
     silent = steps > longest_silence(signal, dt, None)
     if not silent.any():
@@ -79,7 +69,9 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     if step == 0 or jumps[silent].max() > 2 * step:  # sent without change, too; or not where it was
         return False
     near = 4 * step / float(np.ptp(np.quantile(signal.y, (0.05, 0.95))))
-    return near ** int(np.count_nonzero(silent)) < STILL_CHANCE
+    # Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
+    # stood still in them
+    return near ** int(np.count_nonzero(silent)) < 0.01
 
 
 def gaps(signal: Signal) -> list[Gap]:

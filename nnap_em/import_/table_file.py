@@ -12,11 +12,6 @@ from ..data.units import is_time, named_unit
 from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
-EPISODE = re.compile(r"episode(_index|_id)?", re.IGNORECASE)
-"""Column that counts the sequences of one file, each with a clock of its own."""
-BETWEEN = 100
-"""Intervals between two episodes: more than the 5 of a gap, and few enough for rows of the grid to stay in step."""
-
 
 def topics(path: Path) -> tuple[Topic, ...]:
     """The columns, save that of the time."""
@@ -29,7 +24,8 @@ def topics(path: Path) -> tuple[Topic, ...]:
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     names = column_names(path)
-    name, episode = _clock(path, names), [each for each in names if EPISODE.fullmatch(each)][:1]
+    counter = re.compile(r"episode(_index|_id)?", re.IGNORECASE)  # of the sequences of a file, each with its own clock
+    name, episode = _clock(path, names), [each for each in names if counter.fullmatch(each)][:1]
     table = read_log(path, (*((name,) if name else ()), *episode), fields[""])
     values = dict(zip(fields[""], table[:, table.shape[1] - len(fields[""]) :].T, strict=True))
     if name is None:
@@ -45,7 +41,8 @@ def _in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) ->
     steps = np.diff(t)
     new = np.diff(episode) != 0
     usual = np.mean(steps[~new]) if not new.all() else SECOND  # of single precision, the mean is exact
-    return t[0] + np.append(0, np.cumsum(np.where(new, round(BETWEEN * usual), steps)))
+    # Intervals between two episodes: more than the 5 of a gap, and few enough for rows of the grid to stay in step
+    return t[0] + np.append(0, np.cumsum(np.where(new, round(100 * usual), steps)))
 
 
 def _clock(path: Path, names: Sequence[str]) -> str | None:

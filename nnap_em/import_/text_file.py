@@ -18,16 +18,10 @@ from ..numerics.digits import counted
 from .clock import nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
-HEAD, LINES = 2**18, 200
-"""Bytes and lines in which the layout of a file shows: headers have some dozens of lines."""
 MARKS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("", "."), ("", ","), (",", ","))
 """Marks of columns (none: blanks) and of decimals; of two that explain a file alike, the first counts."""
-TICKS = 1e16
-"""Times from here on are 100 ns ticks since 1601, as Windows counts them; in 2026, 1.3e17."""
-TICKS_1970 = 116_444_736_000_000_000
 CODESYS = "[key]"
 """First word of a CODESYS trace."""
-_TRUTHS = {"TRUE": "1", "FALSE": "0"}
 Cells = tuple[Sequence[int], Sequence[str]]
 """Lines in the file, counted from 1, and the fields of a column in them."""
 
@@ -59,7 +53,7 @@ class Block(NamedTuple):
 
 def foreign(path: Path) -> bool:
     """True for a text table that is no plain CSV file: names in line 1, then rows, ',' and '.'."""
-    text = _decoded(read_bytes(path, HEAD).rpartition(b"\n")[0])
+    text = _decoded(read_bytes(path, 2**18).rpartition(b"\n")[0])  # the layout shows in it
     found = layout(text.split("\n"))
     if found is None:
         return text.startswith(CODESYS)
@@ -91,7 +85,7 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
 
 def layout(lines: Sequence[str]) -> Layout | None:
     """The layout that the first lines of a file show; None where no row of numbers stands under names."""
-    lines = lines[:LINES][:-1] or lines  # the last one may be cut
+    lines = lines[:200][:-1] or lines  # headers have some dozens; the last one may be cut
     every = {marks: [[_kind(text, marks[1]) for text in _split(line, marks[0])] for line in lines] for marks in MARKS}
     marks = max(MARKS, key=lambda each: sum(sum(row) for row in every[each] if len(row) - row.count(0) > 1))
     kinds, widths = every[marks], Counter(map(len, every[marks]))
@@ -115,7 +109,8 @@ def _twincat(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) 
     if len(names) < 2 or not clocks:
         return None
     units = [re.sub(r"\s*\(.*", "", unit) for unit in rows.get("Unit", ())]
-    unit = "ticks" if number(row[0], marks[1]) > TICKS else "ms"
+    ticks = 1e16  # times from here on are 100 ns ticks since 1601, as Windows counts them; in 2026, 1.3e17
+    unit = "ticks" if number(row[0], marks[1]) > ticks else "ms"
     return Layout(marks, len(head), _with_units(names, units), clocks, unit)
 
 
@@ -228,15 +223,17 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
 def _nanoseconds(path: Path, name: str, cells: Cells, unit: str, decimal: str) -> Int[np.ndarray, " row"]:
     """The times; ticks in whole numbers, of which floating point holds 16 digits."""
     t = numbers(path, name, *cells, False, True, decimal)
+    ticks_1970 = 116_444_736_000_000_000
     if unit == "ticks":
         whole = [int(text) if text.isdecimal() else int(x) for text, x in zip(cells[1], t, strict=True)]
-        return np.array([100 * (ticks - TICKS_1970) for ticks in whole])
+        return np.array([100 * (ticks - ticks_1970) for ticks in whole])
     return nanoseconds(path, f"column {name!r}", t, unit or named_unit(name)[1])
 
 
 def _split(line: str, mark: str) -> list[str]:
     """The fields of a line, truth values of a PLC as numbers."""
-    return [_TRUTHS.get(text.upper(), text) for text in split(line, mark)]
+    truths = {"TRUE": "1", "FALSE": "0"}
+    return [truths.get(text.upper(), text) for text in split(line, mark)]
 
 
 def _kind(text: str, decimal: str) -> int:

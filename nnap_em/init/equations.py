@@ -10,9 +10,6 @@ from ..data.rig import toml_text
 from ..data.units import is_time, named_unit
 from .from_log import DRAFT_HEAD, Draft, meaning, numbers, sampling
 
-EQUAL_SHARE = 0.5
-"""Share of equal neighbours from which on a column is taken for an input: that of a reading changes in every row."""
-
 
 def draft_equations(path: Path) -> Draft:
     """The rig.toml for a CSV log, with one state for each reading and rates to be written.
@@ -54,7 +51,8 @@ def draft_equations(path: Path) -> Draft:
 def _input(name: str, values: Float[np.ndarray, " time"]) -> bool:
     """True for a column that is called as an input, or that stands still most of the time."""
     still = float(np.mean(np.diff(values) == 0)) if len(values) > 1 else 0.0
-    return meaning(name).kind == "input" or (still > EQUAL_SHARE and resolution(values[None]) == 0.0)
+    # Share of equal neighbours from which on a column is taken for an input: that of a reading changes in every row
+    return meaning(name).kind == "input" or (still > 0.5 and resolution(values[None]) == 0.0)
 
 
 def _ranges(columns: dict[str, Float[np.ndarray, " time"]]) -> list[str]:

@@ -23,7 +23,6 @@ _NAMES = {  # what people call a column, its number apart
     "dx": re.compile(r"(?:dx|x_?dot|v|vel|velocity|speed)()$"),
     "x": re.compile(r"(?:x|pos|position)()$"),
 }
-_EITHER = ("pos", "position", "vel", "velocity", "speed")  # of a joint with a number, of a slide without
 _PARAMETERS = {
     "m": "mass",
     "l": "length of the link",
@@ -120,10 +119,11 @@ def meaning(name: str) -> _Column:
     word, unit = re.sub(r"^(lr|f|r)(?=[A-Z][a-z])", "", name.strip()).lower(), ""  # fAngle of a PLC: a REAL
     if not any(pattern.match(word) for pattern in _NAMES.values()):
         word, unit = named_unit(word)
+    either = ("pos", "position", "vel", "velocity", "speed")  # of a joint with a number, of a slide without
     for kind, pattern in _NAMES.items():
         if match := pattern.match(word):
             number = int(match[1]) if match[1].isdigit() else None
-            if "theta" in kind and number is None and word in _EITHER:
+            if "theta" in kind and number is None and word in either:
                 continue
             state = f"{kind.strip()}{1 if number is None else number}" if "theta" in kind else kind
             return _Column(name, state, number, unit if SIZES.get(unit, ("", 1.0))[1] != 1.0 else "")

@@ -84,16 +84,14 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     return out
 
 
-_IMU = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
-"""Names of readings in a ROS message of an inertial sensor."""
-
-
 def _sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
     """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
     every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
+    # Names of readings in a ROS message of an inertial sensor
+    imu = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
     for sensor in machine.sensors:
         alone = sum(other.kind == sensor.kind for other in machine.sensors) == 3
-        usual = f"{_IMU[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in _IMU else sensor.name
+        usual = f"{imu[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in imu else sensor.name
         at = [at for at in every if at.path == sensor.name] or [at for at in every if at.path == usual]
         if sensor.kind in SENSE_UNITS and len(at) == 1:
             out[sensor.name] = at[0]

@@ -14,9 +14,6 @@ from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
 from .from_log import Draft, drafted, meaning
 
-EXAMINED_ROWS = 100_000
-"""Rows of the log from which its interval and noise are estimated."""
-QUANTITY = re.compile(r"(position|velocity|effort)\[")
 COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
 
 
@@ -60,10 +57,11 @@ def commands(topics: Sequence[Topic]) -> list[Address]:
 
 def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
     """Fields whose names mean a state or an input; rows of a wide data set count from 0."""
+    quantity = re.compile(r"(position|velocity|effort)\[")
     for field in topic.fields:
         word = re.sub(r"\[(\d+)\]$", lambda m: str(int(m[1]) + 1), last_word(field))
         column = meaning(word)
-        if column.kind and column.kind != "time" and not QUANTITY.match(word) and "stamp" not in field:
+        if column.kind and column.kind != "time" and not quantity.match(word) and "stamp" not in field:
             name = re.sub(r"\W+", "_", named_unit(word)[0]) if column.kind == "input" else column.kind
             yield name, Address(topic.name, field, SIZES[column.unit][1] if column.unit else 1.0)
 
@@ -87,7 +85,8 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     origin = max(int(track.t[0]) for track in tracks.values())
     dt = min(float(f"{np.median(np.diff(track.t)) * 1e-9:.3g}") for track in tracks.values() if track.t.size > 1)
     end = min(int(track.t[-1]) for track in tracks.values())
-    at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), EXAMINED_ROWS))
+    most = 100_000  # rows of the log from which its interval and noise are estimated
+    at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), most))
     if at.size < 2:
         raise DataError(f"{path}: its topics have no time in common; name others in [import.columns] by hand")
     timed = all(track.clock != UNTIMED for track in tracks.values())

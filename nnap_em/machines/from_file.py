@@ -14,16 +14,15 @@ from ..data.servo import named as drive_numbers
 from .mjcf import Part, read_file
 
 OF_JOINT = ("armature", "stiffness")
-_FILE = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
-_UNCERTAIN = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
 
 
 def declare(root: Any) -> Declaration:
     """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
     model = root.table("model")
     model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
+    line = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
     if not isinstance(model.items.get("file"), str) or not model.items["file"]:
-        model.refuse("file", None if "file" in model.items else "missing", f"write {_FILE}")
+        model.refuse("file", None if "file" in model.items else "missing", f"write {line}")
     part = _part(model)
     machine, file = read_file(root.path.parent / str(model.items["file"]), part)
     possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
@@ -189,8 +188,9 @@ def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
 def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
     pair = value if isinstance(value, dict) else {"mean": value, "std": 0.0}
     numbers = [pair.get("mean", mean), pair.get("std")]
+    uncertain = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
     if set(pair) - {"mean", "std"} or not all(type(x) in (int, float) and abs(x) < float("inf") for x in numbers):
-        table.refuse(name, f"found {value!r}", _UNCERTAIN)
+        table.refuse(name, f"found {value!r}", uncertain)
     if numbers[1] < 0:
         table.refuse(name, f"found std = {numbers[1]}", "write a standard deviation of 0 (trusted) or more")
     quantity = name.partition(".")[2]

@@ -9,11 +9,6 @@ from xml.parsers import expat
 
 from ..data.rig import RigError
 
-XACRO = "xacro:"
-"""Prefix of what the macro language xacro replaces; so are numbers in `${...}` and `$(...)`."""
-_INERT = ("visual", "collision", "gazebo", "ros2_control")
-"""Elements of which no number is read, so that a macro in there is no obstacle."""
-
 
 class MachineError(RigError):
     """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
@@ -68,12 +63,15 @@ def _read(path: Path) -> _Element:
 def _macro(element: ET.Element) -> tuple[str, ET.Element] | None:
     """The first macro of a file that is not expanded, and its element."""
     names = (element.tag, *element.attrib)
-    if any(name.startswith(XACRO) for name in names):
-        return f"<{next(name for name in names if name.startswith(XACRO))}>", element
+    xacro = "xacro:"  # prefix of what the macro language xacro replaces; so are numbers in `${...}` and `$(...)`
+    if any(name.startswith(xacro) for name in names):
+        return f"<{next(name for name in names if name.startswith(xacro))}>", element
     for value in (*element.attrib.values(), element.text or ""):
         if found := re.search(r"\$[{(].*?[})]", value):
             return f"the value {found[0]!r}", element
-    inner = (_macro(child) for child in element if child.tag not in _INERT)
+    # Elements of which no number is read, so that a macro in there is no obstacle
+    inert = ("visual", "collision", "gazebo", "ros2_control")
+    inner = (_macro(child) for child in element if child.tag not in inert)
     return next((macro for macro in inner if macro is not None), None)
 
 

@@ -13,14 +13,6 @@ from ..effects.base import Candidate, JointEffect, Scalar, known
 
 SHAPES = 5
 """Numbers of the learned stiffness curve: the degree of its Bernstein polynomial."""
-DISTANCES = 4
-"""Presliding distances from which a contact is tried."""
-RISE, STRIBECK = 0.1, 0.05
-"""First rise of the level towards rest, and the velocity over which it falls, over the largest."""
-FAINT = 1e-5
-"""Level and damping of none, over those that are tried."""
-NUMBERS_STD = (1.0, 2.0, 1.0, 1.5, 1.5, 1.5)
-"""Prior standard deviations of the numbers of a contact, in their order."""
 
 
 class DynamicFriction(JointEffect):
@@ -82,6 +74,9 @@ class DynamicFriction(JointEffect):
         """
         out = []
         masses = np.linalg.inv(np.asarray(around.system.mass(jnp.zeros(len(around.system.coordinates)))))
+        distances = 4  # presliding distances from which a contact is tried
+        # Prior standard deviations of the numbers of a contact, in their order
+        numbers_std = (1.0, 2.0, 1.0, 1.5, 1.5, 1.5)
         for j in around.joints if around.learned else ():
             level, speed, inertia = around.dry[j - 1], around.speed[j - 1], 1 / masses[j - 1, j - 1]
             shortest = 2 * around.dt**2 * around.torque[j - 1] / inertia
@@ -92,11 +87,15 @@ class DynamicFriction(JointEffect):
                 "fastest": 2 / around.dt,  # within the stability of Runge and Kutta's method, 2.78
                 "joint": j,
             }
-            spread = cls.of(*NUMBERS_STD[:-1], shape=jnp.full(SHAPES, NUMBERS_STD[-1]), **places)
-            for distance in np.geomspace(shortest, longest, DISTANCES):
+            spread = cls.of(*numbers_std[:-1], shape=jnp.full(SHAPES, numbers_std[-1]), **places)
+            for distance in np.geomspace(shortest, longest, distances):
                 damping = 0.4 * math.sqrt(level * inertia / distance)
-                numbers = np.log([level, distance, damping, RISE, STRIBECK * speed])
-                faint = numbers + math.log(FAINT) * np.array([1, 0, 1, 0, 0])
+                rise, stribeck = (
+                    0.1,
+                    0.05,
+                )  # of the level towards rest, and the velocity over which it falls, over `speed`
+                numbers = np.log([level, distance, damping, rise, stribeck * speed])
+                faint = numbers + math.log(1e-5) * np.array([1, 0, 1, 0, 0])  # level and damping of none
                 none, probe = (cls.of(*each, shape=jnp.zeros(SHAPES), **places) for each in (faint, numbers))
                 out.append(Candidate(none, (probe,), spread))
         return out

@@ -21,9 +21,6 @@ from .servo import Servo
 
 SUBSTEPS, MOST_STEPS = 2, 64
 """Integration steps of one sample where nothing requires more, and at most."""
-STEEP = 1.0
-"""Integration step as a share of the fastest time in which learned friction ends a motion: the classical Runge-Kutta
-method errs by a percent there, in a thin layer near rest, and is unstable from 2.8 on."""
 
 
 class Inputs(NamedTuple):
@@ -141,10 +138,12 @@ class StateSpaceModel(AbstractModel):
     def resolved(self) -> "StateSpaceModel":
         """This model with the integration steps that its friction requires, a power of two: programs are shared.
 
-        Max over joints and poses of dt (M^-1)_jj |d tau_j / d v_j|, over `STEEP`.
+        Max over joints and poses of dt (M^-1)_jj |d tau_j / d v_j|.
         """
         fastest = self.dt * np.max(self.system.mobility() * np.asarray(cast(Any, self.unknown).steepest()))
-        steps = min(MOST_STEPS, 2 ** math.ceil(math.log2(max(float(fastest) / STEEP, 1.0))))
+        # Integration step as the fastest time in which learned friction ends a motion: the classical
+        # Runge-Kutta method errs by a percent there, in a thin layer near rest, and is unstable from 2.8 on
+        steps = min(MOST_STEPS, 2 ** math.ceil(math.log2(max(float(fastest), 1.0))))
         return dataclasses.replace(self, substeps=max(self.substeps, steps))
 
     def parameter(self, name: str) -> Any:

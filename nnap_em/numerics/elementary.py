@@ -12,15 +12,6 @@ from jaxtyping import Array, Float
 TERMS = {jnp.dtype(jnp.float32): 5, jnp.dtype(jnp.float64): 8}
 """Terms of the Taylor series on [-pi/4, pi/4] that leave less than the rounding error."""
 
-HALF_PI = {
-    jnp.dtype(jnp.float32): (1.5703125, 0.00048382679),
-    jnp.dtype(jnp.float64): (1.5707963267341256, 6.077100506506192e-11),
-}
-"""pi / 2 as a sum; the first part has so few digits that a quadrant's number times it is exact [Cody & Waite 1980]."""
-
-FARTHEST = {jnp.dtype(jnp.float32): 1e7, jnp.dtype(jnp.float64): 1e9}
-"""Beyond these [rad] a type has no digits left for the angle, or the sum above not enough."""
-
 
 @jax.custom_jvp
 def sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
@@ -34,9 +25,16 @@ def sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Arr
 
 @jax.jit  # traced once, not for every sine of a model
 def _pair(x):
-    far = jnp.abs(x) > FARTHEST[x.dtype]
+    # Beyond these [rad] a type has no digits left for the angle, or the sum above not enough
+    farthest = {jnp.dtype(jnp.float32): 1e7, jnp.dtype(jnp.float64): 1e9}
+    far = jnp.abs(x) > farthest[x.dtype]
     quarter = jnp.round(x * (2 / math.pi))
-    for part in HALF_PI[x.dtype]:
+    # Pi / 2 as a sum; the first part has so few digits that a quadrant's number times it is exact [Cody & Waite 1980]
+    half_pi = {
+        jnp.dtype(jnp.float32): (1.5703125, 0.00048382679),
+        jnp.dtype(jnp.float64): (1.5707963267341256, 6.077100506506192e-11),
+    }
+    for part in half_pi[x.dtype]:
         x = x - quarter * part
     square = jnp.where(far, jnp.nan, x * x)
     sine, cosine = jnp.zeros_like(x), jnp.zeros_like(x)

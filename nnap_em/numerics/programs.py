@@ -4,9 +4,6 @@ from pathlib import Path
 
 import jax
 
-MOST_MAPS = 40_000
-"""Maps beyond which programs are released; a large one holds some hundred."""
-
 
 def maps() -> int:
     """Memory maps of this process; 0 where the system does not report them."""
@@ -16,8 +13,11 @@ def maps() -> int:
         return 0
 
 
-def release_programs(most: int = MOST_MAPS) -> bool:
-    """Drop all compiled programs where they hold more than `most` maps; what is needed again is compiled again."""
+def release_programs(most: int = 40_000) -> bool:
+    """Drop all compiled programs where they hold more than `most` maps; what is needed again is compiled again.
+
+    A large program holds some hundred maps.
+    """
     if maps() <= most:
         return False
     jax.clear_caches()

@@ -24,10 +24,6 @@ from jax.sharding import Mesh
 
 from .digest import digest, full_name
 
-KEY_PACKAGES = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
-"""Packages whose text a key stands for, by its own hash or by their version."""
-STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
-
 
 @runtime_checkable
 class Cache(Protocol):
@@ -155,7 +151,9 @@ def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
 def _name(code: Any) -> str:
     """Module, name and line of a class or function; TypeError for one of another package, and for a closure."""
     lines, package = getattr(code, "__code__", None), str(code.__module__).partition(".")[0]
-    if package not in KEY_PACKAGES or ("<" in code.__qualname__ and getattr(code, "__closure__", ()) is not None):
+    # Packages whose text a key stands for, by its own hash or by their version
+    packages = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
+    if package not in packages or ("<" in code.__qualname__ and getattr(code, "__closure__", ()) is not None):
         raise TypeError(f"it holds {full_name(code)}")
     return f"{full_name(code)} {lines and lines.co_firstlineno}"
 
@@ -166,6 +164,7 @@ def _surroundings() -> str:
     package, sha256 = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         sha256.update(str(path.relative_to(package)).encode() + path.read_bytes())
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in STANDS_ON]
+    stands_on = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in stands_on]
     sha256.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
     return sha256.hexdigest()

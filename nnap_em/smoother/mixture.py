@@ -33,9 +33,9 @@ and is below 0.13 rad in all others.
 """
 NARROW = 2 / 3
 """Standard deviation of each part over that of the component that is split."""
-SIDE, DISTANCE = 1 / 6, math.sqrt(3 * (1 - NARROW**2))
-"""Weight of the two outer parts, and their distance from the centre in standard deviations: Gauss-Hermite nodes, so
-that the parts together have the first five moments of the whole."""
+DISTANCE = math.sqrt(3 * (1 - NARROW**2))
+"""Distance of the two outer parts from the centre in standard deviations: Gauss-Hermite nodes, so that the parts, of
+which an outer one weighs a sixth, together have the first five moments of the whole."""
 
 
 class Components(NamedTuple):
@@ -71,12 +71,12 @@ def split(before: Components, angles: tuple[int, ...], wide: float) -> Component
     along = jnp.asarray(angles)[jnp.argmax(variance[which])]
     direction = cov[which, :, along] / jnp.sqrt(cov[which, along, along])
     narrow = cov[which] - (1 - NARROW**2) * direction[:, None] * direction[None, :]
-    shift = DISTANCE * direction
+    shift, side = DISTANCE * direction, 1 / 6
     parts = Components(
         Gaussian(
             mean[which][None] + jnp.stack([0 * shift, -shift, shift]), jnp.broadcast_to(narrow, (3, *narrow.shape))
         ),
-        log_weight[which] + jnp.log(jnp.asarray([1 - 2 * SIDE, SIDE, SIDE])),
+        log_weight[which] + jnp.log(jnp.asarray([1 - 2 * side, side, side])),
         jnp.broadcast_to(source[which], 3),
     )
     whole = jax.tree.map(lambda a: a[which][None], before)

@@ -12,9 +12,6 @@ from ..model.base import Prepared
 from ..numerics.gaussian import Gaussian
 from .kalman import ekf
 
-OUTERMOST = 2.5
-"""Outermost hypotheses, in standard deviations of the prior."""
-
 
 class StartBank(eqx.Module):
     """The prior of the start cut into narrow Gaussians on a grid of its wide directions.
@@ -34,10 +31,11 @@ class StartBank(eqx.Module):
     def __init__(self, counts: tuple[int, ...], angles: tuple[int, ...] = ()):
         """`counts` hypotheses along each state (1: as it is)."""
         self.angles = angles
-        lines = [np.linspace(-OUTERMOST, OUTERMOST, n) if n > 1 else np.zeros(1) for n in counts]
+        outermost = 2.5  # outermost hypotheses, in standard deviations of the prior
+        lines = [np.linspace(-outermost, outermost, n) if n > 1 else np.zeros(1) for n in counts]
         grid = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=-1)
         self.offsets = jnp.asarray(grid, float)
-        self.shrink = jnp.asarray([1.2 * OUTERMOST / (n - 1) if n > 1 else 1.0 for n in counts], float)
+        self.shrink = jnp.asarray([1.2 * outermost / (n - 1) if n > 1 else 1.0 for n in counts], float)
 
     def padded(self, states: int) -> "StartBank":
         """This bank for a state with more entries, which it leaves as they are."""

@@ -16,8 +16,6 @@ import numpy as np
 
 from .. import __version__
 
-_HEADER, _CHECKSUM = "header", "sha256"
-
 
 class StoreError(ValueError):
     """A file that is not what it should be: the message names the file, the mistake and a hint."""
@@ -117,7 +115,7 @@ def write_arrays(path: Path, kind: Kind, header: Mapping[str, Any], arrays: Mapp
     np.savez(
         content,
         allow_pickle=False,
-        **{_HEADER: np.frombuffer(text, np.uint8), _CHECKSUM: _checksum(text, arrays)},
+        **{"header": np.frombuffer(text, np.uint8), "sha256": _checksum(text, arrays)},
         **arrays,
     )
     replace_bytes(path, content.getvalue())
@@ -136,7 +134,7 @@ def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.nd
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        text = arrays.pop(_HEADER).tobytes()
+        text = arrays.pop("header").tobytes()
         header = json.loads(text)
     except Exception:  # what the parsers raise on damaged bytes is open-ended
         refuse(path, f"no {kind.noun}, or damaged or cut short ({len(content)} bytes)", kind.whole)
@@ -145,7 +143,7 @@ def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.nd
     if header.get("format") != kind.format:
         by = f"format {header.get('format')} (nnap_em {header.get('version')}), this version reads format {kind.format}"
         refuse(path, by, kind.again)
-    if not np.array_equal(arrays.pop(_CHECKSUM, np.zeros(0)), _checksum(text, arrays)):
+    if not np.array_equal(arrays.pop("sha256", np.zeros(0)), _checksum(text, arrays)):
         refuse(path, "damaged: its checksum does not hold", kind.copy)
     return header, arrays
 

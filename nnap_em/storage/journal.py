@@ -31,7 +31,6 @@ from .leaves import describe, name_of, restore
 
 _AGAIN = "remove it, and --resume does this step again; or leave --resume out to begin anew"
 STEP_KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
-_OWN = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
 HERE: Any = object()
 """Stands for one array or number in the form of an outcome."""
 
@@ -61,8 +60,9 @@ class Journal:
     def clear(self) -> None:
         """Remove the finished steps, and the folder if nothing else is in it."""
         sweep(self.folder)
+        own = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
         for path in self.folder.glob("*.npz"):
-            if _OWN.fullmatch(path.name):
+            if own.fullmatch(path.name):
                 path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self.folder.rmdir()

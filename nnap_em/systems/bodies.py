@@ -13,11 +13,6 @@ from .pseudo_inertia import Numbers, stepped
 from .recursion import NO_INERTIA, Inertia, carried, inertia, united
 from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed, times, transposed
 
-MARGIN = 1e-9
-"""Share by which an inertia may leave the physical ones: rounding, and rods that have none about their axis."""
-SLIGHT = 1e-3
-"""Share of a typical mass below which a load has no inertia about its spot."""
-
 
 def names(body: Body) -> list[str]:
     """All that may be estimated of a body."""
@@ -71,7 +66,9 @@ def physical(mass: Scalar, tensor: Turn) -> Any:
     """
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor
     half = 0.5 * (xx + yy + zz)
-    slack = MARGIN * half
+    # Share by which an inertia may leave the physical ones: rounding, and rods that have none about their axis
+    margin = 1e-9
+    slack = margin * half
     a, b, c = half - xx + slack, half - yy + slack, half - zz + slack
     second = a * b - xy * xy
     third = c * second - a * yz * yz - b * xz * xz - 2 * xy * xz * yz
@@ -86,7 +83,8 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
         if not set(keys) <= set(after):
             continue
         goal = numbers(body, after)
-        reached = _in_order(stepped(*(_together(*numbers(body, values)) for values in (before, after))))
+        step = stepped(*(_together(*numbers(body, values)) for values in (before, after)))
+        reached = [step.mass, *step.centre, *(step.inertia[i, j] for i, j in PAIRS)]  # in the order of `keys`
         fine = physical(goal[0], goal[2])
         out |= {name: jnp.where(fine, after[name], one) for name, one in zip(keys, reached, strict=True)}
     return out
@@ -94,11 +92,6 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
 
 def _together(mass: Scalar, centre: Three, tensor: Turn) -> Numbers:
     return Numbers(jnp.asarray(mass), jnp.stack(centre), jnp.stack([jnp.stack(row) for row in tensor]))
-
-
-def _in_order(body: Numbers) -> list[Scalar]:
-    """Numbers in the order of `names`."""
-    return [body.mass, *body.centre, *(body.inertia[i, j] for i, j in PAIRS)]
 
 
 class LoadPoint(NamedTuple):
@@ -152,10 +145,10 @@ def _longest(layout: Layout, moving: Sequence[tuple[Body, Mount]]) -> float:
 def load(spot: LoadPoint, mass: Scalar, moment: Three) -> Inertia:
     """A point mass in the frame of a body, about its origin, by its mass and its first moment about a spot.
 
-    With h = mass (c - point) its second moment is linear but for |h|^2 / mass.  That share fades out below `SLIGHT` of
+    With h = mass (c - point) its second moment is linear but for |h|^2 / mass.  That share fades out below 0.001 of
     the typical mass, where a first moment alone means a centre of mass that is not as declared.
     """
-    least = SLIGHT * spot.mass
+    least = 1e-3 * spot.mass  # share of a typical mass below which a load has no inertia about its spot
     inverse = mass / jnp.square(jnp.maximum(jnp.abs(mass), least))
     share = about(scaled(times(0.5, inverse), moment), moment)
     second = summed(summed(about(scaled(times(0.5, mass), spot.point), spot.point), about(moment, spot.point)), share)

@@ -7,11 +7,6 @@ from ..data.rig import Declaration, SystemSpec, nearest
 from .equations import Text
 from .expression import FUNCTIONS, Formula, FormulaError, parse
 
-_RESERVED = ("type", "inputs", "states", "rates", "unknown", "units")
-_UNITS = 'write names with units, { h1 = "V" }, or names alone, ["h1"]'
-MOST_SIGNALS = 3
-"""Signals of an unknown term at most."""
-
 
 def declare(root: Any, of: Text | None = None) -> Declaration:
     """The equations of the table [model], or those `of` a Python function; `root` is the whole of rig.toml."""
@@ -23,7 +18,8 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
                 model.refuse(key, "missing", 'write states = { h1 = "V" } and rates = { h1 = "k * u - h1" }')
     units = {name: _unit(table, name) for table in [model.table("units", absent={})] for name in table.items}
     states, inputs = (_named(model, key, had) for key, had in (("states", own.states), ("inputs", own.inputs)))
-    parameters = {key: model.quantity(key) for key in model.items if key not in _RESERVED}
+    reserved = ("type", "inputs", "states", "rates", "unknown", "units")
+    parameters = {key: model.quantity(key) for key in model.items if key not in reserved}
     unknown = model.table("unknown", absent={})
     _distinct(model, states, inputs, parameters, unknown.items)
     if of is not None:
@@ -36,6 +32,7 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
     if of is None:
         _used(model, (*rates.values(), *readings.values()), parameters, inputs)
         _used(unknown, (*rates.values(), *readings.values()), named)
+    inherited = {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
     text = Text(
         states,
         inputs,
@@ -44,7 +41,7 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
         tuple(parameters),
         named,
         {name: (port, signals) for name, (port, signals) in terms.items() if port},
-        {**own.units, **_inherited(readings, states), **units},
+        {**own.units, **inherited, **units},
         own.function,
     )
     spec = SystemSpec(tuple(states), tuple(parameters), {}, 0, sensors=tuple(readings))
@@ -56,8 +53,9 @@ def _named(model: Any, key: str, had: Mapping[str, str]) -> dict[str, str]:
     items = model.items.get(key, dict(had) or ([] if key == "inputs" else None))
     if isinstance(items, list):
         return dict.fromkeys(map(str, model.distinct(key, str)), "") if items else {}
+    hint = 'write names with units, { h1 = "V" }, or names alone, ["h1"]'
     if not isinstance(items, Mapping):
-        model.refuse(key, None if key in model.items else "missing", _UNITS)
+        model.refuse(key, None if key in model.items else "missing", hint)
     if had:
         return dict(items)
     table = model.table(key)
@@ -130,18 +128,14 @@ def _readings(measurement: Any, states: Collection[str], known: Collection[str])
     return {name: formula for name, formula in every.items() if name not in states}
 
 
-def _inherited(readings: Mapping[str, Formula], states: Mapping[str, str]) -> dict[str, str]:
-    """Units of columns that read a state as it is."""
-    return {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
-
-
 def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:
     """State that an unknown term enters, or nothing where it stands in a formula, and its signals."""
     table = unknown.table(name)
     table.check(("signals",), ("enters",))
     signals = table.distinct("signals", str)
-    if not 1 <= len(signals) <= MOST_SIGNALS:
-        table.refuse("signals", hint=f"write one to {MOST_SIGNALS} states or inputs")
+    most = 3  # signals of an unknown term at most
+    if not 1 <= len(signals) <= most:
+        table.refuse("signals", hint=f"write one to {most} states or inputs")
     for signal in signals:
         if signal not in (*states, *inputs):
             table.refuse("signals", f"{signal!r} is no state or input", nearest(signal, (*states, *inputs)))

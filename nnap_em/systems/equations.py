@@ -142,7 +142,8 @@ class Equations(AbstractPlant):
     def port_unit(self, port: int) -> str:
         """Unit of the push at a port, counted from 1."""
         name = self.ports[port - 1]
-        return per_second(self.unit(name)) if name in self.of.states else self.unit(name)
+        unit = self.unit(name)
+        return (f"{unit}/s" if unit else "1/s") if name in self.of.states else unit
 
     def input_of(self, joint: int | None, channel: str | None) -> int | None:
         """Index of an input by its name."""
@@ -206,8 +207,3 @@ class Equations(AbstractPlant):
         """The state that a column reads as it is; None where it reads something else."""
         formula = self.of.readings.get(column, column)
         return formula if formula in self.of.states else None
-
-
-def per_second(unit: str) -> str:
-    """Unit of a rate; of what has no declared unit too."""
-    return f"{unit}/s" if unit else "1/s"

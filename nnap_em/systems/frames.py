@@ -9,9 +9,6 @@ import numpy as np
 from ..data.machine import Vector, unpacked
 from .spatial import Three, Turn
 
-CLEAN = 1e-14
-"""Entries of a rotation nearer than this to 0 or 1 are 0 or 1: rounding of a quaternion."""
-
 
 class Frame(NamedTuple):
     """The frame of a joint in that of the joint before it, at coordinate zero: its z is the axis of the joint."""
@@ -73,7 +70,8 @@ def aligned(axis: Vector) -> np.ndarray:
 
 def _clean(value: float) -> float:
     nearest = float(round(value))
-    return nearest + 0.0 if math.isclose(value, nearest, abs_tol=CLEAN, rel_tol=0.0) else float(value)
+    rounding = 1e-14  # entries of a rotation nearer than this to 0 or 1 are 0 or 1: rounding of a quaternion
+    return nearest + 0.0 if math.isclose(value, nearest, abs_tol=rounding, rel_tol=0.0) else float(value)
 
 
 def _three(values: np.ndarray) -> Three:

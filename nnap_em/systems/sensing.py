@@ -10,12 +10,11 @@ from .frames import Layout, Mount
 from .recursion import Motion, Pose
 from .spatial import Scalar, Three, add, apply, cross, product, transposed
 
-_BASE = Mount(-1, (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-
 
 def seen(sensor: Sensor, layout: Layout, poses: Sequence[Pose], moving: Sequence[Motion]) -> Scalar:
     """The reading of a component [rad/s, m/s^2 or m]; `moving` as `motions` gives them."""
-    mount = layout.mounts[sensor.body] if sensor.body >= 0 else _BASE
+    base = Mount(-1, (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    mount = layout.mounts[sensor.body] if sensor.body >= 0 else base
     place = add(mount.place, apply(mount.turn, sensor.place))
     if sensor.kind == "framepos":
         return _outward(layout, poses, mount.joint, place)[sensor.axis]

@@ -13,15 +13,14 @@ Three = tuple[Scalar, Scalar, Scalar]
 Turn = tuple[Three, Three, Three]
 """Rows."""
 ZERO: Three = (0.0, 0.0, 0.0)
-SIMPLE = (0.0, 1.0, -1.0)
-"""Factors that are known before anything runs, and cost nothing."""
 
 
 @no_type_check
 def times(a: Scalar, b: Scalar) -> Scalar:
     """a b."""
+    simple = (0.0, 1.0, -1.0)  # factors that are known before anything runs, and cost nothing
     for one, other in ((a, b), (b, a)):
-        if isinstance(one, float) and one in SIMPLE:
+        if isinstance(one, float) and one in simple:
             return 0.0 if one == 0 else other if one > 0 else -other
     return a * b
 

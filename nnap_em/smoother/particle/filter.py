@@ -28,9 +28,6 @@ from ...numerics.random import normals
 from .potentials import Potentials, dot, moves
 from .resampling import systematic
 
-_FARTHEST = 1e30
-"""Squared distance from the path [variances of the process noise] from which particles have run away."""
-
 
 class ParticleHistory(NamedTuple):
     """All that the filter has seen; x and f are (state - origin) / scale."""
@@ -109,7 +106,8 @@ def particle_filter(
         f = [jnp.where(leave, (f[i] - origin_next[i]) / scale_[i], x[i]) for i in range(states)]
         log_ahead = jnp.where(leave, following.log_ahead(f), 0.0)
         grown = log_w + log_g(state, u, y, observed) - present.log_psi(x) + log_ahead
-        alive = jnp.isfinite(grown) & (dot(f, f) < _FARTHEST)
+        # Squared distance from the path [variances of the process noise] from which particles have run away
+        alive = jnp.isfinite(grown) & (dot(f, f) < 1e30)
         any_alive = jnp.any(alive)
         grown = jnp.where(alive, grown, jnp.where(any_alive, -jnp.inf, flat))  # where all are dead, all begin anew
         x, f = ([jnp.where(alive, row, 0.0) for row in rows] for rows in (x, f))

@@ -31,12 +31,14 @@ from nnap_em.data.rig import Declared, write_rig
 from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.findings import SuspectReport
 from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.diagnosis.verdict import CERTAIN, RISEN, veto
+from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
+from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.multistep import Grid
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import declared, examples, sweep_experiment
+from nnap_em.model.state_space import with_effects
 
 GROWN = 0.2
 """Growth of the Coulomb friction of a slide [N]; it is 1."""
@@ -47,7 +49,7 @@ def _rig(friction: bool = True):
     return dataclasses.replace(declared("slide", truth), parameters={"m": Declared(1.1, 0.1)}, friction=friction)
 
 
-def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, frictionless: bool = False):
+def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, frictionless: bool = False, laws=()):
     truth, sweep = examples["slide"]()
     law = truth.unknown
     if frictionless:
@@ -56,7 +58,7 @@ def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, fr
     grown = eqx.tree_at(
         lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, (law.coulomb + more, law.breakaway + more)
     )
-    return sweep_experiment(grown, sweep, sequences, steps, key=jax.random.key(seed)).data
+    return sweep_experiment(with_effects(grown, laws), sweep, sequences, steps, key=jax.random.key(seed)).data
 
 
 # --- the posterior of a fit as a prior
@@ -123,12 +125,14 @@ def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     )
 
 
-def test_what_the_recordings_of_the_fit_show_as_well_is_no_change(fit):
-    """The same recordings as above, and a fit whose own show the same friction: it is missing in it."""
-    said = []
-    closed = diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(3, GROWN), log=said.append)
-    assert not findings(closed)
-    assert any("coulomb" in line.lower() and "no certain change" in line for line in said)
+def test_a_law_that_was_missing_before_is_no_change():
+    """A spring that neither the rig nor the fit knows, in all recordings: 2 N/m."""
+    spring, said = TorsionalSpring.of(2.0, 0.0, 0.0, 0.0, joint=1), []
+    first, second = (_logs(seed, laws=(spring,)) for seed in (0, 1))
+    before = identify(_rig(), first, key=jax.random.key(0))
+    closed = diagnose(_rig(), second, key=jax.random.key(0), start=before, own=first, log=said.append)
+    assert not findings(closed), said
+    assert any("spring" in line and "missing there, and no change" in line for line in said), said
 
 
 def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypatch):
@@ -150,8 +154,8 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
     assert veto(**good) is None
-    assert veto(**good, change=1.01 * CERTAIN) is None
-    assert veto(**good, change=0.99 * CERTAIN).code == "before"
+    assert veto(**good, before=KEEP * 0.15 - 0.01) is None
+    assert veto(**good, before=KEEP * 0.15 + 0.01).code == "before"
 
 
 def test_where_nothing_explains_it_the_errors_decide(fit):

@@ -16,7 +16,7 @@ from .outcome import Disputed, Step, Suspect
 from .propose import proposals, seeded, surroundings
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
-from .trial import Null, Trial, changed, null_of, with_candidate
+from .trial import Null, Trial, explained, null_of, with_candidate
 from .verdict import EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
@@ -56,7 +56,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             cases = []
             for s in group:
                 case = with_candidate(s, cast(Null, null), *fitting)
-                cases.append(case if case.rejection else case._replace(change=changed(case, context)))
+                cases.append(case if case.rejection else case._replace(before=explained(case, context)))
                 _log(cases[-1], context)
             tried += cases
             admissible = [case for case in cases if case.rejection is None]

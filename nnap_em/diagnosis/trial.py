@@ -1,6 +1,6 @@
 """A candidate after its refit, beside the model without it fitted in the same way."""
 
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,9 +38,8 @@ class Trial(NamedTuple):
     """Share that the step of the screen removes, before any pass; NaN where likelihood decides."""
     refit: Refit | None = None
     """Its fit; None where the step of the screen removed too little for one."""
-    change: float = np.inf
-    """Wald statistic of its strengths against those of the same law on the recordings of the fit from which the search
-    began, jointly [standard deviations]; infinite where there is none."""
+    before: float = -np.inf
+    """Share of the squared error that it removes from the recordings of the fit from which the search began."""
 
     @property
     def candidate(self) -> Candidate:
@@ -56,7 +55,7 @@ class Trial(NamedTuple):
     def rejection(self) -> Rejection | None:
         """Reason against it; None where there is none."""
         numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
-        numbers["change"] = self.change
+        numbers["before"] = self.before
         return veto(
             possible=self.effect.is_physical(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
         )
@@ -116,34 +115,26 @@ def with_candidate(screened: Screened, null: Null, fit: SmoothedFit, loss: Abstr
     )
 
 
-def changed(case: Trial, context: SearchContext) -> float:
-    """Wald statistic of the strengths of a law against those of the same law, fitted to the recordings of the fit before
-    the search [standard deviations]; infinite where there is none, or its recordings are not at hand.
+def explained(case: Trial, context: SearchContext) -> float:
+    """Share of the squared error that a law as it is fitted removes from the recordings of the fit before the search,
+    with the friction and the numbers of that fit; -inf where there is none, or its recordings are not at hand.
     """
     if (fit := context.origin) is None:
-        return np.inf
-    full = context.declared.plus(case.effect, case.candidate)  # friction and numbers nearly held, as in the search
-    start = begun(full, extended(full.model, fit.path, fit.data), fit, context.loss)
-    there = fitted(start, fit, context.loss, context.effort.passes)
-    cov = sum(covariances(one.model, one.m_step, one.hessian)[-1] for one in (there, cast(Refit, case.refit)))
-    return certainty(case.candidate, case.effect, cov, there.model.effects[-1])
+        return -np.inf
+    full = fit.hypothesis.plus(case.effect, case.candidate)
+    null, other = (
+        context.loss.along(fit, one, path)
+        for one, path in ((fit.hypothesis, fit.path), (full, extended(full.model, fit.path, fit.data)))
+    )
+    return 1 - context.loss.ratio(null, other, fit, case.screened.band)
 
 
-def certainty(
-    candidate: Candidate,
-    effect: AbstractEffect,
-    cov: Float[np.ndarray, "param param"],
-    other: AbstractEffect | None = None,
-) -> float:
-    """Wald statistic of the strengths of an effect against none, or another of its kind, jointly, in standard deviations
-    [Wald 1943].
+def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:
+    """Wald statistic of the strengths of an effect, jointly, in standard deviations [Wald 1943].
 
     Half its square is the log-likelihood that would be lost without the effect, to second order.
     """
     none = np.asarray(flat(candidate.start))
     strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)
-    cov, away = (
-        cov[np.ix_(strong, strong)],
-        (np.asarray(flat(effect)) - np.asarray(flat(other or candidate.start)))[strong],
-    )
+    cov, away = cov[np.ix_(strong, strong)], (np.asarray(flat(effect)) - none)[strong]
     return float(np.sqrt(max(0.0, away @ np.linalg.pinv(cov, rcond=1e-12, hermitian=True) @ away)))

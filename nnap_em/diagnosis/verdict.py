@@ -30,8 +30,7 @@ SURVIVES = 0.05
 """Smallest share of a law's columns that friction and parameters cannot give: on a slide under control that lacks a
 force 2 % of a false scale of its sensor, and 10 to 95 % of all other laws."""
 CERTAIN = 5.0
-"""Wald statistic [standard deviations] from which on an effect differs from none, and a change from what was there
-before: 12.5 nat of log-likelihood."""
+"""Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
 DETERMINED = 2.0
 """The same for its amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
 EQUIVALENT = 0.9
@@ -156,7 +155,8 @@ class Rejection(NamedTuple):
     @property
     def sentence(self) -> str:
         """The reason as a clause whose subject is the effect."""
-        value = share_of(self.value, "the squared error", 1) if self.code == "small" else self.value
+        shares = ("small", "before")
+        value = share_of(self.value, "the squared error", 1) if self.code in shares else self.value
         return REASONS[self.code].format(value)
 
 
@@ -165,7 +165,7 @@ REASONS = {
     "uncertain": "is {:.1f} standard deviations from none after its refit",
     "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
     "small": "removes {} after its refit",
-    "before": "differs by {:.1f} standard deviations from what the recordings of the fit show: no certain change",
+    "before": "explains the recordings of the fit as well, of which it removes {}: it is missing there, and no change",
 }
 
 
@@ -177,14 +177,14 @@ def veto(
     removed: float,
     floor: float,
     complexity: int,
-    change: float = math.inf,
+    before: float = -math.inf,
 ) -> Rejection | None:
     """Reason against an effect after its refit, None where there is none.
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
     one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
-    `complexity` that of the law, `change` the Wald statistic of its strengths against those on the recordings of an
-    earlier fit (infinite without): a law that is there as well is missing, and no change.
+    `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit: a law that
+    counts there as well is missing, and no change.
     """
     if not possible:
         return Rejection("impossible")
@@ -194,7 +194,7 @@ def veto(
         return Rejection("undetermined", amplitude)
     if not needed(removed, required(floor, complexity)):
         return Rejection("small", removed)
-    return None if change > CERTAIN else Rejection("before", change)
+    return Rejection("before", before) if needed(before, required(floor, complexity)) else None
 
 
 def needed(share: float, floor: float) -> bool:

@@ -26,7 +26,7 @@ from .digest import digest, full_name
 
 KEY_PACKAGES = frozenset({"nnap_em", "jax", "jaxlib", "equinox", "numpy", "builtins"})
 """Packages whose text a key stands for, by its own hash or by their version."""
-STANDS_ON = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
+STANDS_ON = ("jax", "jaxlib", "equinox", "numpy")
 
 
 @runtime_checkable

@@ -110,6 +110,17 @@ def test_groups_of_sequences_change_nothing(monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
+def test_the_program_of_larger_data_predicts_the_same():
+    case = _case(q=1e-2, information=1e3)
+    key, (sequences, rows) = jax.random.key(5), case.data.t.shape
+    by_own, by_larger = (
+        predict(case.fitted, case.data, GIVEN, key=key, samples=5, shape=shape)
+        for shape in ((0, 0), (sequences + 2, rows + 7))
+    )
+    for own, larger in zip(by_own, by_larger, strict=True):
+        np.testing.assert_allclose(own, larger, rtol=1e-9, atol=1e-12)  # the same operations in another program
+
+
 def test_std_grows_as_the_kicks_add_up():
     """Near rest the pendulum is linear: the covariance obeys P' = F P F' + Q, here against draws."""
     case = _case(q=1e-2, information=1e20)

@@ -77,6 +77,17 @@ def horizon(data: Dataset, samples: int, after: Int[np.ndarray, " seq"] | int = 
     return data._replace(valid=data.valid & np.broadcast_to(seen, data.valid.shape))
 
 
+def padded(data: Dataset, shape: tuple[int, ...]) -> Dataset:
+    """`data` with padding up to `shape` (sequences, rows): rows that are not there, and the last sequence again."""
+    (count, length), size = data.t.shape, tuple(map(max, data.t.shape, shape))
+    if size == (count, length):
+        return data
+    sequences, rows = (np.minimum(np.arange(n), last - 1) for n, last in zip(size, (count, length), strict=True))
+    t, u, y, valid = (np.asarray(a)[sequences][:, rows] for a in data)
+    there = np.arange(size[1]) < length
+    return Dataset(t, np.where(there[:, None], u, 0.0), np.where(there[:, None], y, np.nan), valid & there)
+
+
 def fill_missing(y: Float[Array, "*batch obs"]) -> tuple[Float[jax.Array, "*batch obs"], Bool[jax.Array, "*batch obs"]]:
     """Readings with 0 in place of NaN, and the mask of what was measured."""
     observed = ~jnp.isnan(y)

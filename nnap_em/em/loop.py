@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..data.dataset import Dataset, horizon
+from ..data.dataset import Dataset, horizon, padded
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import batches, each
 from ..numerics.profile import stage
@@ -80,12 +80,24 @@ class Schedule(eqx.Module):
         return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
 
 
-def e_step(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
+def e_step(
+    model: AbstractModel,
+    data: Dataset,
+    smoother: AbstractSmoother,
+    *,
+    key: PRNGKeyArray,
+    shape: tuple[int, ...] = (0, 0),
+) -> Posterior:
     """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
 
-    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
+    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept. Where
+    `shape` (sequences, rows) is larger than that of `data`, its program serves, and what pads them is cut off.
     """
-    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key))
+    first = _alone(model, padded(data, shape), smoother, key=key)
+    (count, length), rows = data.t.shape, first.state.mean.shape[1]
+    if first.loglik.shape[0] > count or rows > length:
+        first = jax.tree.map(lambda a: np.asarray(a)[(slice(count), slice(length - rows or None))[: a.ndim]], first)
+    return _with_mixture(model, data, smoother.second(), first)
 
 
 def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:

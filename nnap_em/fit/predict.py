@@ -59,9 +59,9 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
     return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
 
 
-def posterior_of(fitted: Identified, data: Dataset) -> Posterior:
+def posterior_of(fitted: Identified, data: Dataset, shape: tuple[int, ...] = (0, 0)) -> Posterior:
     """p(x_k | all y) of every sequence by the smoother of the fit; one that draws gives the same each time."""
-    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key, shape=shape)
 
 
 def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
@@ -176,7 +176,13 @@ def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
 
 
 def predict(
-    fitted: Identified, data: Dataset | Logs, given: float, *, key: PRNGKeyArray, samples: int = 100
+    fitted: Identified,
+    data: Dataset | Logs,
+    given: float,
+    *,
+    key: PRNGKeyArray,
+    samples: int = 100,
+    shape: tuple[int, ...] = (0, 0),
 ) -> Prediction:
     """Predict every state from the first readings of each sequence and all its inputs.
 
@@ -190,6 +196,7 @@ def predict(
         given: time from the first row on whose readings are used [s].
         key: random key of the sample paths.
         samples: number of sample paths.
+        shape: sequences and rows of other data: where larger, the smoother compiled for these serves.
 
     Returns:
         Mean and standard deviation (sequence, row, state) of what `fitted.model.system.readable` names: coordinates,
@@ -201,7 +208,7 @@ def predict(
     """
     data = sequences_of(data, fitted.rig)
     known = given_samples(data, given)
-    posterior = posterior_of(fitted, data._replace(valid=known))
+    posterior = posterior_of(fitted, data._replace(valid=known), shape)
     key_draw, key_roll = jax.random.split(key)
     common = drawn_paths(fitted, samples, key=key_draw)
     sequences, rows = data.t.shape

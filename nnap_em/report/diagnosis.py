@@ -44,7 +44,7 @@ def write_diagnosis(
     """Write the report of a diagnosis into the folder `out`; `began` is `time.perf_counter()` at the start."""
     names, both = names_of(diagnosis.before), {"before": diagnosis.before, "after": diagnosis.after}
     sides = both if accepted else {"before": diagnosis.before}
-    predicted = predictions(sides, test, seed)
+    predicted = predictions(sides, train, test, seed) if test else {}
     error = errors(predicted, sides, test) if test else None
     if error:
         error.setdefault("after", error["before"])

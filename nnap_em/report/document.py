@@ -101,10 +101,14 @@ def noise(fitted: Identified) -> dict[str, Any]:
     }
 
 
-def predictions(sides: Mapping[str, Identified], test: Logs | None, seed: int) -> dict[str, Prediction]:
-    """Predictions of the test sequences, from their first readings, by every model with the same random numbers."""
-    key = jax.random.key(seed)
-    return {n: predict(fitted, test.data, given_of(fitted), key=key) for n, fitted in sides.items()} if test else {}
+def predictions(sides: Mapping[str, Identified], train: Logs, test: Logs, seed: int) -> dict[str, Prediction]:
+    """Predictions of the test sequences, from their first readings, by every model with the same random numbers.
+
+    They are smoothed by the program that smoothed `train`, unless that has more than eight times their rows.
+    """
+    key, shape, size = jax.random.key(seed), train.data.t.shape, test.data.t.shape
+    shape = shape if min(np.subtract(shape, size)) >= 0 and np.prod(shape) <= 8 * np.prod(size) else size
+    return {n: predict(fitted, test.data, given_of(fitted), key=key, shape=shape) for n, fitted in sides.items()}
 
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def write_identification(
     drawn = [term for term in terms if len(term["signals"]) < 3]
     figures += [picture("found", f"Unknown term {term['name']}", caption, term_figure(term)) for term in drawn]
     sides = {"fit": fitted}
-    error = errors(predictions(sides, test, seed), sides, test) if test else None
+    error = errors(predictions(sides, train, test, seed), sides, test) if test else None
     if error:
         caption = "On test sequences that the fit has not seen."
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))

@@ -3,12 +3,13 @@
     python benchmarks/arm.py [--joints 6] [--seeds 3] [--first 0] [--imu]
     python benchmarks/arm.py --lacks payload --out OUT      # `nnap-em diagnose` on logs of an arm with a payload
     python benchmarks/arm.py --lacks off_axis --out OUT     # 2.8 kg, its centre 0.25 m off the axis of joint 6
+    python benchmarks/arm.py --lacks payload --joints 7 --size 4 400 --out OUT
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
-of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
-where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last joint has no encoder, and the hand
-a gyroscope and an accelerometer. With `--lacks` the machine has what its file does not say; OUT keeps logs and
-findings, and a seed that is found there is not run again.
+of another size in every joint. 10 sequences of 5 s at 100 Hz, or `--size` sequences and rows. Seconds are those of
+`identify`. The first seed is cold where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last
+joint has no encoder, and the hand a gyroscope and an accelerometer. With `--lacks` the machine has what its file does
+not say; OUT keeps logs and findings, and a seed that is found there is not run again.
 """
 
 import argparse
@@ -39,7 +40,8 @@ from nnap_em.systems import specs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from machine_files import DT, FINE, errors
 
-SEQUENCES, ROWS = 10, 501
+SIZE = 10, 501
+"""Sequences and rows."""
 NOISE = 1e-3
 """Of the readings [rad]."""
 IMU = {"gyro": 0.005, "accelerometer": 0.05}
@@ -68,6 +70,7 @@ JOINTS = (
     Joint(0.5, 0.7, 0.30, 0.06, 0.20, 5.0),
     Joint(0.3, 0.36, 0.50, 0.08, 0.12, 5.0),
     Joint(0.1, 0.15, 0.40, 0.06, 0.04, 8.0),
+    Joint(0.06, 0.09, 0.40, 0.06, 0.02, 8.0),
 )
 
 
@@ -117,7 +120,9 @@ def plant(text: str) -> mujoco.MjModel:
     return model
 
 
-def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None) -> tuple[Dataset, np.ndarray]:
+def recorded(
+    text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None, size: tuple[int, int] = SIZE
+) -> tuple[Dataset, np.ndarray]:
     """Logs of the arm, of its hand in place of the last joint where there are sensors, and all its states."""
     lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
     model = plant(text)
@@ -130,10 +135,11 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
     if any(lack.away):
         model = model_true  # the controller knows the load, as on a robot that is told its payload
     inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
-    t = DT * np.arange(ROWS)
-    u, x = np.zeros((SEQUENCES, ROWS, dof)), np.zeros((SEQUENCES, ROWS, 2 * dof))
-    sensed = np.zeros((SEQUENCES, ROWS, model.nsensordata))
-    for s in range(SEQUENCES):
+    sequences, rows = size
+    t = DT * np.arange(rows)
+    u, x = np.zeros((sequences, rows, dof)), np.zeros((sequences, rows, 2 * dof))
+    sensed = np.zeros((sequences, rows, model.nsensordata))
+    for s in range(sequences):
         tones, phases = rng.uniform(0.15, 1.2, (dof, 4)), rng.uniform(0, 2 * np.pi, (dof, 4))
         turn = 2 * np.pi * tones[None] * t[:, None, None] + phases[None]
         rate = speed * np.sum(np.cos(turn), axis=-1) / 2.5
@@ -141,7 +147,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
         data, known = mujoco.MjData(model_true), mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = goal[0], rate[0]
         sent = [np.zeros(dof)] * (lack.late + 1)
-        for k in range(ROWS):
+        for k in range(rows):
             x[s, k] = np.concatenate([data.qpos, data.qvel])
             known.qpos[:], known.qvel[:] = data.qpos, data.qvel
             mujoco.mj_forward(model, known)
@@ -164,7 +170,7 @@ def recorded(text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None 
     std = np.repeat([NOISE, *IMU.values()][: 1 + model.nsensor], [read, *model.sensor_dim])
     y = np.concatenate([x[..., :read], sensed], axis=-1)
     y = y + std * rng.normal(size=y.shape)
-    return Dataset(np.tile(t, (SEQUENCES, 1)), u, y, np.ones((SEQUENCES, ROWS), bool)), x
+    return Dataset(np.tile(t, (sequences, 1)), u, y, np.ones((sequences, rows), bool)), x
 
 
 def _inertia(model: mujoco.MjModel) -> np.ndarray:
@@ -203,12 +209,12 @@ def written(rig: Rig, data: Dataset, folder: Path) -> None:
         write_csv(folder / "train" / f"{i:03d}.csv", {"time": np.asarray(t)} | columns)
 
 
-def diagnosed(kind: str, seed: int, out: Path, count: int, *, imu: bool) -> str:
+def diagnosed(kind: str, seed: int, out: Path, count: int, size: tuple[int, int], *, imu: bool) -> str:
     """What `nnap-em diagnose` names in a machine that lacks something, and how long it took; a row of the table."""
     folder, result = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
     if not (result / "report.json").exists():
         (folder / "train").mkdir(parents=True, exist_ok=True)
-        data, _ = recorded(machine(count, imu=imu), JOINTS[:count], seed, LACKS[kind])
+        data, _ = recorded(machine(count, imu=imu), JOINTS[:count], seed, LACKS[kind], size)
         written(declared(folder, count, imu=imu), data, folder)
         command = ["diagnose", str(folder), "--out", str(result), "--seed", str(seed), "--quiet"]
         began, before = time.perf_counter(), os.times().children_user
@@ -229,7 +235,8 @@ def _numbers(effect: dict) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--joints", type=int, default=6, choices=range(1, 7))
+    parser.add_argument("--joints", type=int, default=6, choices=range(1, 8))
+    parser.add_argument("--size", type=int, nargs=2, default=SIZE, help="sequences and rows (10 501)")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="seed")
     parser.add_argument("--imu", action="store_true", help="at the hand, in place of the last encoder")
@@ -244,14 +251,14 @@ def main() -> None:
     if args.lacks:
         print("| lacks | seed | named | s | processor s |\n| --- | --- | --- | --- | --- |")
         for seed in seeds:
-            print(diagnosed(args.lacks, seed, args.out, args.joints, imu=args.imu), flush=True)
+            print(diagnosed(args.lacks, seed, args.out, args.joints, tuple(args.size), imu=args.imu), flush=True)
         return
     print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
     print("| --- " * (args.joints + 4) + "|")
     with TemporaryDirectory() as folder:
         rig = declared(Path(folder), args.joints, imu=args.imu)
         for seed in seeds:
-            data, x = recorded(machine(args.joints, imu=args.imu), joints, seed)
+            data, x = recorded(machine(args.joints, imu=args.imu), joints, seed, size=tuple(args.size))
             began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))
             took, spent = time.perf_counter() - began, time.process_time() - spent

@@ -30,7 +30,7 @@ dtheta1 = "/js:velocity[joint]"
 u = "/cmd:data[0]"
 """
 ARM = RIG.replace('["u"]', '["u", "v"]').replace("[1]", "[1, 2]").replace("pendulum", "acrobot")
-ARM = ARM.replace("m = 0.3\nlc = 0.2\nI = 0.01", "m1 = 1\nm2 = 1\nl1 = 1\nl2 = 1\nlc1 = 1\nlc2 = 1\nI1 = 1\nI2 = 1")
+ARM = ARM.replace("m = 0.5\nlc = 0.2\nI = 0.002", "m1 = 1\nm2 = 1\nl1 = 1\nl2 = 1\nlc1 = 1\nlc2 = 1\nI1 = 1\nI2 = 1")
 T = DT * np.arange(1000)
 DAY = 86400.0
 

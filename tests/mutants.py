@@ -173,11 +173,11 @@ a kept program whatever it was made of
 # numerics/ode.py
 ## test_ode.py::test_linear_system_is_the_taylor_series_to_fourth_order
 weights of the Runge-Kutta stages
-- [-4 / 3, 1 / 3, 2 / 3, 1 / 3]
-+ [-4 / 3, 2 / 3, 1 / 3, 1 / 3]
+- [1.0, 2.0, 2.0, 1.0]
++ [1.0, 2.0, 1.0, 2.0]
 a Runge-Kutta stage at the wrong place
-- ahead = h * jnp.asarray([1 / 2, 1 / 2, 1.0
-+ ahead = h * jnp.asarray([1 / 2, 1.0, 1.0
+- ahead = h * jnp.asarray([0.5, 0.5, 1.0, 0.0]
++ ahead = h * jnp.asarray([0.5, 1.0, 1.0, 0.0]
 # smoother/linear.py
 ## test_kalman.py::test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings[tangent]
 lag-one covariance: spread of the pair's first

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
         accepted = findings(diagnosis)
         document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted, None)}
     write_monitor(args.out, fitted, beside, seen, document, log)
-    return 4 if seen.alarm is not None else 0
+    return 4 if seen.alarm is not None else 0  # the exit status of a machine that changed
 
 
 def _row(fitted: Identified, beside: Reference, candidates, rig: Rig, path: Path, trust: bool) -> dict[str, Any]:

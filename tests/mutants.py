@@ -173,11 +173,11 @@ a kept program whatever it was made of
 # numerics/ode.py
 ## test_ode.py::test_linear_system_is_the_taylor_series_to_fourth_order
 weights of the Runge-Kutta stages
-- [1.0, 2.0, 2.0, 1.0]
-+ [1.0, 2.0, 1.0, 2.0]
+- [-4 / 3, 1 / 3, 2 / 3, 1 / 3]
++ [-4 / 3, 1 / 3, 1 / 3, 2 / 3]
 a Runge-Kutta stage at the wrong place
-- ahead = h * jnp.asarray([0.5, 0.5, 1.0, 0.0]
-+ ahead = h * jnp.asarray([0.5, 1.0, 1.0, 0.0]
+- ahead = h * jnp.asarray([1 / 2, 1 / 2, 1.0, 1 / 6]
++ ahead = h * jnp.asarray([1 / 2, 1.0, 1.0, 1 / 6]
 # smoother/linear.py
 ## test_kalman.py::test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings[tangent]
 lag-one covariance: spread of the pair's first
@@ -211,6 +211,10 @@ stride not shortened on retreat
 retreat to the model that was refused
 - between(state.best, state.proposal, state.stride)
 + between(state.model, state.proposal, state.stride)
+## test_fit.py::test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step
+a rise along one path counts, however small
+- - abs(np.mean((best - state.top)[both])))
++ )
 ## test_fit.py::test_a_sequence_that_was_left_out_refuses_nothing
 lost sequences judge the next model
 - top = np.where(used, loglik, np.nan)

@@ -65,6 +65,38 @@ def test_a_worse_model_is_refused_and_the_way_from_the_best_is_shorter():
     assert after.epoch == 4
 
 
+class _Along(NamedTuple):
+    """An M-step whose likelihood of a mass is that along the path of the best."""
+
+    best: float
+    tried: float
+
+    def loglik(self, model, path, data):
+        assert path is PATH
+        return np.array({1.0: self.best, 1.5: self.tried}[_mass(model)] + np.array([0.0, 2.0, np.nan]))
+
+
+@pytest.mark.parametrize(
+    ("best", "tried", "used", "ess", "taken"),
+    [
+        (-40.0, 1.0, [1, 1, 0], np.inf, True),  # rises by 41, known to 40
+        (40.0, 81.0, [1, 1, 0], np.inf, True),
+        (-40.0, -1.0, [1, 1, 0], np.inf, False),
+        (40.0, 79.0, [1, 1, 0], np.inf, False),
+        (-40.0, 1.0, [1, 0, 0], np.inf, False),  # a sequence is lost
+        (-40.0, 1.0, [1, 1, 0], 100.0, False),  # of samples it would be chance
+    ],
+)
+def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(monkeypatch, best, tried, used, ess, taken):
+    """Likelihoods along different paths differ by what is known of neither."""
+    monkeypatch.setattr(loop, "e_step", lambda *_, **__: SimpleNamespace(state=PATH))
+    state, used = _state([0.0, 2.0, np.nan], ess=ess), np.array(used) > 0
+    same = lambda: loop._rise(state, DATA, None, _Along(best, tried), used)  # noqa: E731
+    after = loop._judge(state, _heavy(2.5), jnp.ones((1, 1)), np.array([-9.0, -7.0, -9.0]), used, same)
+    assert _mass(after.best) == (1.5 if taken else 1.0)
+    assert after.top[0] == (-9.0 if taken else 0.0)
+
+
 def test_a_sequence_that_was_left_out_refuses_nothing():
     after = loop._judge(
         _state([0.0, np.nan]), _heavy(2.5), jnp.ones((1, 1)), np.array([1.0, -1e9]), np.array([1, 0]) > 0

@@ -24,7 +24,7 @@ from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each, on_default_device
-from ..smoother.kalman import Cubature, Tangent
+from ..smoother.kalman import Cubature, Tangent, kalman_filter
 from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
 from .prior import ParameterPrior
@@ -71,6 +71,10 @@ class AbstractMStep(eqx.Module):
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[AbstractModel, MStepInfo]:
         """The next model."""
 
+    def loglik(self, model, path: Gaussian, data: Dataset) -> Float[Array, " seq"]:
+        """Log-likelihood of the readings by a model linearised about a path of every sequence; NaN: not known."""
+        return jnp.full(len(data.t), jnp.nan)
+
     @abstractmethod
     def while_growing(self) -> "AbstractMStep":
         """The rule while the horizon still grows."""
@@ -99,6 +103,11 @@ def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
 def _quadratic(common, one) -> Quadratic:
     (log_q, log_r, start, nodes), (linear, posterior, read) = common, one
     return quadratic(log_q, log_r, start, linear, nodes, posterior, read)
+
+
+def _loglik(common, linear: Local) -> Float[Array, ""]:
+    log_q, log_r, start = common
+    return kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq).loglik
 
 
 @eqx.filter_jit
@@ -231,6 +240,11 @@ class ScoringMStep(AbstractMStep):
         core = self.core(model)
         core, hessian, used = self.advance(core, linear, posterior, read, not_diverged(posterior, data))
         return self.whole(model, core), MStepInfo(hessian, used)
+
+    def loglik(self, model, path: Gaussian, data: Dataset) -> Float[Array, " seq"]:
+        """Log-likelihood of the readings by a model linearised about a path of every sequence, as in a step."""
+        linear = locals_along(model, self.prior, path, data, self.linearise)
+        return each(_loglik, (model.log_q, model.log_r, model.start), linear)
 
     def core(self, model) -> Core:
         """Parts of a model that a step changes."""

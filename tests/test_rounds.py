@@ -52,7 +52,9 @@ def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None
     )
 
 
-def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MULTI, members=None, shortlist=8):
+def _run(
+    monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MULTI, members=None, shortlist=8, white=None
+):
     """A round over these candidates, and the names of those that were refitted in turn.
 
     A refit removes what the screen said, or leaves `errors` by name; its gain is 100 nat, or that of `gains`.
@@ -76,7 +78,8 @@ def _run(monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MU
     monkeypatch.setattr(rounds, "with_candidate", refit)
     fit = SmoothedFit(BARE, hypothesis, None, DATA, np.ones(6, bool), 9)
     before = SimpleNamespace(rig=RIG)
-    context = SearchContext(before, {}, DATA, loss, SEARCH_EFFORT._replace(shortlist=shortlist), lambda text: None)
+    effort, white = SEARCH_EFFORT._replace(shortlist=shortlist), not loss.multi_step if white is None else white
+    context = SearchContext(before, {}, DATA, loss, effort, lambda text: None, white=white)
     return screening_round(fit, context), tried
 
 
@@ -134,6 +137,24 @@ def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(m
     for share, names in ((0.46, ("x",)), (0.44, ("x", "dx"))):
         outcome, _ = _run(monkeypatch, [_screened(two, 0.5), _screened(one, share)])
         assert outcome.accepted.effect.inputs_named() == names
+
+
+@pytest.mark.parametrize(
+    ("white", "share", "gain", "accepted"),
+    [
+        (True, 0.46, 101.0, "air_drag"),
+        (True, 0.44, 101.0, "motor_gain"),  # predicts less well
+        (True, 0.46, 99.0, "motor_gain"),
+        (False, 0.46, 101.0, "motor_gain"),  # of readings that are not white it proves nothing
+    ],
+)
+def test_likelihood_decides_between_laws_that_predict_alike_where_readings_are_white(
+    monkeypatch, white, share, gain, accepted
+):
+    """A mass and a gain predict alike over many steps, and are apart over one."""
+    entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("air_drag"), share)]
+    outcome, _ = _run(monkeypatch, entries, gains={"air_drag": gain}, white=white)
+    assert outcome.accepted.effect.name == accepted
 
 
 def test_a_simpler_law_is_refitted_where_the_function_that_beat_it_is_rejected(monkeypatch):

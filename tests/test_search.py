@@ -505,5 +505,5 @@ def test_where_a_joint_is_hidden_rounds_begin_at_short_horizons(monkeypatch, mea
     monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
     monkeypatch.setattr(search, "_ladder", lambda _: [4, 6])
     monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
-    search.search(context, white=False, release=lambda fitted, data: fitted)
+    search.search(context, release=lambda fitted, data: fitted)
     assert seen == [lengths]

@@ -70,6 +70,8 @@ class SearchContext(NamedTuple):
     """The fit from which the search began along its own recordings, where the question is what changed since."""
     change: bool = False
     """True where that is the question: the declared model is a fit, and its laws stay."""
+    white: bool = False
+    """True where readings carry white noise: one-step errors then count, last and among laws that predict alike."""
     kinds: Collection[type[AbstractEffect]] = catalogue.values()
     """Laws that are tried."""
 

@@ -72,8 +72,9 @@ def with_memory(fitted: Identified, data: Dataset | Logs, log: Log = silent) -> 
     data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
     before, joints = fitted._replace(smoother=unbranched(fitted.bank)), len(fitted.model.system.coordinates)
     effort = SEARCH_EFFORT._replace(most=joints, shortlist=joints)
-    context = SearchContext(before, {}, data, MultiStep(), effort, log, kinds=(DynamicFriction,))
-    found = search(context, white=white_readings(data, fitted.model), release=finished)
+    white = white_readings(data, fitted.model)
+    context = SearchContext(before, {}, data, MultiStep(), effort, log, white=white, kinds=(DynamicFriction,))
+    found = search(context, release=finished)
     sentences = "\n".join(f"joint {j + 1}: {_sentence(found, j + 1)}" for j in range(joints))
     outcome = found.after if found.evidence else fitted
     return outcome._replace(smoother=fitted.smoother, memory=sentences)

@@ -88,12 +88,13 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
 
 
 def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
-    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form.
+    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form; among those by
+    likelihood where readings are white.
 
     None is accepted where one that is worth as much is of another cause.
     """
     model, values = fit.model, [case.removed for case in admissible]
-    ties = values if context.loss.multi_step else [_priced(case) for case in admissible]
+    ties = [_priced(case) for case in admissible] if context.white else values
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), ties)]
     best = _form(leader, admissible, values, ties, model)

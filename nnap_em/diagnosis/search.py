@@ -101,10 +101,10 @@ def _evidence(outcome: Round, loss: AbstractLoss) -> Evidence:
     return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
 
 
-def search(context: SearchContext, *, white: bool, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
+def search(context: SearchContext, *, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
 
-    Where readings carry `white` noise and what is left is white, too, one-step errors show last what is too weak for
+    Where readings carry white noise and what is left is white, too, one-step errors show last what is too weak for
     many steps: of a model that lacks more they prove nothing.
     """
     before, data = context.before, context.data
@@ -117,7 +117,7 @@ def search(context: SearchContext, *, white: bool, release: Callable[[Identified
     hidden = not set(before.model.system.coordinates) <= set(before.rig.measured)
     lengths = _ladder(context) if hidden else [_first(context)]
     hypothesis, state, steps, complete = _search(context, *begun, lengths)
-    if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
+    if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
@@ -308,14 +308,14 @@ def diagnose(
     )
     ended = _ended(hold) if change else finished if white else _released(rig)
     if white:
-        context = SearchContext(before, stages, data, MultiStep(), effort, log, (), end, origin, change)
-        diagnosis = search(context, white=True, release=ended)
+        context = SearchContext(before, stages, data, MultiStep(), effort, log, (), end, origin, change, white)
+        diagnosis = search(context, release=ended)
         return _compared(diagnosis, origin, data, ended) if change else _branching(diagnosis)
     before, data, disturbances, pieces = disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
     context = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end, origin, change)
-    diagnosis = search(context, white=False, release=ended)._replace(interventions=disturbances, pieces=pieces)
+    diagnosis = search(context, release=ended)._replace(interventions=disturbances, pieces=pieces)
     if change:
         return _compared(diagnosis, origin, data, ended)
     before = ended(before, data)

@@ -56,8 +56,9 @@ def write_diagnosis(
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if diagnosis.before.rig.friction}
     for name, table in tables.items():
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
+    alone = lambda sides: sides if accepted else {"fit": sides["before"]} if sides else {}  # noqa: E731
     figures = [
-        *_error_pictures(error, predicted, tables, names, test),
+        *_error_pictures(error, alone(predicted), alone(tables), names, test),
         *_residual_pictures(left, partial, names),
         *_effect_pictures(accepted),
         *_search_pictures(diagnosis.steps, diagnosis.before.rig.named),
@@ -103,8 +104,10 @@ def _error_pictures(
     out = []
     if error:
         caption = "On test sequences that no fit and no choice has seen."
-        drawn = {key: value for key, value in error.items() if key != "after" or len(predicted) > 1}
-        out.append(picture("error", "Prediction error", caption, error_figure(drawn, names)))
+        if "fit" in predicted:
+            error = {key: value for key, value in error.items() if key != "after"}
+            error["fit"] = error.pop("before")
+        out.append(picture("error", "Prediction error", caption, error_figure(error, names)))
     if tables:
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
         out.append(

@@ -85,5 +85,5 @@ def trend_figure(document: Mapping[str, Any]) -> Figure:
         ax.axhline(0, color="#BBBBBB", lw=0.8)
         ax.set_title(f"{each['name']} [{each['unit']}]", fontsize=8)
     figure.axes[-1].set_xlabel("recording")
-    head(figure, "Trend", [errors])
+    head(figure, "Each recording beside the fit", [errors])
     return figure

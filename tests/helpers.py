@@ -10,16 +10,28 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 
-from nnap_em.data.rig import Rig
+from nnap_em.commands import cli
+from nnap_em.data.rig import Rig, read_rig, write_rig
+from nnap_em.diagnosis.residual import Residual
 from nnap_em.effects.base import SearchScales
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
+from nnap_em.fit.identify import Identified, phi_samples
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.state_space import StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems import systems
+from nnap_em.systems import specs, systems
 from nnap_em.systems.slide import Slide
+
+
+def draws(fitted: Identified, samples: int, rows: int, key: jax.Array) -> tuple[np.ndarray, ...]:
+    """The random numbers of `predict` with this key for one sequence, as an exported predictor takes them."""
+    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
+    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
+    n = fitted.model.log_q.shape[0]
+    drawn = jax.random.normal(key_start, (samples, n)), jax.random.normal(key_noise, (rows, samples, n))
+    return tuple(map(np.asarray, (phi_samples(fitted, samples, key=key_draw), *drawn)))
 
 
 @contextlib.contextmanager
@@ -31,6 +43,17 @@ def optimised() -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
+
+
+def nnap(*words: object) -> int:
+    """Exit status of a command in this process."""
+    return cli.main([str(word) for word in words])
+
+
+def written_again(rig: Rig, folder: Path) -> Rig:
+    """What is read of the rig.toml that is written of a rig."""
+    write_rig(rig, folder / "again.toml")
+    return read_rig(folder / "again.toml", specs)
 
 
 def data_sets(shared: Path) -> list[Path]:
@@ -102,6 +125,27 @@ def around(model: StateSpaceModel) -> SearchScales:
         model.system, np.ones(2), 10 * np.ones(2), np.zeros(2), -3 * np.ones(2), 3 * np.ones(2), np.ones(1),
         ("theta1", "theta2", "dtheta1", "dtheta2"), np.ones(4), 0.01, (0.0, 5.0), 5.0, True, True, ("u",),
     )  # fmt: skip
+
+
+def right_residual(seed: int, shape: tuple[int, int], dof: int, read: int, **changes) -> Residual:
+    """What a right model would leave, of states that move; `shape` counts sequences and rows, `read` readings."""
+    rng = np.random.default_rng(seed)
+    sequences, rows = shape
+    walk = 0.1 * np.cumsum(rng.normal(size=(*shape, 2 * dof)), axis=1)
+    forces = np.zeros((*shape, dof))
+    return Residual(
+        innovation=rng.normal(size=(*shape, read)),
+        force=np.concatenate([rng.normal(size=(sequences, rows - 1, dof)), np.full((sequences, 1, dof), np.nan)], 1),
+        force_std=forces + 1.0,
+        partial_force=forces,
+        partial_force_std=forces + 1.0,
+        state=walk,
+        predicted=walk,
+        u=np.sin(0.1 * np.arange(rows) + rng.uniform(0, 6, size=(sequences, 1)))[..., None],
+        t=np.tile(0.01 * np.arange(rows), (sequences, 1)),
+        valid=np.ones(shape, bool),
+        used=np.ones(sequences, bool),
+    )._replace(**changes)
 
 
 def slide() -> tuple[StateSpaceModel, ScoringMStep]:

@@ -14,6 +14,17 @@ from mcap_ros2._dynamic import serialize_dynamic
 NS = 1_000_000_000
 EPOCH = 1_700_000_000 * NS
 """Where the clocks of these logs begin [ns]."""
+T = 0.004 * np.arange(2000)
+Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
+V = np.stack([np.cos(T), -2 * np.sin(2 * T)], axis=1)
+"""Times, angles and rates of a robot of two joints, hip and knee."""
+TOPICS = """
+[import.columns]
+theta1 = "/js:position[joint]"
+dtheta1 = "/js:velocity[joint]"
+u = "/cmd:data[0]"
+"""
+"""Columns of a pendulum in a topic of joint states and one of commands."""
 JOINT_STATE = """\
 std_msgs/Header header
 string[] name
@@ -114,3 +125,12 @@ def write_hdf5(path: Path, groups: Mapping[str, Mapping[str, Any]]) -> Path:
             for column, values in columns.items():
                 group[column] = values
     return path
+
+
+def robot_log(path: Path, command: str | None, joints: Sequence[str] = ("hip", "knee")) -> Path:
+    """A robot's log with its joints in this order, each other name an axis that moves as the hip."""
+    rng, turn = np.random.default_rng(0), [int(joint == "knee") for joint in joints]
+    noisy = Q[:, turn] + 1e-3 * rng.normal(size=(len(T), len(turn)))
+    topics = {"/joint_states": (ros2(*JOINTS), ns(T), joint_states(joints, noisy, V[:, turn], 7 * Q[:, turn], ns(T)))}
+    topics |= {command: (ros2(*MULTI), ns(T), arrays(np.stack([T, -T], 1)))} if command else {}
+    return write_mcap(path, topics)

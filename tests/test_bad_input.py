@@ -33,15 +33,17 @@ def good(tmp_path_factory) -> Path:
     return folder
 
 
-def _log_file(change: Callable[[str], str | bytes]) -> Callable[[Path], object]:
+def _with(change: Callable) -> Callable[..., Callable[[Path], None]]:
+    """A change of the folder, of the arguments that follow the folder."""
+    return lambda *arguments: lambda folder: change(folder, *arguments)
+
+
+@_with
+def _log_file(folder: Path, change: Callable[[str], str | bytes]) -> None:
     """A change of train/01.csv."""
-
-    def apply(folder: Path) -> None:
-        path = folder / "train/01.csv"
-        content = change(path.read_text())
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-
-    return apply
+    path = folder / "train/01.csv"
+    content = change(path.read_text())
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def _columns(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Callable[[str], str]:
@@ -53,14 +55,11 @@ def _column(name: str, change) -> Callable[[str], str]:
     return _columns(lambda log: {name: change(log[name])})
 
 
-def _rig(old: str, new: str) -> Callable[[Path], object]:
+@_with
+def _rig(folder: Path, old: str, new: str) -> None:
     """A change of rig.toml."""
-
-    def apply(folder: Path) -> None:
-        assert old in RIG
-        (folder / "rig.toml").write_text(RIG.replace(old, new, 1))
-
-    return apply
+    assert old in RIG
+    (folder / "rig.toml").write_text(RIG.replace(old, new, 1))
 
 
 def _only(name: str) -> Callable[[Path], object]:
@@ -83,38 +82,24 @@ def _huge(folder: Path) -> None:
         file.truncate(LARGEST_FILE + 2**20)  # sparse: it takes no place on the disk
 
 
-def _everywhere(name: str, change) -> Callable[[Path], object]:
+@_with
+def _everywhere(folder: Path, name: str, change) -> None:
     """A change of one column of all files."""
-
-    def apply(folder: Path) -> None:
-        for path in folder.glob("t*/*.csv"):
-            log = np.genfromtxt(path, delimiter=",", names=True)
-            columns = {other: log[other] for other in log.dtype.names}
-            path.write_text(csv_text(columns | {name: change(columns[name])}))
-
-    return apply
+    for path in folder.glob("t*/*.csv"):
+        log = np.genfromtxt(path, delimiter=",", names=True)
+        columns = {other: log[other] for other in log.dtype.names}
+        path.write_text(csv_text(columns | {name: change(columns[name])}))
 
 
-def _cut(first: int, last: int) -> Callable[[Path], object]:
+@_with
+def _cut(folder: Path, first: int, last: int) -> None:
     """test/01.csv: some rows of train/01.csv, their clock set back."""
-
-    def apply(folder: Path) -> None:
-        rows = {name: values[first:last] for name, values in swing().items()}
-        (folder / "test/01.csv").write_text(csv_text(rows | {"time": rows["time"] - rows["time"][0]}))
-
-    return apply
+    rows = {name: values[first:last] for name, values in swing().items()}
+    (folder / "test/01.csv").write_text(csv_text(rows | {"time": rows["time"] - rows["time"][0]}))
 
 
 def _wrap(theta):
     return (theta + 1.0) % (2.0 * np.pi)
-
-
-def _random():
-    return np.random.default_rng(0).normal(0.0, 0.1, 201)
-
-
-def _jitter(t):
-    return t + 0.0002 * (np.arange(t.size) == 7)
 
 
 LOGS = {  # name: (the change of train/01.csv, the words of the message: place | finding | hint)
@@ -168,7 +153,10 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
         lambda s: s.replace("\n0.04,", "\n0.03,"),
         "line 6, column 'time' | does not run on | resample to uniform rows with `nnap-em import` | (dt = 0.01 s)",
     ),
-    "jitter": (_column("time", _jitter), "line 9, column 'time' | jitter: 0.06 s, then 0.0702 s (2 places | resample"),
+    "jitter": (
+        _column("time", lambda t: t + 0.0002 * (np.arange(t.size) == 7)),
+        "line 9, column 'time' | jitter: 0.06 s, then 0.0702 s (2 places | resample",
+    ),
     "another dt": (_column("time", lambda t: 2 * t), "column 'time' | 0.02 s apart | correct [sampling] dt"),
     "milliseconds": (_column("time", lambda t: 1000 * t), "column 'time' | 10 s apart | one of the two is in ms"),
     "time backwards": (_column("time", lambda t: -t), "column 'time' | -0.01 s apart | correct [sampling] dt"),
@@ -220,65 +208,56 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
     "angle twice": (_columns(lambda log: {"dtheta1": log["theta1"]}), "'dtheta1' | same numbers | each sensor reads"),
     "input as rate": (_columns(lambda log: {"dtheta1": log["u"]}), "'dtheta1' | as column 'u' | each sensor reads"),
 }
-FOLDERS = {  # name: (the change of the folder, the file, the words of the message); more of rig.toml in test_rig.py
-    "no rig": (lambda f: (f / "rig.toml").unlink(), "rig.toml", "cannot be read | a folder with a rig.toml"),
-    "rig no TOML": (_rig("m = 0.5", "m = 0,5"), "rig.toml", "line 5 | not TOML | key = value"),
-    "unknown table": (_rig("[sampling]", "[samplign]"), "rig.toml", "samplign | did you mean 'sampling'?"),
+FOLDERS = {  # name: (the change of the folder, the words of the message, the file first); more in test_rig.py
+    "no rig": (lambda f: (f / "rig.toml").unlink(), "rig.toml | cannot be read | a folder with a rig.toml"),
+    "rig no TOML": (_rig("m = 0.5", "m = 0,5"), "rig.toml | line 5 | not TOML | key = value"),
+    "unknown table": (_rig("[sampling]", "[samplign]"), "rig.toml | samplign | did you mean 'sampling'?"),
     "parameters missing": (
         _rig("lc = 0.4\nI = 0.002\n", ""),
-        "rig.toml",
-        "[model] lc, I: missing (found only: type, m, g, friction, actuated_joint); write lc = 0.2 | , and so on",
+        "rig.toml | [model] lc, I: missing (found only: type, m, g, friction, actuated_joint); "
+        "write lc = 0.2 | , and so on",
     ),
-    "no train": (lambda f: shutil.rmtree(f / "train"), "train", "is no folder | one CSV file per sequence"),
+    "no train": (lambda f: shutil.rmtree(f / "train"), "train | is no folder | one CSV file per sequence"),
     "empty train": (
         lambda f: [path.unlink() for path in f.glob("train/*")],
-        "train",
-        "holds no *.csv | one CSV file per sequence",
+        "train | holds no *.csv | one CSV file per sequence",
     ),
     "spreadsheets": (
         lambda f: [path.rename(path.with_suffix(".xlsx")) for path in f.glob("train/*")],
-        "train",
-        "found there: 00.xlsx, 01.xlsx | one CSV file per sequence",
+        "train | found there: 00.xlsx, 01.xlsx | one CSV file per sequence",
     ),
     "a sequence in two formats": (
         lambda f: (f / "train/00.mat").write_bytes(b""),
-        "train/00.mat",
-        "there is a 00.csv beside it | remove or rename one",
+        "train/00.mat | there is a 00.csv beside it | remove or rename one",
     ),
     "a sequence in two formats, and another between": (
         lambda f: [(f / "train/00.d.csv").write_bytes(b""), (f / "train/00.mat").write_bytes(b"")],
-        "train/00.mat",
-        "there is a 00.csv beside it | remove or rename one",
+        "train/00.mat | there is a 00.csv beside it | remove or rename one",
     ),
     "a folder for a file": (
         lambda f: [(f / "train/01.csv").unlink(), (f / "train/01.csv").mkdir()],
-        "train/01.csv",
-        "cannot be read | check the path",
+        "train/01.csv | cannot be read | check the path",
     ),
-    "huge": (_huge, "train/01.csv", "257 MB | cut it into sequences"),
+    "huge": (_huge, "train/01.csv | 257 MB | cut it into sequences"),
     "bad test file": (
         lambda f: (f / "test/00.csv").write_text(csv_text(swing(phase=1.0)).replace("time", "tme")),
-        "test/00.csv",
-        "line 1, column 'time' | did you mean 'tme'?",
+        "test/00.csv | line 1, column 'time' | did you mean 'tme'?",
     ),
     "time and dt in ms": (
         _both(_rig("dt = 0.01", "dt = 10"), _everywhere("time", lambda t: 1000 * t)),
-        "train/00.csv",
-        "column 'dtheta1' | times column | time and dt are in ms",
+        "train/00.csv | column 'dtheta1' | times column | time and dt are in ms",
     ),
-    "test in train": (_cut(0, 201), "test file 01.csv", "same content as train file 01.csv | remove one"),
+    "test in train": (_cut(0, 201), "test file 01.csv | same content as train file 01.csv | remove one"),
     "a part of train in test": (
         _cut(100, 150),
-        "test file 01.csv",
-        "row 1 and those after it are also in train file 01.csv, from row 101 | remove one",
+        "test file 01.csv | row 1 and those after it are also in train file 01.csv, from row 101 | remove one",
     ),
     "a sequence twice": (
         lambda f: shutil.copy(f / "train/01.csv", f / "train/02.csv"),
-        "train file 02.csv",
-        "same content as train file 01.csv | remove one",
+        "train file 02.csv | same content as train file 01.csv | remove one",
     ),
 }
-ERRORS = FOLDERS | {name: (_log_file(change), "train/01.csv", words) for name, (change, words) in LOGS.items()}
+ERRORS = FOLDERS | {name: (_log_file(change), f"train/01.csv | {words}") for name, (change, words) in LOGS.items()}
 WARNINGS = {  # what may be meant: name: (the change of the folder, the words of the warning)
     "gap": (
         _log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
@@ -287,7 +266,8 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, the words of
     "gap in noisy inputs": (
         _log_file(
             lambda _: csv_text(
-                {name: np.delete(x, range(100, 110)) for name, x in (swing() | {"u": _random()}).items()}
+                {name: np.delete(x, range(100, 110)) for name, x in swing().items()}
+                | {"u": np.random.default_rng(0).normal(0.0, 0.1, 191)}
             )
         ),
         "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | cannot be interpolated",
@@ -353,14 +333,14 @@ def _identify(good: Path, change: Callable[[Path], object], place: Path) -> Path
     return folder
 
 
-@pytest.mark.parametrize("change, file, words", ERRORS.values(), ids=ERRORS)
-def test_bad_input_is_refused_in_one_line(good, tmp_path, capsys, change, file, words):
+@pytest.mark.parametrize("change, words", ERRORS.values(), ids=ERRORS)
+def test_bad_input_is_refused_in_one_line(good, tmp_path, capsys, change, words):
     _identify(good, change, tmp_path)
     said = capsys.readouterr()
     assert said.out == ""
     (line,) = (line for line in said.err.splitlines() if "warning: " not in line)
     assert line.startswith("nnap-em: error: ")
-    for word in (file, *words.split(" | ")):
+    for word in words.split(" | "):
         assert word in line
 
 

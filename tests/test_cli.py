@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from helpers import nnap
 from mcap.reader import make_reader
 
 import nnap_em
@@ -44,10 +45,6 @@ SHORT = 61
 """Rows of the one test sequence that is shorter than the others: it ends before the given time."""
 
 
-def _run(*argv) -> int:
-    return cli.main([str(word) for word in argv])
-
-
 def _read(path: Path) -> dict[str, np.ndarray]:
     table = np.genfromtxt(path, delimiter=",", names=True)
     return {name: table[name] for name in table.dtype.names}
@@ -62,17 +59,13 @@ def _files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def _without_declared_noise(folder: Path) -> None:
-    text = (folder / "rig.toml").read_text()
-    (folder / "rig.toml").write_text(re.sub(r"\[measurement\.noise_std\]\n.*\n", "", text))
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory) -> Path:
     """A data set with a short test sequence and gaps in another; the noise of the readings is not declared."""
     folder = tmp_path_factory.mktemp("cli") / "bench"
-    assert _run("simulate", folder, *SIMULATE) == 0
-    _without_declared_noise(folder)
+    assert nnap("simulate", folder, *SIMULATE) == 0
+    text = (folder / "rig.toml").read_text()
+    (folder / "rig.toml").write_text(re.sub(r"\[measurement\.noise_std\]\n.*\n", "", text))
     lines = (folder / "test/001.csv").read_text().splitlines(keepends=True)
     (folder / "test/001.csv").write_text("".join(lines[: 1 + SHORT]))
     lines = (folder / "test/002.csv").read_text().splitlines()
@@ -84,7 +77,7 @@ def bench(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def fit(bench) -> Path:
     out = bench.parent / "fit"
-    assert _run("identify", bench, "--out", out, "--epochs", EPOCHS, "--quiet") == 0
+    assert nnap("identify", bench, "--out", out, "--epochs", EPOCHS, "--quiet") == 0
     return out
 
 
@@ -109,7 +102,7 @@ assert not {"jax", "numpy", "equinox", "matplotlib"} & set(sys.modules)
 
 def test_version_is_that_of_the_package(capsys):
     with pytest.raises(SystemExit, match="0"):
-        _run("--version")
+        nnap("--version")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert capsys.readouterr().out == f"nnap-em {project['version']}\n"
     assert project["version"] == nnap_em.__version__
@@ -140,7 +133,7 @@ def test_command_line_offers_what_the_library_has():
 
 def test_simulated_logs_are_the_truth_with_the_declared_noise(tmp_path):
     noise = ("--process-noise", 1e-4, 2e-3, "--measurement-noise", 0.002, 0.03)
-    assert _run("simulate", tmp_path / "a", *SIMULATE, "--measured", "dx", "x", *noise) == 0
+    assert nnap("simulate", tmp_path / "a", *SIMULATE, "--measured", "dx", "x", *noise) == 0
     declared = read_rig(tmp_path / "a/rig.toml", specs)
     assert (declared.measured, declared.noise_std) == (("dx", "x"), {"dx": 0.03, "x": 0.002})
     groups = [f"{group}/{i:03d}.csv" for group in ("train", "test") for i in range(4)]
@@ -160,7 +153,7 @@ def test_simulated_logs_are_the_truth_with_the_declared_noise(tmp_path):
         np.testing.assert_allclose(values.std(), std, rtol=4 / np.sqrt(2 * values.size))
     friction = _read(tmp_path / "a/truth/friction.csv")
     np.testing.assert_allclose(friction["torque"], _slide_law(friction["velocity"]), rtol=1e-9, atol=1e-9)
-    assert _run("simulate", tmp_path / "b", *SIMULATE) == 0
+    assert nnap("simulate", tmp_path / "b", *SIMULATE) == 0
     assert (tmp_path / "b/train/000.csv").read_bytes() != (tmp_path / "a/train/000.csv").read_bytes()
 
 
@@ -168,7 +161,7 @@ def test_simulated_logs_are_the_truth_with_the_declared_noise(tmp_path):
 def test_every_system_is_simulated(tmp_path, system):
     size = ("--sequences", 1, "--test", 0, "--steps", 30)
     for name in "ab":
-        assert _run("simulate", tmp_path / name, "--system", system, *size, "--seed", 1) == 0
+        assert nnap("simulate", tmp_path / name, "--system", system, *size, "--seed", 1) == 0
     declared = read_rig(tmp_path / "a/rig.toml", specs)
     table = read_logs(tmp_path / "a/train", declared).data
     assert table.y.shape == (1, 31, len(declared.measured))
@@ -179,7 +172,7 @@ def test_every_system_is_simulated(tmp_path, system):
 
 def test_a_folder_with_something_in_it_is_left_alone(bench, capsys):
     before = _files(bench)
-    assert _run("simulate", bench, *SIMULATE) == 2
+    assert nnap("simulate", bench, *SIMULATE) == 2
     assert "is there already; give a new folder" in capsys.readouterr().err
     assert _files(bench) == before
 
@@ -222,7 +215,7 @@ def test_results_that_will_be_replaced_are_named_before(bench, tmp_path, monkeyp
     monkeypatch.setattr(command, "resumable", stop)
     name = command.__name__.rpartition(".")[2]
     for _ in range(2):
-        assert _run(name, bench, "--out", tmp_path) == 2
+        assert nnap(name, bench, "--out", tmp_path) == 2
         (tmp_path / file).touch()
     first, replaced, second = capsys.readouterr().err.splitlines()
     assert re.fullmatch(rf"nnap-em: the (fit|diagnosis) in {tmp_path} will be replaced", replaced)
@@ -232,7 +225,7 @@ def test_results_that_will_be_replaced_are_named_before(bench, tmp_path, monkeyp
 def test_particles_identify_as_well(bench, fit, tmp_path):
     """Two epochs with few particles, against the same epochs of the cubature smoother: the slide is almost linear."""
     argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")
-    assert _run("identify", bench, "--out", tmp_path, *argv) == 0
+    assert nnap("identify", bench, "--out", tmp_path, *argv) == 0
     assert _files(tmp_path) == _files(fit)
     particles, other = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, fit))
     assert read(tmp_path / "model.npz").notes["settings"] == {"smoother": "particle", "particles": 50, "seed": 0}
@@ -257,7 +250,7 @@ def test_the_learned_friction_is_the_true_one(bench, fit):
 
 
 def test_reported_errors_are_those_of_the_predictions(bench, fit, tmp_path, capsys):
-    assert _run("predict", fit, bench / "test", "--given", "1.0", "--out", tmp_path / "p") == 0
+    assert nnap("predict", fit, bench / "test", "--given", "1.0", "--out", tmp_path / "p") == 0
     assert "test: no row of 001.csv is later than --given 1 s: nothing is predicted there" in capsys.readouterr().err
     assert _files(tmp_path / "p") == [f"{i:03d}.csv" for i in range(4)]
     since, miss = [], []
@@ -279,7 +272,7 @@ def test_reported_errors_are_those_of_the_predictions(bench, fit, tmp_path, caps
 def test_predictions_hold_the_truth(bench, fit, tmp_path):
     """The true state, inputs after the given time included, within the stated standard deviations."""
     z = []
-    assert _run("predict", fit / "model.npz", bench / "test", "--given", "0.5", "--out", tmp_path, "--seed", 4) == 0
+    assert nnap("predict", fit / "model.npz", bench / "test", "--given", "0.5", "--out", tmp_path, "--seed", 4) == 0
     for name in ("000.csv", "002.csv", "003.csv"):
         predicted, truth = _read(tmp_path / name), _read(bench / "truth/test" / name)
         ahead = truth["time"] > 0.5 + 1e-6
@@ -294,13 +287,13 @@ def test_readings_after_the_given_time_change_nothing(bench, fit, tmp_path):
         lines[42:] = [line.rpartition(",")[0] + "," for line in lines[42:]]
         path.write_text("\n".join(lines) + "\n")
     for folder, out in ((bench / "test", "a"), (tmp_path / "test", "b")):
-        assert _run("predict", fit, folder, "--given", "0.4", "--out", tmp_path / out) == 0
+        assert nnap("predict", fit, folder, "--given", "0.4", "--out", tmp_path / out) == 0
     for name in _files(tmp_path / "a"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_path):
-    assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
+    assert nnap("smooth", fit, bench / "test", "--out", tmp_path) == 0
     error, noise, z = [], [], []
     for name in _files(bench / "test"):
         smoothed, log, truth = _read(tmp_path / name), _read(bench / "test" / name), _read(bench / "truth/test" / name)
@@ -314,16 +307,12 @@ def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_
     assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 2.0
 
 
-def _no_json(word: str):
-    raise AssertionError(f"{word} is no JSON")
-
-
 def _messages(path: Path) -> dict[str, list[tuple[int, dict]]]:
     """Log time [ns] and content of every message, by topic."""
     topics: dict[str, list[tuple[int, dict]]] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
-            content = json.loads(message.data, parse_constant=_no_json)
+            content = json.loads(message.data, parse_constant=pytest.fail)
             assert set(content) <= set(json.loads(schema.data)["properties"])
             topics.setdefault(channel.topic, []).append((message.log_time, content))
     return topics
@@ -331,7 +320,7 @@ def _messages(path: Path) -> dict[str, list[tuple[int, dict]]]:
 
 def test_viewers_get_the_log_and_what_was_smoothed(bench, fit, tmp_path):
     path = tmp_path / "smoothed.mcap"
-    assert _run("smooth", fit, bench / "test", "--out", tmp_path / "csv", "--mcap", path) == 0
+    assert nnap("smooth", fit, bench / "test", "--out", tmp_path / "csv", "--mcap", path) == 0
     topics = _messages(path)
     fitted = load(fit / "model.npz")
     logs = read_logs(bench / "test", fitted.rig)
@@ -361,7 +350,7 @@ def test_viewers_get_the_log_and_what_was_smoothed(bench, fit, tmp_path):
 
 def test_viewers_get_the_prediction(bench, fit, tmp_path):
     path = tmp_path / "predicted.mcap"
-    assert _run("predict", fit, bench / "test", "--given", "0.4", "--out", tmp_path / "csv", "--mcap", path) == 0
+    assert nnap("predict", fit, bench / "test", "--given", "0.4", "--out", tmp_path / "csv", "--mcap", path) == 0
     topics = _messages(path)
     written = np.concatenate([_read(tmp_path / "csv" / name)["dx_std"] for name in _files(bench / "test")])
     assert set(topics) == {"/log", "/predicted"}
@@ -373,7 +362,7 @@ def test_mcap_needs_its_package(bench, fit, tmp_path, monkeypatch, capsys, comma
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     name, *arguments = command
     path = tmp_path / "a.mcap"
-    assert _run(name, fit, bench / "test", *arguments, "--out", tmp_path / "csv", "--mcap", path) == 2
+    assert nnap(name, fit, bench / "test", *arguments, "--out", tmp_path / "csv", "--mcap", path) == 2
     assert 'a.mcap: MCAP files cannot be written without mcap; pip install "nnap-em[logs]"' in capsys.readouterr().err
     assert not _files(tmp_path)
 
@@ -395,7 +384,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path
     argv = ("identify", bench, "--out", out, "--epochs", EPOCHS)
     with monkeypatch.context() as patch:
         _stop_after(9, patch)  # five of them tell how large the process noise is
-        assert _run(*argv) == 130
+        assert nnap(*argv) == 130
     said = capsys.readouterr().err
     assert said.startswith("nnap-em: compiling for 4 sequences of 151 rows")
     assert re.search(
@@ -403,7 +392,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path
     )
     assert f"stopped with 9 finished steps kept; to go on: nnap-em identify {bench} --out {out}" in said
     assert all(name.startswith("unfinished/em_step-") for name in _files(out))
-    assert _run(*argv, "--resume") == 0
+    assert nnap(*argv, "--resume") == 0
     assert "resumed with 9 finished steps" in capsys.readouterr().err
     assert _files(out) == _files(fit)
     assert (out / "friction.csv").read_bytes() == (fit / "friction.csv").read_bytes()
@@ -421,75 +410,22 @@ def test_a_stop_before_the_first_epoch_keeps_nothing(bench, tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     monkeypatch.setattr(identify_command, "identify", stop)
-    assert _run("identify", bench, "--out", tmp_path / "new") == 130
+    assert nnap("identify", bench, "--out", tmp_path / "new") == 130
     assert "nothing was kept" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
-def _changed(name: str, old: str, new: str):
-    """Puts another text into a file of the bench."""
-
-    def change(bench: Path) -> None:
-        text = (bench / name).read_text()
-        assert old in text
-        (bench / name).write_text(text.replace(old, new, 1))
-
-    return change
-
-
-def _other_data(bench: Path) -> None:
-    text = (bench / "train/000.csv").read_text()
-    (bench / "train/000.csv").write_text(text.rpartition(",")[0] + ",0.5\n")
-
-
-@pytest.fixture(scope="module")
-def stopped(bench) -> Path:
-    """What a run leaves that was stopped after its second step."""
-    out = bench.parent / "stopped"
-    with pytest.MonkeyPatch.context() as patch:
-        _stop_after(2, patch)
-        assert _run("identify", bench, "--out", out, "--quiet") == 130
-    return out
-
-
-RESUMES = {
-    "data": (_other_data, "", "made from another training data"),
-    "rig": (_changed("rig.toml", "m = 1.0", "m = 1.1"), "", "made from another rig.toml"),
-    "seed": (None, "--seed 8", "made with --seed 0, not 8; resume with --seed 0"),
-    "smoother": (None, "--smoother ekf", "resume with --smoother cubature"),
-    "particles": (None, "--smoother particle --particles 9", "resume with --smoother cubature"),
-}
-
-
-@pytest.mark.parametrize("change, options, reason", RESUMES.values(), ids=RESUMES)
-def test_resume_refuses_what_the_kept_steps_are_not_of(bench, stopped, tmp_path, capsys, change, options, reason):
-    shutil.copytree(bench, tmp_path / "bench")
-    if change:
-        change(tmp_path / "bench")
-    before = {name: (stopped / name).stat().st_mtime_ns for name in _files(stopped)}
-    assert before
-    assert _run("identify", tmp_path / "bench", "--out", stopped, "--resume", *options.split()) == 2
-    assert reason in capsys.readouterr().err
-    assert {name: (stopped / name).stat().st_mtime_ns for name in _files(stopped)} == before
-
-
-def test_without_test_sequences_there_is_no_error_to_report(bench, tmp_path, capsys):
-    shutil.copytree(bench, tmp_path / "bench")
-    shutil.rmtree(tmp_path / "bench/test")
-    assert _run("identify", tmp_path / "bench", "--out", tmp_path / "fit", "--epochs", 1) == 0
-    report = json.loads((tmp_path / "fit/report.json").read_text())
-    assert report["fit"] is report["error"] is None
-    assert "no test sequences" in report["error_note"]
-    assert "no test sequences" in capsys.readouterr().err
-
-
-def test_test_sequences_do_not_change_the_fit(bench, fit, tmp_path):
+def test_without_test_sequences_the_fit_is_the_same_and_there_is_no_error_to_report(bench, tmp_path, capsys):
     """One epoch with and without them."""
     shutil.copytree(bench, tmp_path / "bench")
     shutil.rmtree(tmp_path / "bench/test")
     for folder, out in ((bench, "a"), (tmp_path / "bench", "b")):
-        assert _run("identify", folder, "--out", tmp_path / out, "--epochs", 1, "--quiet") == 0
+        assert nnap("identify", folder, "--out", tmp_path / out, "--epochs", 1) == 0
+        said = capsys.readouterr().err
     assert (tmp_path / "a/friction.csv").read_bytes() == (tmp_path / "b/friction.csv").read_bytes()
+    report = json.loads((tmp_path / "b/report.json").read_text())
+    assert report["fit"] is report["error"] is None
+    assert "no test sequences" in report["error_note"] and "no test sequences" in said
 
 
 def test_json_has_null_for_what_is_no_number(tmp_path):
@@ -501,13 +437,19 @@ def test_json_has_null_for_what_is_no_number(tmp_path):
     assert content == {"a": [1.0, [2.0, None]], "b": {"c": None, "d": "é"}, "e": estimate}
 
 
+def _renamed(bench: Path) -> None:
+    """Another name of the reading in the header of a test sequence."""
+    text = (bench / "test/001.csv").read_text()
+    (bench / "test/001.csv").write_text(text.replace(",x", ",z", 1))
+
+
 PREDICT = "predict {fit} {bench}/test --given 1 --out {out}"
 BAD = {
     "out is a file": (None, "identify {bench} --out {bench}/rig.toml", r"rig\.toml: File exists"),
     "no model": (None, "smooth {bench} {bench}/test --out {out}", "model.npz: cannot be read"),
     "model is a log": (None, "smooth {bench}/test/000.csv {bench}/test --out {out}", r"000\.csv: no model"),
     "no logs": (lambda b: shutil.rmtree(b / "test"), PREDICT, "bench/test: is no folder"),
-    "column lost": (_changed("test/001.csv", ",x", ",z"), PREDICT, r"test/001\.csv: line 1, column 'x': missing"),
+    "column lost": (_renamed, PREDICT, r"test/001\.csv: line 1, column 'x': missing"),
     "question unknown": (
         None, "design {fit} --out {out} --for speed",
         "--for speed: not a question of this fit; possible here: friction, .*all",
@@ -529,7 +471,7 @@ def test_a_mistake_gives_one_line_and_writes_nothing(bench, fit, tmp_path, capsy
         change(tmp_path / "bench")
     before = _files(tmp_path)
     places = {"bench": tmp_path / "bench", "fit": fit, "out": tmp_path / "out"}
-    assert _run(*(word.format(**places) for word in argv.split())) == 2
+    assert nnap(*(word.format(**places) for word in argv.split())) == 2
     said = capsys.readouterr()
     assert re.fullmatch(rf"nnap-em: error: .*{reason}.*\n", said.err)
     assert said.out == ""
@@ -552,7 +494,7 @@ USAGE = {
 @pytest.mark.parametrize("argv, reason", USAGE.values(), ids=USAGE)
 def test_wrong_usage_is_refused(capsys, argv, reason):
     with pytest.raises(SystemExit, match="2"):
-        _run(*argv.split())
+        nnap(*argv.split())
     assert reason in capsys.readouterr().err
 
 
@@ -561,10 +503,10 @@ def test_a_full_disk_leaves_nothing_half_written(bench, fit, tmp_path, monkeypat
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(files, "os", SimpleNamespace(fsync=full, getpid=os.getpid))
-    assert _run("smooth", fit, bench / "test", "--out", tmp_path / "out") == 2
+    assert nnap("smooth", fit, bench / "test", "--out", tmp_path / "out") == 2
     assert capsys.readouterr().err == f"nnap-em: error: {tmp_path}/out/000.csv: No space left on device\n"
     assert _files(tmp_path) == []
-    assert _run("simulate", tmp_path / "new", *SIMULATE) == 2
+    assert nnap("simulate", tmp_path / "new", *SIMULATE) == 2
     assert list(tmp_path.iterdir()) == [tmp_path / "out"]
 
 
@@ -574,7 +516,7 @@ def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
 
     monkeypatch.setattr(smooth_command, "smooth", bug)
     with pytest.raises(ZeroDivisionError):
-        _run("smooth", fit, bench / "test", "--out", tmp_path / "out")
+        nnap("smooth", fit, bench / "test", "--out", tmp_path / "out")
 
 
 def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypatch, capsys):
@@ -585,7 +527,7 @@ def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypa
         return state._replace(mean=state.mean.at[2, 10:, 1].set(np.inf))
 
     monkeypatch.setattr(smooth_command, "smooth", lost)
-    assert _run("smooth", fit, bench / "test", "--out", tmp_path) == 0
+    assert nnap("smooth", fit, bench / "test", "--out", tmp_path) == 0
     assert f"nnap-em: warning: 002.csv: {STEPS + 1 - 10} values run away" in capsys.readouterr().err
     assert np.isnan(_read(tmp_path / "002.csv")["dx"]).sum() == STEPS + 1 - 10
 
@@ -616,5 +558,5 @@ def test_log_lines_of_xla_are_off_unless_the_user_wants_them(tmp_path, monkeypat
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
     if chosen is not None:
         monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen)
-    assert _run("check", tmp_path / "nothing") == 2
+    assert nnap("check", tmp_path / "nothing") == 2
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == (chosen or "3")

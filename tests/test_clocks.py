@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import pendulum_rig
-from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
+from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
 
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
@@ -23,12 +23,6 @@ from nnap_em.systems import specs
 
 DT = 0.01
 RIG = pendulum_rig() + "[import]\n"
-TOPICS = """
-[import.columns]
-theta1 = "/js:position[joint]"
-dtheta1 = "/js:velocity[joint]"
-u = "/cmd:data[0]"
-"""
 ARM = RIG.replace('["u"]', '["u", "v"]').replace("[1]", "[1, 2]").replace("pendulum", "acrobot")
 ARM = ARM.replace("m = 0.5\nlc = 0.2\nI = 0.002", "m1 = 1\nm2 = 1\nl1 = 1\nl2 = 1\nlc1 = 1\nlc2 = 1\nI1 = 1\nI2 = 1")
 T = DT * np.arange(1000)

@@ -13,9 +13,9 @@ import jax.scipy.linalg
 import numpy as np
 import pytest
 import scipy.stats
+from helpers import nnap
 
 from nnap_em import compare
-from nnap_em.commands import cli
 from nnap_em.comparison.compare import CHANGED, LEAST_SHARED, Cause, Comparison, corrected_tests, number, shared
 from nnap_em.comparison.pooling import LEAST_VARIANCE, joint_test, pool
 from nnap_em.data.rig import Declared
@@ -264,16 +264,21 @@ def test_a_parameter_that_one_fit_keeps_is_a_difference(unchanged):
     assert comparison.differences == ("m is estimated in a, kept as declared in b",)
 
 
+def _visited(fits: Fits, folder: Path, rows: dict[str, dict]) -> Comparison:
+    """The comparison of fits, by name, whose reports have these ranges."""
+    for name, row in rows.items():
+        (folder / name).mkdir()
+        (folder / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
+        (folder / name / "report.json").write_text(json.dumps({"visited": [row]}))
+    return compare(*(folder / name for name in rows))
+
+
 @pytest.mark.parametrize("inside, warned", [(0.99, True), (1.01, False)])
 @pytest.mark.parametrize("kind", ["velocity", "load"])
 def test_ranges_that_hardly_overlap_are_warned_of(fits, tmp_path, kind, inside, warned):
     ranges = {"velocity": [-1.0, 1.0], "load": [-4.0, 4.0]}
-    for name, factor in (("first", 1.0), ("grown", LEAST_SHARED * inside)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
-        row = {part: [factor * end if part == kind else end for end in ends] for part, ends in ranges.items()}
-        (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"joint": 1} | row]}))
-    comparison = compare(tmp_path / "first", tmp_path / "grown")
+    narrow = ranges | {kind: [LEAST_SHARED * inside * end for end in ranges[kind]]}
+    comparison = _visited(fits, tmp_path, {"first": ranges, "grown": narrow})
     assert len(comparison.warnings) == warned
     if warned:
         first, other = ("-1 to 1", "-0.495 to 0.495 m/s") if kind == "velocity" else ("-4 to 4", "-1.98 to 1.98 N")
@@ -288,11 +293,8 @@ def test_ranges_that_are_not_known_are_not_warned_of():
 
 
 def test_fits_without_a_common_velocity_have_no_curve(fits, tmp_path):
-    for name, ends in (("first", [-1.0, -0.5]), ("grown", [0.5, 1.0])):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "model.npz").write_bytes((getattr(fits, name) / "model.npz").read_bytes())
-        (tmp_path / name / "report.json").write_text(json.dumps({"visited": [{"velocity": ends, "load": None}]}))
-    comparison = compare(tmp_path / "first", tmp_path / "grown")
+    ends = {"first": [-1.0, -0.5], "grown": [0.5, 1.0]}
+    comparison = _visited(fits, tmp_path, {name: {"velocity": each, "load": None} for name, each in ends.items()})
     assert comparison.curves == () and "its friction is not compared" in comparison.warnings[0]
 
 
@@ -307,35 +309,26 @@ def test_fits_of_the_same_logs_are_warned_of(unchanged, tmp_path):
 # --- mistakes
 
 OTHER = {
-    "system": (lambda rig: dataclasses.replace(rig, system="sled"), "a is of system slide and b of sled"),
-    "parameter": (lambda rig: dataclasses.replace(rig, parameters={}), "a declares m and b does not"),
+    "system": ({}, {"system": "sled"}, "a is of system slide and b of sled; compare fits of one machine"),
+    "parameter": ({}, {"parameters": {}}, "a declares m and b does not; compare fits of one machine"),
+    "trusted number": (
+        {"parameters": {"m": Declared(1.0, 0.0)}},
+        {"parameters": {"m": Declared(1.2, 0.0)}},
+        r"the trusted m is 1 in a and 1\.2 in b; .*uncertain in both",
+    ),
 }
 
 
-@pytest.mark.parametrize("change, reason", OTHER.values(), ids=OTHER)
-def test_other_machines_are_refused(unchanged, change, reason):
-    first, second = (fit.fitted for fit in unchanged.fits)
-    with pytest.raises(CompareError, match=f"{reason}; compare fits of one machine"):
-        compare(first, second._replace(rig=change(second.rig)), names=("a", "b"))
-
-
-def test_another_trusted_number_is_refused(unchanged):
-    mass = lambda m: {"parameters": {"m": Declared(m, 0.0)}}  # noqa: E731
-    pair = (
-        fit.fitted._replace(rig=dataclasses.replace(fit.fitted.rig, **mass(m)))
-        for fit, m in zip(unchanged.fits, (1.0, 1.2), strict=True)
-    )
-    with pytest.raises(CompareError, match=r"the trusted m is 1 in a and 1\.2 in b; .*uncertain in both"):
-        compare(*pair, names=("a", "b"))
+@pytest.mark.parametrize("one, two, reason", OTHER.values(), ids=OTHER)
+def test_other_machines_are_refused(unchanged, one, two, reason):
+    both = zip((fit.fitted for fit in unchanged.fits), (one, two), strict=True)
+    with pytest.raises(CompareError, match=reason):
+        compare(*(fit._replace(rig=dataclasses.replace(fit.rig, **own)) for fit, own in both), names=("a", "b"))
 
 
 def test_names_are_one_for_each_fit(fits):
     with pytest.raises(CompareError, match="names a for 2 fits; give each fit a name of its own"):
         compare(fits.first, fits.second, names=("a",))
-
-
-def _run(*argv) -> int:
-    return cli.main([str(word) for word in argv])
 
 
 def test_the_command_refuses_in_one_line(fits, tmp_path, capsys):
@@ -347,7 +340,7 @@ def test_the_command_refuses_in_one_line(fits, tmp_path, capsys):
         ((fits.first, text), "no model, or damaged"),
         ((fits.first, tmp_path), "cannot be read"),
     ):
-        assert _run("compare", *argv, "--out", tmp_path / "out") == 2
+        assert nnap("compare", *argv, "--out", tmp_path / "out") == 2
         said = capsys.readouterr()
         assert said.out == "" and said.err.startswith("nnap-em: error: ") and said.err.count("\n") == 1
         assert reason in said.err
@@ -355,7 +348,7 @@ def test_the_command_refuses_in_one_line(fits, tmp_path, capsys):
 
 
 def test_the_command_prints_a_table_and_writes_a_page(fits, changed, tmp_path, capsys):
-    assert _run("compare", fits.first, fits.grown, "--out", tmp_path / "out") == 0
+    assert nnap("compare", fits.first, fits.grown, "--out", tmp_path / "out") == 0
     said = capsys.readouterr()
     assert said.out == table(changed) + "\n"
     lines = said.out.splitlines()

@@ -10,14 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import optimised
+from helpers import nnap, optimised, written_again
 
 import nnap_em
-from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.data.rig import RigError, read_rig
 from nnap_em.diagnosis.residual import names_of
 from nnap_em.em.weights import Weights
 from nnap_em.experiment.criteria import Discrimination, Friction, Information, Several, after, share
@@ -42,10 +41,7 @@ LIMITS = Limits(
 )  # fmt: skip
 SIMULATE = ("--system", "slide", "--sequences", 12, "--test", 0, "--steps", 150)
 SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
-
-
-def _run(*argv) -> int:
-    return cli.main([str(word) for word in argv])
+THREE = {"seconds": 4.0, "sequences": 3, "effort": SMALL}
 
 
 @pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[type(f).__name__ for f in FAMILIES])
@@ -164,10 +160,10 @@ def test_a_model_is_no_distance_from_itself_and_some_from_another(fit):
 def slide(tmp_path_factory):
     """A slide whose mass is uncertain: folder, rig, logs and fit."""
     folder = tmp_path_factory.mktemp("design") / "slide"
-    assert _run("simulate", folder, *SIMULATE) == 0
+    assert nnap("simulate", folder, *SIMULATE) == 0
     text = (folder / "rig.toml").read_text()
     (folder / "rig.toml").write_text(re.sub(r"m = 1\.0\b", "m = { mean = 1.1, std = 0.2 }", text))
-    assert _run("identify", folder, "--out", folder.parent / "fit", "--quiet") == 0
+    assert nnap("identify", folder, "--out", folder.parent / "fit", "--quiet") == 0
     rig = read_rig(folder / "rig.toml", specs)
     return folder, rig, read_logs(folder / "train", rig).data, load(folder.parent / "fit" / "model.npz")
 
@@ -202,7 +198,7 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
 
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     *_, data, fitted = slide
-    designed = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    designed = design(fitted, data, key=jax.random.key(2), **THREE)
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
     extremes = motions(paths, designed.limits, designed.t, designed.u, designed.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(extremes.lowest) >= designed.limits.lowest[None, None])
@@ -214,11 +210,9 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     assert (
         speed[near > 0].max() <= designed.slow[0] < speed[whole > 0].max()
     )  # the slowest rows once more by themselves
-    again = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    again, other = (design(fitted, data, key=jax.random.key(seed), **THREE) for seed in (2, 3))
     np.testing.assert_array_equal(designed.u, again.u)  # the same seed, the same numbers
-    assert not np.array_equal(
-        designed.u, design(fitted, data, key=jax.random.key(3), seconds=4.0, sequences=3, effort=SMALL).u
-    )
+    assert not np.array_equal(designed.u, other.u)
 
 
 def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread():
@@ -309,7 +303,7 @@ def designed(slide) -> Path:
     folder = slide[0].parent
     order = ("design", folder / "fit", "--out", folder / "next", "--seconds", 6, "--sequences", 4, "--quiet")
     with optimised():
-        assert _run(*order) == 0
+        assert nnap(*order) == 0
     return folder / "next"
 
 
@@ -336,24 +330,24 @@ def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys)
         rows = [f"{t:.2f},{a[0]!r},{b[0] + 1e-4!r}" for t, a, b in zip(data.t[i], u.tolist(), y.tolist(), strict=True)]
         (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
     out = tmp_path / "fit"
-    assert _run("identify", folder, "--more", new, "--out", out, "--epochs", 2, "--quiet") == 0
+    assert nnap("identify", folder, "--more", new, "--out", out, "--epochs", 2, "--quiet") == 0
     assert "to 24 sequences" in json.loads((out / "report.json").read_text())["verdict"]
     from nnap_em.fit.store import read
 
     assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]
-    again = _run("design", out, "--out", tmp_path / "next", "--seconds", 0.1, "--quiet")
+    again = nnap("design", out, "--out", tmp_path / "next", "--seconds", 0.1, "--quiet")
     assert again == 2 and "give more --seconds" in capsys.readouterr().err
 
 
 def test_logs_that_are_not_those_of_the_fit_are_refused(slide, tmp_path, capsys):
     folder = slide[0]
     other = tmp_path / "other"
-    assert _run("simulate", other, *SIMULATE, "--seed", 5) == 0
+    assert nnap("simulate", other, *SIMULATE, "--seed", 5) == 0
     text = (folder / "rig.toml").read_text()
     (other / "rig.toml").write_text(text)
-    assert _run("design", folder.parent / "fit", "--logs", other, "--out", tmp_path / "next") == 2
+    assert nnap("design", folder.parent / "fit", "--logs", other, "--out", tmp_path / "next") == 2
     assert "not the logs, or not read as those, of the fit" in capsys.readouterr().err
-    assert _run("design", folder.parent / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
+    assert nnap("design", folder.parent / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
     assert "its logs are not at" in capsys.readouterr().err
     assert not (tmp_path / "next").exists()
 
@@ -368,8 +362,7 @@ def test_limits_are_read_and_written(slide, tmp_path):
     path.write_text((slide[0] / "rig.toml").read_text() + BOUNDS)
     rig = read_rig(path, specs)
     assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
-    write_rig(rig, tmp_path / "again.toml")
-    assert read_rig(tmp_path / "again.toml", specs) == rig
+    assert written_again(rig, tmp_path) == rig
 
 
 @pytest.mark.parametrize(
@@ -394,7 +387,7 @@ def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
 def test_the_figure_shows_all_of_every_input(slide):
     """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
     *_, data, fitted = slide
-    designed = design(fitted, data, key=jax.random.key(2), seconds=4.0, sequences=3, effort=SMALL)
+    designed = design(fitted, data, key=jax.random.key(2), **THREE)
     u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], designed.u.shape)
     low, high = motion_figure(designed._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
     assert low < 0.01 and high > 3.0

@@ -1,11 +1,12 @@
 """The first rig.toml for a machine in a file: joints, motors and sensors are found by name, and import takes it."""
 
+import functools
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recorders import JOINTS, MULTI, arrays, joint_states, ns, ros2, write_mcap
+from recorders import Q, T, robot_log
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
@@ -14,9 +15,8 @@ from nnap_em.data.rig import read_rig
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
-T = 0.004 * np.arange(2000)
-Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
-V = np.stack([np.cos(T), -2 * np.sin(2 * T)], axis=1)
+LOG = functools.partial(robot_log, command="/torques/commands", joints=("knee", "hip"))
+"""A robot's log in which the knee stands first."""
 MOTORS = '<motor name="m_hip" joint="hip"/><motor name="m_knee" joint="knee"/>'
 
 
@@ -32,15 +32,6 @@ def _leg(path: Path, motors: str = MOTORS, sensors: str = "") -> Path:
     return path
 
 
-def _log(path: Path, joints=("knee", "hip"), command: str | None = "/torques/commands") -> Path:
-    """A robot's log in which the knee stands first."""
-    rng, turn = np.random.default_rng(0), [("hip", "knee").index(j) if j in ("hip", "knee") else 0 for j in joints]
-    noisy = Q[:, turn] + 1e-3 * rng.normal(size=Q.shape)
-    topics = {"/joint_states": (ros2(*JOINTS), ns(T), joint_states(joints, noisy, V[:, turn], 7 * Q[:, turn], ns(T)))}
-    topics |= {command: (ros2(*MULTI), ns(T), arrays(np.stack([T, -T], 1)))} if command else {}
-    return write_mcap(path, topics)
-
-
 @pytest.mark.parametrize(
     ("command", "motors", "inputs"),
     [
@@ -51,7 +42,7 @@ def _log(path: Path, joints=("knee", "hip"), command: str | None = "/torques/com
 )
 def test_a_robot_of_a_file_is_drafted_and_imported(tmp_path, command, motors, inputs):
     model = _leg(tmp_path / "models" / "leg.xml", motors)
-    log, bench = _log(tmp_path / "a.mcap", command=command), tmp_path / "bench"
+    log, bench = LOG(tmp_path / "a.mcap", command=command), tmp_path / "bench"
     bench.mkdir()
     assert cli.main(["init", str(log), "--model", str(model), "--out", str(bench)]) == 0
     text = (bench / "rig.toml").read_text()
@@ -72,14 +63,14 @@ def test_servos_of_a_file_are_drafted_with_what_may_be_uncertain(tmp_path):
     """A measured effort is not taken for the goal of a servo."""
     servo = '<position name="m_hip" joint="hip" kp="40" kv="2"/>'
     model = _leg(tmp_path / "leg.xml", servo)
-    made = draft_machine(_log(tmp_path / "a.mcap", command="/goals/commands"), model, tmp_path)
+    made = draft_machine(LOG(tmp_path / "a.mcap", command="/goals/commands"), model, tmp_path)
     assert '# [input."m_hip"]    # the goal of a position servo; in the file kp = 40, kd = 2' in made.text
-    none = draft_machine(_log(tmp_path / "b.mcap", command=None), model, tmp_path)
+    none = draft_machine(LOG(tmp_path / "b.mcap", command=None), model, tmp_path)
     assert "effort" not in none.text.partition("[import")[0]
 
 
 def test_what_is_uncertain_can_be_said_by_taking_marks_away(tmp_path):
-    made = draft_machine(_log(tmp_path / "a.mcap"), _leg(tmp_path / "leg.xml"), tmp_path)
+    made = draft_machine(LOG(tmp_path / "a.mcap"), _leg(tmp_path / "leg.xml"), tmp_path)
     (tmp_path / "rig.toml").write_text(re.sub(r"(?m)^# (\w+\.\w+ = )", r"\1", made.text))
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert {name: (p.mean, p.std) for name, p in rig.parameters.items()} == {
@@ -111,6 +102,6 @@ def test_plain_columns_by_names_of_joints_sensors_and_by_number(tmp_path):
 
 
 def test_a_log_of_another_machine_is_refused_by_names(tmp_path):
-    log = _log(tmp_path / "a.mcap", joints=("shoulder", "elbow"), command=None)
+    log = LOG(tmp_path / "a.mcap", joints=("shoulder", "elbow"), command=None)
     with pytest.raises(DataError, match=r"a\.mcap: nothing in it is called as a joint of .*leg\.xml \(hip, knee\)"):
         draft_machine(log, _leg(tmp_path / "leg.xml"), tmp_path)

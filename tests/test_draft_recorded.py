@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
+from recorders import Q, T, V, ns, plain_json, robot_log, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
@@ -13,34 +13,18 @@ from nnap_em.import_.recording import Topic
 from nnap_em.init.from_topics import draft_recorded, found_columns
 from nnap_em.systems import specs
 
-T = 0.004 * np.arange(2000)
-Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
-V = np.stack([np.cos(T), -2 * np.sin(2 * T)], axis=1)
-
-
-def _robot(path, command="/effort_controller/commands"):
-    rng = np.random.default_rng(0)
-    noisy = Q + 1e-3 * rng.normal(size=Q.shape)
-    states = joint_states(("hip", "knee"), noisy, V, 0 * Q, stamps=ns(T))
-    topics = {"/joint_states": (ros2(*JOINTS), ns(T), states)}
-    topics |= {command: (ros2(*MULTI), ns(T), arrays(np.stack([T, -T], 1)))} if command else {}
-    return write_mcap(path, topics)
-
-
-def _filled(path):
-    path.write_text(re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", path.read_text()))
-    return path
-
 
 @pytest.mark.parametrize("command, inputs", [("/effort_controller/commands", "data[0]"), (None, "effort[hip]")])
 def test_a_robot_is_drafted_and_imported(tmp_path, command, inputs):
-    log = _robot(tmp_path / "a.mcap", command)
+    log = robot_log(tmp_path / "a.mcap", command)
     assert cli.main(["init", str(log), "--system", "acrobot"]) == 0
-    rig = read_rig(_filled(tmp_path / "rig.toml"), specs)
+    path = tmp_path / "rig.toml"
+    path.write_text(re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", path.read_text()))
+    rig = read_rig(path, specs)
     assert (rig.dt, rig.measured) == (0.004, ("theta1", "theta2", "dtheta1", "dtheta2"))
     assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == {"tau1": 1, "tau2": 2}
     assert rig.noise_std["theta1"] == pytest.approx(1e-3, rel=0.1)  # the median of 2000 third differences
-    text = (tmp_path / "rig.toml").read_text()
+    text = path.read_text()
     assert f'"tau1" = "{command or "/joint_states"}:{inputs}"' in text
     assert '"dtheta2" = "/joint_states:velocity[knee]"' in text
     argv = ["import", str(log), "--rig", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out"), "--test", "0"]

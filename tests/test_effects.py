@@ -1,6 +1,7 @@
 """The catalogue against an independent simulator: each effect moves the machine as the other code says."""
 
 import json
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -78,21 +79,18 @@ def _pulses(e):
     return catalogue["periodic_force"](sine, jnp.zeros(7), _a(e["frequency"]), harmonics=7, joint=e["joint"])
 
 
-MAKE = {
+def _of_one_number(name: str, number: str) -> Callable:
+    """Maker of the effect of that name, which is this number at a joint."""
+    return lambda e: catalogue[name](_a(e[number]), joint=e["joint"])
+
+
+ONE = """payload mass, link_inertia dI, link_length dl, center_of_mass dlc, air_drag c, dead_zone width,
+saturation limit, input_delay delay, actuator_lag tau, torque_offset value, motor_back_emf b"""
+MAKE = {name: _of_one_number(name, number) for name, number in map(str.split, ONE.split(","))} | {
     "torsional_spring": _spring,
     "base_tilt": lambda e: catalogue["base_tilt"](_a(e["angle"])),
-    "payload": lambda e: catalogue["payload"](_a(e["mass"]), joint=e["joint"]),
-    "link_inertia": lambda e: catalogue["link_inertia"](_a(e["dI"]), joint=e["joint"]),
-    "link_length": lambda e: catalogue["link_length"](_a(e["dl"]), joint=e["joint"]),
-    "center_of_mass": lambda e: catalogue["center_of_mass"](_a(e["dlc"]), joint=e["joint"]),
-    "air_drag": lambda e: catalogue["air_drag"](_a(e["c"]), joint=e["joint"]),
     "motor_gain": lambda e: catalogue["motor_gain"](_a(e["gain"] - 1), joint=e["joint"]),
-    "dead_zone": lambda e: catalogue["dead_zone"](_a(e["width"]), joint=e["joint"]),
-    "saturation": lambda e: catalogue["saturation"](_a(e["limit"]), joint=e["joint"]),
-    "input_delay": lambda e: catalogue["input_delay"](_a(e["delay"]), joint=e["joint"]),
-    "actuator_lag": lambda e: catalogue["actuator_lag"](_a(e["tau"]), joint=e["joint"]),
     "cogging": _cogging,
-    "torque_offset": lambda e: catalogue["torque_offset"](_a(e["value"]), joint=e["joint"]),
     "position_dependent_friction": _depth,
     "friction_drift": lambda e: catalogue["friction_drift"](_a(e["change"]), _a(np.log(e["tau"])), joint=e["joint"]),
     "sensor_bias": lambda e: catalogue["sensor_bias"](_a(e["bias"]), channel=e["channel"]),
@@ -109,7 +107,6 @@ MAKE = {
     "load_friction": lambda e: catalogue["load_friction"](
         _a(e["mu"]), _a(e["knee"]), names=("u", "dtheta2"), joint=e["joint"]
     ),
-    "motor_back_emf": lambda e: catalogue["motor_back_emf"](_a(e["b"]), joint=e["joint"]),
     "periodic_force": _pulses,
 }
 """The catalogue's effect of a simulator's one."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import chain_rig, csv_text
+from helpers import chain_rig, csv_text, draws
 
 import nnap_em
 from nnap_em.commands.cli import main
@@ -21,7 +21,7 @@ from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.export.c99 import write_c
 from nnap_em.export.model import PREDICTOR_FILE, STABLEHLO_FILE, write_model
-from nnap_em.fit.identify import begin, phi_samples
+from nnap_em.fit.identify import begin
 from nnap_em.fit.predict import predict
 from nnap_em.fit.store import fingerprint, save
 from nnap_em.model.state_space import Inputs
@@ -172,15 +172,8 @@ def test_the_numpy_predictor_agrees_with_predict(place, tmp_path):
     exec((tmp_path / PREDICTOR_FILE).read_text(), space)
     key = jax.random.key(3)
     wanted = predict(fitted, logs.data, GIVEN, key=key, samples=SAMPLES)
-    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
-    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
-    draws = (
-        np.asarray(phi_samples(fitted, SAMPLES, key=key_draw)),
-        np.asarray(jax.random.normal(key_start, (SAMPLES, 2))),
-        np.asarray(jax.random.normal(key_noise, (ROWS, SAMPLES, 2))),
-    )
     t, u, y = (np.asarray(a)[0] for a in (logs.data.t, logs.data.u, logs.data.y))
-    found = space["predict"](space["MODEL"], t, u, y, GIVEN, draws=draws)
+    found = space["predict"](space["MODEL"], t, u, y, GIVEN, draws=draws(fitted, SAMPLES, ROWS, key))
     assert found.mean.shape == (ROWS, 3)
     np.testing.assert_allclose(found.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(found.std, wanted.std[0], rtol=1e-6, atol=1e-6)

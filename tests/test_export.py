@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import csv_text
+from helpers import csv_text, draws
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
@@ -20,7 +20,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import AbstractEffect, catalogue
 from nnap_em.export import unroll
 from nnap_em.export.model import ExportError, parameters, predictor, stablehlo, write_model
-from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table, phi_samples
+from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table
 from nnap_em.fit.predict import posterior_of, predict
 from nnap_em.fit.store import save
 
@@ -95,15 +95,10 @@ def test_the_predictor_agrees_with_predict_where_there_is_no_jax(case, tmp_path)
     fitted, data = case
     key = jax.random.key(3)
     wanted = predict(fitted, data, GIVEN, key=key, samples=SAMPLES)
-    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
-    (key_one,) = jax.random.split(key_roll, 1)
-    key_start, key_noise = jax.random.split(key_one)
-    n = fitted.model.log_q.shape[0]
     np.savez(
         tmp_path / "log.npz",
         t=data.t[0], u=data.u[0], y=data.y[0], given=GIVEN,
-        deviations=phi_samples(fitted, SAMPLES, key=key_draw),
-        start=jax.random.normal(key_start, (SAMPLES, n)), noise=jax.random.normal(key_noise, (ROWS, SAMPLES, n)),
+        **dict(zip(("deviations", "start", "noise"), draws(fitted, SAMPLES, ROWS, key), strict=True)),
     )  # fmt: skip
     write_model(fitted, tmp_path)
     (tmp_path / "use.py").write_text(CODE)

@@ -313,6 +313,7 @@ def _other_data(out: Path, rig: Path) -> None:
     path.write_text("\n".join(lines[:-1]) + "\n")
 
 
+SMOOTHER = "resume with --smoother cubature"
 REFUSED = {
     "empty": (_cut(0.0), (), r"damaged or cut short \(0 bytes\)"),
     "truncated": (_cut(0.4), (), "damaged or cut short"),
@@ -323,17 +324,21 @@ REFUSED = {
     "rig": (_edit("rig.toml", "m = 1.0", "m = 1.1"), (), r"made from another rig\.toml; leave --resume out"),
     "data": (_other_data, (), "made from another training data; leave --resume out"),
     "seed": (lambda out, rig: None, ("--seed", "3"), "made with --seed 0, not 3; resume with --seed 0"),
+    "smoother": (lambda out, rig: None, ("--smoother", "ekf"), SMOOTHER),
+    "particles": (lambda out, rig: None, ("--smoother", "particle", "--particles", "9"), SMOOTHER),
 }
+OF_ALL = [name for name in REFUSED if REFUSED[name][2] != SMOOTHER]  # identify alone has a choice of smoothers
+RUNS = [*((IDENTIFY, name) for name in REFUSED), *((DIAGNOSE, name) for name in OF_ALL)]
 
 
-@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=["identify", "diagnose"])
-@pytest.mark.parametrize("change, options, reason", REFUSED.values(), ids=REFUSED)
-def test_what_is_no_state_of_this_run_is_refused(rig, stopped, tmp_path, capsys, command, change, options, reason):
-    out, copy = tmp_path / "out", tmp_path / "rig"
+@pytest.mark.parametrize("command, case", RUNS, ids=[f"{name}-{command[0]}" for command, name in RUNS])
+def test_what_is_no_state_of_this_run_is_refused(rig, stopped, tmp_path, capsys, command, case):
+    (change, options, reason), out, copy = REFUSED[case], tmp_path / "out", tmp_path / "rig"
     shutil.copytree(stopped[command[0]], out)
     shutil.copytree(rig, copy)
     change(out, copy)
     before = {path: path.read_bytes() for path in out.rglob("*.npz")}
+    assert before
     assert cli.main(_order(command, copy, out, "--resume", *options)) == 2
     assert re.search(rf"error: {_first(out)}: .*{reason}", _last_line(capsys.readouterr().err))
     assert {path: path.read_bytes() for path in out.rglob("*.npz")} == before
@@ -467,17 +472,3 @@ def test_sweeping_leaves_what_others_are_writing(tmp_path):
         (tmp_path / name).write_text("")
     sweep(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {names[os.getppid()], ".other.part", "model.npz"}
-
-
-def test_a_file_whose_disk_is_full_is_named(tmp_path, monkeypatch):
-    path = tmp_path / "a.txt"
-    files.replace_text(path, "old")
-
-    def full(_):
-        raise OSError("no room")
-
-    monkeypatch.setattr(files.os, "fsync", full)
-    with pytest.raises(OSError, match=r"no room.*a\.txt"):
-        files.replace_text(path, "new")
-    assert path.read_text() == "old"
-    assert len(list(tmp_path.iterdir())) == 1

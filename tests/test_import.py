@@ -1,14 +1,14 @@
 """Topics with clocks of their own on one grid: closed forms, round trips, gaps, delays; what cannot be is refused."""
 
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import pendulum_rig
-from recorders import JOINTS, MULTI, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
+from helpers import nnap, pendulum_rig
+from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
 
-from nnap_em.commands import cli
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
@@ -20,14 +20,7 @@ from nnap_em.systems import specs
 
 DT = 0.01
 RIG = pendulum_rig()
-COLUMNS = """
-[import]
-{more}
-[import.columns]
-theta1 = "/js:position[joint]"
-dtheta1 = "/js:velocity[joint]"
-u = "/cmd:data[0]"
-"""
+COLUMNS = "\n[import]\n{more}" + TOPICS
 
 
 def _rig(folder, more: str = "", text: str = RIG, columns: str = COLUMNS):
@@ -51,8 +44,7 @@ def _write(path, t, command_t, command, theta=_theta, joint: str = "joint", **op
     return write_mcap(path, topics, **options)
 
 
-def _import(*words):
-    return cli.main(["import", *map(str, words)])
+_import = functools.partial(nnap, "import")
 
 
 def _table(path):
@@ -293,7 +285,7 @@ def test_a_delay_is_reported_and_taken_out_as_asked_only(tmp_path, driven, capsy
 def test_what_was_simulated_comes_back_from_mcap(tmp_path, clock):
     """The acrobot of `simulate`, three sequences as recordings: the same CSV files to the last digit but one."""
     bench = tmp_path / "bench"
-    assert cli.main(["simulate", str(bench), "--sequences", "2", "--test", "1", "--steps", "150"]) == 0
+    assert nnap("simulate", bench, "--sequences", 2, "--test", 1, "--steps", 150) == 0
     text = (bench / "rig.toml").read_text().replace('"sequence"', f'"{clock}"')
     rig = read_rig(bench / "rig.toml", specs)
     (tmp_path / "rig.toml").write_text(text + "\n[import]\nshortest = 0.5\n")
@@ -356,7 +348,7 @@ def _said(old: str, new: str) -> dict[str, str]:
     return {"columns": COLUMNS.replace(old, new, 1)}
 
 
-REFUSED = {  # what is wrong with the rig's table, or with the log, and words of the message
+REFUSED = {  # what is wrong with the rig's table, with the log or the words of the command, and words of the message
     "unknown topic": (_said("/cmd:", "/cmmd:"), {}, ["column 'u'", "no topic '/cmmd'", "did you mean '/cmd'"]),
     "unknown field": (_said("data[0]", "dat"), {}, ["column 'u'", "no field 'dat'", "data[0]"]),
     "wrong index": (_said("data[0]", "data[3]"), {}, ["'data' of '/cmd' has 1 value", "count from 0 to 0"]),
@@ -371,15 +363,17 @@ REFUSED = {  # what is wrong with the rig's table, or with the log, and words of
     "no overlap": ({}, {"command_t": T + 100}, ["topics '/js' and '/cmd'", "no time in common", "--shift /cmd="]),
     "all NaN": ({}, {"command": _empty(T)}, ["column 'u'", "0 numbers in 300 messages", "[import.columns]"]),
     "dt too fine": ({"text": RIG.replace("0.01\ninput", "0.001\ninput")}, {}, ["is much finer", "write dt = 0.01"]),
+    "unknown shift": ({}, {"words": ("--shift", "/jss=1")}, ["--shift /jss: no topic of that name", "mean '/js'?"]),
     "too short": ({"more": "shortest = 100"}, {}, ["has 300 rows", "a sequence needs 10000"]),
 }
 
 
 @pytest.mark.parametrize("rig, log, words", REFUSED.values(), ids=REFUSED)
 def test_what_cannot_be_imported_is_refused_and_nothing_is_written(tmp_path, capsys, rig, log, words):
-    log = {"t": T, "command_t": T, "command": np.cos(T)} | log
+    log = {"t": T, "command_t": T, "command": np.cos(T), "words": ()} | log
+    options = log.pop("words")
     path = _write(tmp_path / "a.mcap", **log)
-    assert _import(path, "--rig", _rig(tmp_path, **rig), "--out", tmp_path / "out") == 2
+    assert _import(path, "--rig", _rig(tmp_path, **rig), "--out", tmp_path / "out", *options) == 2
     said = capsys.readouterr().err.strip().split("\n")[-1]
     assert any(str(tmp_path / name) in said for name in ("a.mcap", "rig.toml")) and ";" in said
     for word in words:
@@ -400,12 +394,6 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path, capsys):
     assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out") == 2
     assert "out: is there already; give a new folder, or empty this one" in capsys.readouterr().err
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
-
-
-def test_a_shift_of_an_unknown_topic_is_refused(tmp_path, capsys):
-    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--shift", "/jss=1") == 2
-    assert "--shift /jss: no topic of that name is used; did you mean '/js'?" in capsys.readouterr().err
 
 
 def test_a_name_that_stands_twice_is_asked_for(tmp_path, capsys):
@@ -473,8 +461,7 @@ def test_a_machine_from_a_file_is_imported_and_found_from_the_new_folder(tmp_pat
     header = ",".join(("time", *names))
     np.savetxt(tmp_path / "log.csv", rows, fmt="%.9g", delimiter=",", header=header, comments="")
     out = tmp_path / "deep" / "bench"
-    words = ("import", tmp_path / "log.csv", "--rig", tmp_path / "cartpole.toml", "--out", out, "--test", "0")
-    assert cli.main([str(word) for word in words]) == 0
+    assert _import(tmp_path / "log.csv", "--rig", tmp_path / "cartpole.toml", "--out", out, "--test", 0) == 0
     again = read_rig(out / "rig.toml", specs)
     one, other = unpacked(again.machine), unpacked(rig.machine)
     assert (Path(one.file).name, one._replace(file="")) == (other.file, other._replace(file=""))

@@ -81,15 +81,12 @@ def test_padding_and_what_is_too_small_to_matter():
     assert disturbances(left, NAMES, DT, np.asarray([5.0])) == ()
 
 
-def _data():
-    t = np.tile(DT * np.arange(301), (2, 1))
-    return Dataset(t, t[..., None], np.stack([t, -t], axis=-1), t < 9)
-
-
 @pytest.mark.parametrize("restart", [True, False])
 def test_a_recording_is_cut_at_a_touch(restart):
     """Rows of the touch and 0.1 s about it are in no sequence; all others are where their readings say."""
-    cut, pieces = without(_data(), (TOUCH,), DT, restart=restart)
+    t = np.tile(DT * np.arange(301), (2, 1))
+    data = Dataset(t, t[..., None], np.stack([t, -t], axis=-1), t < 9)
+    cut, pieces = without(data, (TOUCH,), DT, restart=restart)
     assert pieces == ((0, 1, 1) if restart else (0, 1))
     lengths = np.asarray(cut.valid).sum(axis=1).tolist()
     assert lengths == ([301, 110, 140] if restart else [301, 110])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
@@ -90,7 +91,7 @@ def _dense(p: _Problem, observed: np.ndarray, upto: int | None = None) -> _Dense
     for k, row in enumerate(transfer):
         for j, g in enumerate(row):
             big[k * n : (k + 1) * n, j * n : (j + 1) * n] = g
-    prior_cov = big @ _blocks(noise) @ big.T
+    prior_cov = big @ block_diag(*noise) @ big.T
     prior = np.concatenate(mean)
     seen = np.asarray(observed) & (np.arange(time) < (time if upto is None else upto))[:, None]
     c = np.kron(np.eye(time), np.asarray(p.model.c))[seen.ravel()]
@@ -100,14 +101,6 @@ def _dense(p: _Problem, observed: np.ndarray, upto: int | None = None) -> _Dense
     gain = np.linalg.solve(s, c @ prior_cov).T
     loglik = -0.5 * (e @ np.linalg.solve(s, e) + np.linalg.slogdet(s)[1] + len(e) * LOG_2PI) if len(e) else 0.0
     return _Dense(prior + gain @ e, prior_cov - gain @ c @ prior_cov, float(loglik))
-
-
-def _blocks(matrices) -> np.ndarray:
-    n = len(matrices[0])
-    out = np.zeros((len(matrices) * n,) * 2)
-    for k, m in enumerate(matrices):
-        out[k * n : (k + 1) * n, k * n : (k + 1) * n] = m
-    return out
 
 
 def _active(time: int) -> jax.Array:
@@ -126,25 +119,28 @@ def _run(p: _Problem, observed, active):
     return filtered, rts(filtered)
 
 
+def _close(a, b) -> None:
+    np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))
+
+
 def _check(p: _Problem, observed: np.ndarray):
     """All that the two passes give, to 1e-9 of its size: rounding times the condition of some hundred."""
     time, n = p.y.shape[0], p.start.mean.shape[0]
     filtered, smoothed = _run(p, jnp.asarray(observed), _active(time))
     dense = _dense(p, observed)
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))  # noqa: E731
-    close(filtered.loglik, dense.loglik)
+    _close(filtered.loglik, dense.loglik)
     cov = dense.cov.reshape(time, n, time, n)
-    close(smoothed.state.mean, dense.mean.reshape(time, n))
-    close(smoothed.state.cov, np.stack([cov[k, :, k] for k in range(time)]))
+    _close(smoothed.state.mean, dense.mean.reshape(time, n))
+    _close(smoothed.state.cov, np.stack([cov[k, :, k] for k in range(time)]))
     lag_one = np.einsum("kij,kjl->kil", smoothed.gain, smoothed.state.cov[1:])
-    close(lag_one, np.stack([cov[k, :, k + 1] for k in range(time - 1)]))
+    _close(lag_one, np.stack([cov[k, :, k + 1] for k in range(time - 1)]))
     for k in (0, time // 2, time - 1):
         before, after = _dense(p, observed, k), _dense(p, observed, k + 1)
         block = slice(k * n, (k + 1) * n)
-        close(filtered.predicted.mean[k], before.mean[block])
-        close(filtered.predicted.cov[k], before.cov[block, block])
-        close(filtered.state.mean[k], after.mean[block])
-        close(filtered.state.cov[k], after.cov[block, block])
+        _close(filtered.predicted.mean[k], before.mean[block])
+        _close(filtered.predicted.cov[k], before.cov[block, block])
+        _close(filtered.state.mean[k], after.mean[block])
+        _close(filtered.state.cov[k], after.cov[block, block])
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)
@@ -188,18 +184,17 @@ def test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings(r
     dense = [_dense(p, observed) for observed in patterns]
     cov = np.stack([d.cov.reshape(time, n, time, n) for d in dense])
     mean = np.stack([d.mean.reshape(time, n) for d in dense])
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))  # noqa: E731
-    close(paths.loglik, np.asarray([d.loglik for d in dense]))
-    close(paths.state.mean, mean)
-    close(paths.state.cov, np.einsum("pkikj->pkij", cov))
+    _close(paths.loglik, np.asarray([d.loglik for d in dense]))
+    _close(paths.state.mean, mean)
+    _close(paths.state.cov, np.einsum("pkikj->pkij", cov))
     pair = np.asarray(jnp.concatenate([paths.prev, paths.next], axis=-1))
-    close(pair.mean(axis=2), np.concatenate([mean[:, :-1], mean[:, 1:]], axis=-1))
+    _close(pair.mean(axis=2), np.concatenate([mean[:, :-1], mean[:, 1:]], axis=-1))
     away = pair - pair.mean(axis=2, keepdims=True)
     second = np.einsum("pkni,pknj->pkij", away, away) / pair.shape[2]
     blocks = [cov[:, k : k + 2, :, k : k + 2, :].reshape(-1, 2 * n, 2 * n) for k in range(time - 1)]
-    close(second, np.stack(blocks, axis=1))
+    _close(second, np.stack(blocks, axis=1))
     expected = paths.next - jnp.einsum("ij,pknj->pkni", p.model.a, paths.prev) - (p.u @ p.model.b.T)[:-1][None, :, None]
-    close(paths.kick, expected)
+    _close(paths.kick, expected)
 
 
 def test_rows_that_are_not_valid_are_not_read():

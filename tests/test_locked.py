@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import file_rig
+from helpers import file_rig, written_again
 from machines import arm
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import RigError, RigWarning, read_rig, write_rig
+from nnap_em.data.rig import RigError, RigWarning, read_rig
 from nnap_em.em.build import build_system
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.fit.identify import begin
@@ -231,8 +231,7 @@ def test_what_cannot_be_held_is_refused_with_the_line_to_add(machine, line, said
 def test_a_written_rig_holds_the_same_joints(tmp_path):
     path = _rig(tmp_path, GRIPPER, 'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }', measured="yaw")
     rig = read_rig(path, specs)
-    write_rig(rig, tmp_path / "again.toml")
-    assert read_rig(tmp_path / "again.toml", specs) == rig
+    assert written_again(rig, tmp_path) == rig
 
 
 def test_a_part_is_written_back_as_the_part(tmp_path):

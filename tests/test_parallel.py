@@ -1,20 +1,22 @@
 """Sequences over devices, groups and processes: the same numbers as one device gives."""
 
+import contextlib
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import nnap
 from shell import ENVIRONMENT
 
-from nnap_em.commands import cli
 from nnap_em.launch import free_address
 from nnap_em.numerics.parallel import all_devices, each, over
 
@@ -105,19 +107,20 @@ np.testing.assert_allclose(run(4), one, rtol=1e-9, atol=1e-9)
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("parallel") / "rig"
-    _nnap("simulate", "--system", "slide", "--sequences", "5", "--test", "1", "--steps", "40", str(folder))
+    assert nnap("simulate", "--system", "slide", "--sequences", 5, "--test", 1, "--steps", 40, folder) == 0
     shutil.rmtree(folder / "test")  # nothing to predict: it is the fit that is spread
     return folder
 
 
-def _nnap(*command: str) -> None:
-    """A command in this process, on its one device."""
-    assert cli.main(command) == 0
-
-
-def _launched(*order: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "nnap_em.launch", *order]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+@contextlib.contextmanager
+def _launched(*order: object, **options) -> Iterator[subprocess.Popen]:
+    """Processes of a command, which end at the end."""
+    options |= {"env": ENVIRONMENT, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    run = subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *map(str, order)], **options)
+    try:
+        yield run
+    finally:
+        run.kill()
 
 
 @pytest.mark.slow
@@ -135,7 +138,7 @@ def _numbers(out: Path) -> dict[str, np.ndarray]:
 def alone(rig) -> dict[str, np.ndarray]:
     """Numbers of the fit by one process."""
     out = rig.parent / "alone"
-    _nnap("identify", str(rig), "--epochs", "1", "--out", str(out), "--quiet")
+    assert nnap("identify", rig, "--epochs", 1, "--out", out, "--quiet") == 0
     return _numbers(out)
 
 
@@ -149,8 +152,8 @@ def _agree(out: Path, alone: dict[str, np.ndarray]) -> None:
 
 @pytest.mark.slow
 def test_processes_agree(rig, alone, tmp_path):
-    run = _launched("2", "identify", str(rig), "--epochs", "1", "--out", str(tmp_path / "out"))
-    _, said = run.communicate(timeout=300)
+    with _launched(2, "identify", rig, "--epochs", 1, "--out", tmp_path / "out") as run:
+        _, said = run.communicate(timeout=300)
     assert run.returncode == 0, said
     _agree(tmp_path / "out", alone)
 
@@ -165,13 +168,10 @@ def test_several_machines_need_to_know_their_share():
 @pytest.mark.slow
 def test_two_launchers_are_two_machines(rig, alone, tmp_path):
     place = ["--coordinator", free_address(), "--here", "1", "--first"]
-    order = ["identify", str(rig), "--epochs", "1", "--out"]
-    runs = [_launched(*place, str(i), "2", *order, str(tmp_path / str(i))) for i in range(2)]
-    try:
+    order = [2, "identify", rig, "--epochs", 1, "--out"]
+    with _launched(*place, 0, *order, tmp_path / "0") as one, _launched(*place, 1, *order, tmp_path / "1") as other:
+        runs = one, other
         said = [run.communicate(timeout=300)[1] for run in runs]
-    finally:
-        for run in runs:
-            run.kill()
     assert [run.returncode for run in runs] == [0, 0], said
     _agree(tmp_path / "0", alone)
     assert not (tmp_path / "1").exists()
@@ -187,16 +187,10 @@ def _after_the_first_step(run: subprocess.Popen, out: Path) -> None:
 @pytest.mark.slow
 def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
     out = tmp_path / "out"
-    order = [sys.executable, "-m", "nnap_em.launch", "2", "identify", str(rig), "--epochs", "500", "--out", str(out)]
-    run = subprocess.Popen(
-        order, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
-    )
-    try:
+    with _launched(2, "identify", rig, "--epochs", 500, "--out", out, start_new_session=True) as run:
         _after_the_first_step(run, out)
         os.killpg(run.pid, signal.SIGINT)  # as a terminal does
         _, said = run.communicate(timeout=60)
-    finally:
-        run.kill()
     assert run.returncode == 130
     assert "to go on: nnap-em identify" in said and "--resume" in said
 
@@ -204,15 +198,12 @@ def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
 @pytest.mark.slow
 def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, tmp_path, capsys):
     out = tmp_path / "out"
-    run = _launched("2", "identify", str(rig), "--epochs", "500", "--out", str(out))
-    try:
+    with _launched(2, "identify", rig, "--epochs", 500, "--out", out) as run:
         _after_the_first_step(run, out)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         os.kill(int(children[1]), signal.SIGKILL)
         _, said = run.communicate(timeout=60)
-    finally:
-        run.kill()
     assert run.returncode == 1
     assert "process 1 was killed by SIGKILL" in said and "--resume" in said
-    _nnap("identify", str(rig), "--resume", "--epochs", "3", "--out", str(out))
+    assert nnap("identify", rig, "--resume", "--epochs", 3, "--out", out) == 0
     assert "resumed with" in capsys.readouterr().err

@@ -56,18 +56,16 @@ class _Oscillator(AbstractModel):
         return x[:1]
 
 
-def _oscillator():
-    return _Oscillator(
+@functools.cache
+def _linear(steps=30):
+    """An oscillator, and one sequence of it with a gap, whose second half ends nowhere near a reading."""
+    model = _Oscillator(
         jnp.array([[0.98, 0.1], [-0.3, 0.9]]),
         jnp.array([0.0, 0.1]),
         Gaussian(jnp.array([1.0, 0.0]), jnp.array([[0.3, 0.1], [0.1, 0.5]])),
         2 * jnp.log(jnp.array([0.02, 0.1])),
         2 * jnp.log(jnp.array([0.1])),
     )
-
-
-def _linear_data(model, steps=30):
-    """One sequence with a gap; the second half of the gap ends nowhere near a reading."""
     rng = np.random.default_rng(3)
     u = np.sin(0.4 * np.arange(steps + 1))[:, None]
     x, y = np.array([1.3, -0.4]), []
@@ -76,7 +74,7 @@ def _linear_data(model, steps=30):
         x = np.asarray(model.matrix) @ x + np.asarray(model.drive) * u[k, 0] + [0.02, 0.1] * rng.standard_normal(2)
     y = np.array(y)
     y[[4, 12, 13, 14, 15]] = np.nan
-    return Dataset(*map(jnp.asarray, (0.1 * np.arange(steps + 1), u, y, np.ones(steps + 1, bool))))
+    return model, Dataset(*map(jnp.asarray, (0.1 * np.arange(steps + 1), u, y, np.ones(steps + 1, bool))))
 
 
 def _padded(seq, rows):
@@ -105,8 +103,8 @@ def _run_linear(model, seq, potentials, keys):
 @functools.cache
 def _linear_runs(proposal):
     """SEEDS independent runs: the exact answer, log-likelihoods, and the trajectories."""
-    model = _oscillator()
-    seq = prepare(model, _linear_data(model))
+    model, seq = _linear()
+    seq = prepare(model, seq)
     filtered, smoothed = _guide(2).path(model, seq)
     potentials = PROPOSALS[proposal](model, seq, filtered, smoothed)
     return model, filtered, smoothed, _run_linear(model, seq, potentials, jax.random.split(jax.random.key(5), SEEDS))
@@ -146,7 +144,7 @@ def test_likelihood_is_unbiased(proposal):
 def test_scores_of_the_trajectories_are_fishers(proposal):
     """Fisher's identity: the expected score of states and readings together is the gradient of log p(y)."""
     model, _, _, (_, _, paths) = _linear_runs(proposal)
-    seq = _linear_data(model)
+    _, seq = _linear()
     y, observed = fill_missing(seq.y)
 
     def loglik(log_q, log_r, push):
@@ -168,8 +166,7 @@ def test_scores_of_the_trajectories_are_fishers(proposal):
 
 def test_double_precision_gives_what_single_does():
     """The same law: means over 100 seeds of what both give, within the standard errors of their difference."""
-    model = _oscillator()
-    seq = _linear_data(model)
+    model, seq = _linear()
 
     @jax.jit
     def run(keys):
@@ -208,8 +205,7 @@ def _smooth(model, seq, key):
 
 
 def test_padding_changes_no_number():
-    model = _oscillator()
-    seq = _linear_data(model)
+    model, seq = _linear()
     short = _smooth(model, seq, key=jax.random.key(2))
     long = _smooth(model, _padded(seq, 7), key=jax.random.key(2))
     n = seq.y.shape[0]
@@ -222,8 +218,7 @@ def test_padding_changes_no_number():
 
 
 def test_one_key_one_result():
-    model = _oscillator()
-    seq = _linear_data(model)
+    model, seq = _linear()
     one, same, other = (_smooth(model, seq, key=jax.random.key(k)) for k in (7, 7, 8))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True))
     assert not np.array_equal(one.prev, other.prev)
@@ -262,9 +257,8 @@ def test_systematic_draws_are_unbiased():
 
 def test_weights_of_the_blind_filter_by_hand():
     """Every weight is the old one, or 1 / N after a resampling, times the density of the reading."""
-    model, n = _oscillator(), 40
-    seq = _linear_data(model)
-    rows = seq.t.shape[0]
+    model, seq = _linear()
+    n, rows = 40, seq.t.shape[0]
     blind = Potentials(jnp.zeros((rows, 2)), jnp.zeros((rows, 2, 2)), jnp.zeros((rows, 2)))
     run = eqx.filter_jit(lambda m, s, key: particle_filter(m, blind, s, num_particles=n, key=key, dtype=float))
     h = run(model, prepare(model, seq), jax.random.key(6))
@@ -384,8 +378,7 @@ def test_the_filtered_cloud_of_the_example_is_the_kalman_filters():
 
     4,000 particles are off by up to 0.11 standard deviations, 40,000 by 0.04: one over the root of their number.
     """
-    model = _oscillator()
-    seq = _linear_data(model)
+    model, seq = _linear()
     guide = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=0)
     mean, std = particle_cloud(ParticleSmoother(guide, Guided(), num_particles=40_000))(model, seq, jax.random.key(0))
     exact = guide.path(model, prepare(model, seq))[0].state

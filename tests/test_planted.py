@@ -93,6 +93,14 @@ def _unknown(tag: str, joint: int, **values: float):
     return tag, joint, values, _Force(tag, tuple(values.items()), joint=joint)
 
 
+def _recorded(*plants: tuple[Plant, dict]) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
+    """Torques and states, the log of them with these effects planted, and its inputs."""
+    u = _torques()
+    x = _motion(u)
+    written = planted_make.planted(_log(x, u), list(plants), BODY | FRICTION, DT)
+    return u, x, written, np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+
+
 def _wave(size: float, phase: float):
     """Sine and cosine part of a wave."""
     return a(size * np.cos(phase)), a(size * np.sin(phase))
@@ -142,10 +150,7 @@ def _tag(value) -> str:
 @pytest.mark.parametrize(("tag", "joint", "values", "effect"), FORCES, ids=_tag)
 def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effect):
     """Up to what the torque that is held over a step leaves: a hundredth of what the effect does."""
-    u = _torques()
-    x = _motion(u)
-    written = planted_make.planted(_log(x, u), [(Plant(tag, joint, None), values)], BODY | FRICTION, DT)
-    u = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    _, x, _, u = _recorded((Plant(tag, joint, None), values))
     lacking, right = _motion(u), _motion(u, (effect,))
     assert np.abs(lacking - x).max() > 0.05
     assert np.abs(right - x).max() < 0.01 * np.abs(lacking - x).max()
@@ -153,19 +158,14 @@ def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effec
 
 @pytest.mark.parametrize(("tag", "joint", "values", "effect"), DRIVES, ids=_tag)
 def test_a_drive_makes_the_real_torque_of_the_written_input(tag, joint, values, effect):
-    u = _torques()
-    x = _motion(u)
-    written = planted_make.planted(_log(x, u), [(Plant(tag, joint, None), values)], BODY | FRICTION, DT)
-    commanded = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    u, x, _, commanded = _recorded((Plant(tag, joint, None), values))
     assert np.abs(commanded - u).max() > 0.05
     np.testing.assert_allclose(_motion(commanded, (effect,)), x, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("tag", "channel", "values", "effect"), SENSORS, ids=_tag)
 def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
-    u = _torques()
-    x = _motion(u)
-    written = planted_make.planted(_log(x, u), [(Plant(tag, None, channel), values)], BODY | FRICTION, DT)
+    u, x, written, _ = _recorded((Plant(tag, None, channel), values))
     model = _model((effect,))
     cut = ROWS - len(written["time"])
     seq = Dataset(DT * jnp.arange(ROWS, dtype=float), jnp.asarray(u), jnp.asarray(x), jnp.ones(ROWS, bool))
@@ -181,12 +181,8 @@ def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
 
 def test_two_effects_together_move_as_the_recording():
     """The drive makes of the written input the real torque without the force."""
-    u = _torques()
-    x = _motion(u)
     (_, joint, spring, force), (_, driven, gain, drive) = FORCES[0], DRIVES[0]
-    both = [(Plant("gain", driven, None), gain), (Plant("spring", joint, None), spring)]
-    written = planted_make.planted(_log(x, u), both, BODY | FRICTION, DT)
-    u = np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    _, x, _, u = _recorded((Plant("gain", driven, None), gain), (Plant("spring", joint, None), spring))
     np.testing.assert_allclose(_motion(u, (force, drive)), x, rtol=0, atol=0.01 * np.abs(_motion(u) - x).max())
 
 

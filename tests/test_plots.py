@@ -6,6 +6,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import right_residual
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
@@ -30,25 +31,7 @@ def _names(dof: int) -> Names:
 
 
 def _residual(dof: int, seed: int = 0, **changes) -> Residual:
-    """What a right model would leave, of states that move."""
-    rng = np.random.default_rng(seed)
-    shape = (SEQUENCES, ROWS)
-    walk = 0.1 * np.cumsum(rng.normal(size=(*shape, 2 * dof)), axis=1)
-    force = rng.normal(size=(*shape, dof))
-    force[:, -1] = np.nan
-    return Residual(
-        innovation=rng.normal(size=(*shape, 2 * dof)),
-        force=force,
-        force_std=np.ones((*shape, dof)),
-        partial_force=force,
-        partial_force_std=np.ones((*shape, dof)),
-        state=walk,
-        predicted=walk,
-        u=np.sin(0.1 * np.arange(ROWS) + rng.uniform(0, 6, size=(SEQUENCES, 1)))[..., None],
-        t=np.tile(DT * np.arange(ROWS), (SEQUENCES, 1)),
-        valid=np.ones(shape, bool),
-        used=np.ones(SEQUENCES, bool),
-    )._replace(**changes)
+    return right_residual(seed, (SEQUENCES, ROWS), dof, 2 * dof, **changes)
 
 
 def _table(dof: int) -> FrictionTable:

@@ -32,8 +32,8 @@ FLOOR = 0.15
 MULTI = MultiStep()
 
 
-def _law(name: str, value: float = 1.0) -> AbstractEffect:
-    return catalogue[name](jnp.asarray(value), joint=1)
+def _law(name: str, value: float = 1.0, joint: int = 1) -> AbstractEffect:
+    return catalogue[name](jnp.asarray(value), joint=joint)
 
 
 def _spring() -> AbstractEffect:
@@ -84,13 +84,20 @@ def _run(
 
 
 @pytest.mark.parametrize(
-    ("share", "chance", "accepted"),
-    [(0.151, 0.0, True), (0.149, 0.0, False), (0.3, 0.149, True), (0.3, 0.151, False)],
+    ("law", "share", "chance", "accepted"),
+    [
+        (_law("motor_gain"), 0.151, 0.0, True),
+        (_law("motor_gain"), 0.149, 0.0, False),
+        (_law("motor_gain"), 0.3, 0.149, True),
+        (_law("motor_gain"), 0.3, 0.151, False),
+        (_function("x"), 0.251, 0.0, True),  # a law without a name has a higher bar
+        (_function("x"), 0.249, 0.0, False),
+    ],
 )
-def test_a_law_is_accepted_from_the_floor_and_from_twice_the_chance_level_on(monkeypatch, share, chance, accepted):
-    outcome, tried = _run(monkeypatch, [_screened(_law("motor_gain"), share, chance)])
+def test_a_law_is_accepted_from_the_floor_and_from_twice_the_chance_level_on(monkeypatch, law, share, chance, accepted):
+    outcome, tried = _run(monkeypatch, [_screened(law, share, chance)])
     assert (outcome.accepted is not None) == bool(tried) == accepted
-    assert outcome.step.accepted == (key_of(_law("motor_gain")) if accepted else None)
+    assert outcome.step.accepted == (key_of(law) if accepted else None)
 
 
 def test_the_smaller_of_both_shares_counts_where_the_parts_agree(monkeypatch):
@@ -99,18 +106,20 @@ def test_the_smaller_of_both_shares_counts_where_the_parts_agree(monkeypatch):
     assert not _run(monkeypatch, least)[1] and not _run(monkeypatch, split)[1]
 
 
-@pytest.mark.parametrize(("free", "tried"), [(0.55, "air_drag"), (0.56, "unknown_function")])
-def test_a_law_with_a_name_is_preferred_where_it_is_even_with_six_tenths_of_another(monkeypatch, free, tried):
-    outcome, _ = _run(monkeypatch, [_screened(_function("x"), free), _screened(_law("air_drag"), 0.3)])
-    assert outcome.accepted.effect.name == tried
-
-
-@pytest.mark.parametrize(("named", "accepted"), [(0.46, "torsional_spring"), (0.44, "unknown_function")])
+@pytest.mark.parametrize(
+    ("free", "law", "share", "accepted"),
+    [
+        (0.55, _law("air_drag"), 0.3, "air_drag"),  # one that it does not contain: where it is even with six tenths
+        (0.56, _law("air_drag"), 0.3, "unknown_function"),
+        (0.5, _spring(), 0.46, "torsional_spring"),
+        (0.5, _spring(), 0.44, "unknown_function"),
+    ],
+)
 def test_a_named_law_is_preferred_to_the_function_that_contains_it_where_it_reaches_nine_tenths(
-    monkeypatch, named, accepted
+    monkeypatch, free, law, share, accepted
 ):
     """The parts left out of both are the same, so that they differ by what they explain: a bump is no ripple."""
-    outcome, _ = _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), named)])
+    outcome, _ = _run(monkeypatch, [_screened(_function("x"), free), _screened(law, share)])
     assert outcome.accepted.effect.name == accepted
 
 
@@ -121,12 +130,6 @@ def test_a_refit_may_show_that_a_named_law_is_even_with_the_function_that_contai
     outcome, tried = _run(monkeypatch, entries, {"torsional_spring": error})
     assert set(tried) == {"torsional_spring", "unknown_function"} and outcome.accepted.effect.name == accepted
     assert _run(monkeypatch, [_screened(_function("x"), 0.5), _screened(_spring(), 0.26)])[1] == ["unknown_function"]
-
-
-@pytest.mark.parametrize(("share", "accepted"), [(0.251, True), (0.249, False)])
-def test_a_law_without_a_name_has_a_higher_bar(monkeypatch, share, accepted):
-    outcome, _ = _run(monkeypatch, [_screened(_function("x"), share)])
-    assert (outcome.accepted is not None) == accepted
 
 
 def test_a_function_of_fewer_signals_is_preferred_where_it_reaches_nine_tenths(monkeypatch):
@@ -304,30 +307,14 @@ def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it(monkey
     assert not _run(monkeypatch, [weak], members=members)[0].step.disputed
 
 
-def _periodic(joint: int) -> AbstractEffect:
-    """A law of time that is named, at a joint."""
-    return catalogue["motor_gain"](jnp.asarray(1.0), joint=joint)
-
-
 @pytest.mark.parametrize(("errors", "joint"), [((0.27, 0.35), 1), ((0.35, 0.27), 2)])
 def test_the_same_law_at_every_other_place_is_refitted_beside_the_one_that_leads(monkeypatch, errors, joint):
     """The screen gives the second joint less than nine tenths of the first: refits decide at which joint it is."""
-    entries = [_screened(_periodic(1), 0.60), _screened(_periodic(2), 0.53)]
+    entries = [_screened(_law("motor_gain", joint=1), 0.60), _screened(_law("motor_gain", joint=2), 0.53)]
     assert elsewhere(*(key_of(entry.candidate.start) for entry in entries))
     left = iter(errors)
-    outcome, tried = _run(monkeypatch, entries, _Left(left))
+    outcome, tried = _run(monkeypatch, entries, SimpleNamespace(get=lambda *_: next(left)))  # in the order of refits
     assert len(tried) == 2 and outcome.accepted.effect.joint == joint
-
-
-class _Left(dict):
-    """Errors after refits, in the order in which they are made."""
-
-    def __init__(self, left):
-        super().__init__(any=None)
-        self.left = left
-
-    def get(self, name, default=None):
-        return next(self.left)
 
 
 def test_a_law_is_not_dropped_for_a_function_that_loses_to_another_place(monkeypatch):

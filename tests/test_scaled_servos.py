@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PENDULUM, rig_text
+from helpers import PENDULUM, rig_text, written_again
 
 from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
-from nnap_em.data.rig import Declared, Rig, RigError, read_rig, write_rig
+from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system
 from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
 from nnap_em.fit.identifiability import identifiability
@@ -81,7 +81,7 @@ def test_declared_elsewhere_a_number_gives_the_same_motion(tmp_path):
 
 def test_scales_of_the_fit_are_those_of_the_gains_in_the_logs(tmp_path):
     """The size of the torque and the step of integration, against those of plain numbers."""
-    rig, data = _rig(tmp_path, KP), None
+    rig = _rig(tmp_path, KP)
     data = read_logs(_log(tmp_path), rig).data
     plain = _rig(tmp_path, f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}")
     bare, system = data._replace(u=data.u[..., :1]), build_system(rig)
@@ -102,8 +102,7 @@ def test_a_declaration_is_written_and_stored_as_it_is(tmp_path):
     assert (rig.scale_columns, rig.logged_inputs) == (("gain", "supply"), ("goal", "gain", "supply"))
     assert rig.parameters["goal.kp"] == Declared(3.0, 1.0)
     assert "goal.kp by gain and supply" in str(rig)
-    write_rig(rig, tmp_path / "rig.toml")
-    assert read_rig(tmp_path / "rig.toml", specs) == rig
+    assert written_again(rig, tmp_path) == rig
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
     assert again.rig == rig

@@ -44,6 +44,7 @@ RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.05,
 ACROBOT = declared_model(plant.Case(steps=20, hidden=False))
 AROUND = around(ACROBOT)
 MULTI = MultiStep()
+SMOOTHED = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
 
 
 def _law(name: str, value: float = 0.0):
@@ -198,10 +199,9 @@ def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypat
         tops.append(0.0 if epochs == 2 else 7.0)  # one epoch, which only judges the model as it is
         return _emstate(state.model, tops[-1])
 
-    smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
     monkeypatch.setattr(context_of, "fit", fit)
     monkeypatch.setattr(context_of, "_afresh", lambda *_: None)
-    monkeypatch.setattr(context_of, "smooth", lambda *_: (smoothed, np.ones(6, bool)))
+    monkeypatch.setattr(context_of, "smooth", lambda *_: (SMOOTHED, np.ones(6, bool)))
     monkeypatch.setattr(context_of, "followed", lambda *_: None)
     monkeypatch.setattr(context_of, "errors", lambda *_: None)
     monkeypatch.setattr(context_of, "ratio", lambda *_: worse)
@@ -211,35 +211,34 @@ def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypat
 def _pretend(monkeypatch, worth: dict[str, float], others=()):
     """Fits whose squared error is one, less what each law of theirs is worth; `others` come in the place of laws."""
     left = lambda model: 1 - sum(worth[name] for name in _names(model))  # noqa: E731
-    smoothed = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
-    fit_of = lambda _, hypothesis, __: (smoothed._replace(hypothesis=hypothesis), np.ones(6, bool))  # noqa: E731
-    refit_of = lambda hypothesis, *_: Refit(hypothesis.model, RULE, None, np.zeros(6), None)  # noqa: E731
+    fit_of = lambda _, hypothesis, __: (SMOOTHED._replace(hypothesis=hypothesis), np.ones(6, bool))  # noqa: E731
     for module in (search, backward):
         monkeypatch.setattr(module, "smooth", fit_of)
-    monkeypatch.setattr(backward, "null_of", lambda *arguments: Null(*2 * [refit_of(*arguments)]))
+    monkeypatch.setattr(backward, "null_of", lambda hypothesis, *_: Null(*2 * [_refit(hypothesis.model)]))
     monkeypatch.setattr(backward, "_in_place", lambda *_: iter(others))
     monkeypatch.setattr(MultiStep, "ratio", lambda self, null, full, *_: left(full.model) / left(null.model))
     monkeypatch.setattr(search, "extend", lambda context, hypothesis, length: _emstate(hypothesis.model, 1.0))
 
 
-@pytest.mark.parametrize("names", [("motor_gain", "dead_zone"), ("dead_zone", "motor_gain")])
-@pytest.mark.parametrize(("least", "stays"), [(0.04, False), (0.06, True)])
-def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, names, least, stays):
+@pytest.mark.parametrize(
+    ("worth", "hypothesis", "stay"),
+    [
+        ((0.5, 0.04), _with("motor_gain", "dead_zone"), ["motor_gain"]),
+        ((0.5, 0.04), _with("dead_zone", "motor_gain"), ["motor_gain"]),
+        ((0.5, 0.06), _with("motor_gain", "dead_zone"), ["motor_gain", "dead_zone"]),
+        ((0.5, 0.06), _with("dead_zone", "motor_gain"), ["dead_zone", "motor_gain"]),
+        ((0.01, 0.02), _with("motor_gain", "dead_zone"), []),
+        ((0.0, 0.5), BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5)), []),  # without meaning
+    ],
+)
+def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, worth, hypothesis, stay):
     """Of an error of 0.5, 0.09 of it, the least that counts, are 0.045; without either the other is worth more."""
-    _pretend(monkeypatch, {"motor_gain": 0.5, "dead_zone": least})
-    left = backward.backward(_context(), _with(*names))
-    assert set(_names(left.model)) == {"motor_gain"} | ({"dead_zone"} if stays else set())
+    _pretend(monkeypatch, dict(zip(("motor_gain", "dead_zone"), worth, strict=True)))
+    assert _names(backward.backward(_context(), hypothesis).model) == stay
 
 
-def test_both_of_two_laws_go_that_are_worth_nothing(monkeypatch):
-    _pretend(monkeypatch, {"motor_gain": 0.01, "dead_zone": 0.02})
-    assert backward.backward(_context(), _with("motor_gain", "dead_zone")).evidence == ()
-
-
-def test_a_law_whose_value_has_no_meaning_goes(monkeypatch):
-    _pretend(monkeypatch, {"dead_zone": 0.5})
-    hypothesis = BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5))
-    assert backward.backward(_context(), hypothesis).evidence == ()
+def _refit(model, top: float = 0.0) -> Refit:
+    return Refit(model, RULE, None, np.full(6, top), None)
 
 
 def _case(law, removed: float = 0.5) -> Trial:
@@ -425,48 +424,40 @@ def test_one_step_errors_come_last_and_where_noise_is_what_the_model_says(
 
 def test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings():
     """Five nats in each of four sequences of 18 readings; a sequence that one of both loses does not count."""
-    fit = SmoothedFit(BARE, BARE, None, DATA, np.array([1, 1, 1, 1, 1, 0], bool), 9)
-    null, full = (Refit(MODEL, RULE, None, np.full(6, top), None) for top in (10.0, 15.0))
+    fit = SMOOTHED._replace(used=np.array([1, 1, 1, 1, 1, 0], bool))
+    null, full = _refit(MODEL, 10.0), _refit(MODEL, 15.0)
     full.loglik[0] = np.nan
     assert readings(DATA, fit.used) == 90
     assert OneStep().ratio(null, full, fit, 0) == pytest.approx(1 - 2 * 20 / 72)
 
 
-@pytest.mark.parametrize(("worth", "name"), [(0.5, "air_drag"), (0.55, "air_drag"), (0.56, "dead_zone")])
-def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth, name):
+@pytest.mark.parametrize(
+    ("worth", "name", "same"),
+    [
+        (0.4, "air_drag", ("motor_gain",)),  # clearly less is no equivalent; one that was not fitted stays
+        (0.5, "air_drag", ("dead_zone", "motor_gain")),
+        (0.55, "air_drag", ("dead_zone", "motor_gain")),
+        (0.56, "dead_zone", ()),
+    ],
+)
+def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth, name, same):
     """A law that removes half of the error gives way to one that removes more than ten ninths of that."""
     law = _law("dead_zone", 1.0)
     other = _case(law, worth)._replace(after=BARE.plus(law, _candidate("dead_zone")))
-    other = other._replace(refit=Refit(other.after.model, RULE, None, np.zeros(6), None))
+    other = other._replace(refit=_refit(other.after.model))
     _pretend(monkeypatch, {"air_drag": 0.5, "dead_zone": worth}, [other])
     evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
     hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
     after = backward.backward(_context(), hypothesis)
     assert _names(after.model) == [name]
-    same = () if name == "dead_zone" else evidence.equivalent
-    assert after.evidence[0].equivalent == same
-
-
-def test_an_equivalent_that_explains_clearly_less_is_none(monkeypatch):
-    law = _law("dead_zone", 1.0)
-    other = _case(law)._replace(
-        refit=Refit(BARE.plus(law, _candidate("dead_zone")).model, RULE, None, np.zeros(6), None)
-    )
-    _pretend(monkeypatch, {"air_drag": 0.5, "dead_zone": 0.4}, [other])
-    evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
-    hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
-    after = backward.backward(_context(), hypothesis)
-    assert after.evidence[0].equivalent == (key_of(_law("motor_gain")),)  # one that was not fitted stays
+    assert after.evidence[0].equivalent == tuple(key_of(_law(each)) for each in same)
 
 
 def test_a_likelihood_pays_for_the_numbers_of_a_law_that_takes_a_place():
     """Six nats in all, less three for three numbers more, over five."""
-    fit = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
     models = [BARE.plus(law, Candidate(law, (law,), law)).model for law in (_law("motor_gain", 1.0), _spring())]
-    full, other = (
-        Refit(model, RULE, None, np.full(6, top), None) for model, top in zip(models, (1.0, 2.0), strict=True)
-    )
-    assert OneStep().lead(full, full, other, fit) == pytest.approx((6 - 3) / 5)
+    full, other = map(_refit, models, (1.0, 2.0))
+    assert OneStep().lead(full, full, other, SMOOTHED) == pytest.approx((6 - 3) / 5)
 
 
 def test_ratios_of_noise_are_held_at_those_of_the_first_model():

@@ -13,14 +13,14 @@ import mujoco
 import numpy as np
 import pytest
 from arm import JOINTS, declared, friction, machine, recorded
-from helpers import csv_text, file_rig, optimised, rig_text
+from helpers import csv_text, draws, file_rig, optimised, rig_text, written_again
 from machine_files import errors
 from machines import arm
 
 from nnap_em import identify
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import packed, unpacked
-from nnap_em.data.rig import RigError, read_rig, write_rig
+from nnap_em.data.rig import RigError, read_rig
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.local import local, readings_at
@@ -29,7 +29,7 @@ from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.export.model import parameters, predictor
-from nnap_em.fit.identify import begin, phi_samples
+from nnap_em.fit.identify import begin
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
 from nnap_em.import_.recording import Topic
@@ -224,8 +224,7 @@ def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
         == [system.unit(name) for name in columns]
         == ["rad", "rad/s", "m/s^2", "m"]
     )
-    write_rig(rig, tmp_path / "again.toml")
-    assert read_rig(tmp_path / "again.toml", specs) == rig
+    assert written_again(rig, tmp_path) == rig
     assert unpacked(packed(read := unpacked(rig.machine))) == read
 
 
@@ -312,14 +311,10 @@ def test_the_exported_predictor_agrees_with_predict(swung):
     fitted, data = swung
     key = jax.random.key(3)
     wanted = predict(fitted, data, 0.5, key=key, samples=20)
-    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
-    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
-    draws = phi_samples(fitted, 20, key=key_draw), jax.random.normal(key_start, (20, 2))
     space: dict = {"__name__": "predictor"}
     exec(predictor(fitted), space)
     one = (np.asarray(part[0]) for part in data[:3])
-    noise = np.asarray(jax.random.normal(key_noise, (90, 20, 2)))
-    prediction = space["predict"](space["MODEL"], *one, 0.5, draws=(*map(np.asarray, draws), noise))
+    prediction = space["predict"](space["MODEL"], *one, 0.5, draws=draws(fitted, 20, 90, key))
     np.testing.assert_allclose(prediction.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(prediction.std, wanted.std[0], rtol=1e-6, atol=1e-6)
     assert space["MODEL"].sensors == SEEN

@@ -120,9 +120,10 @@ SMOOTHERS = {
 
 @pytest.mark.parametrize("make", SMOOTHERS.values(), ids=SMOOTHERS)
 def test_a_stored_model_keeps_its_smoother(tmp_path, make):
+    """Its path may be a string."""
     fitted = begin(RIGS["arm"], _data(RIGS["arm"]), key=jax.random.key(5), smoother=make)
-    save(tmp_path / "model.npz", fitted)
-    loaded = load(tmp_path / "model.npz")
+    save(f"{tmp_path}/model.npz", fitted)
+    loaded = load(f"{tmp_path}/model.npz")
     assert _bits(loaded) == _bits(fitted)
     assert jax.tree.structure(loaded.smoother) == jax.tree.structure(fitted.smoother)  # statics, too
 
@@ -145,12 +146,6 @@ def test_a_smoother_from_elsewhere_is_stored_once_it_is_known(tmp_path, monkeypa
     monkeypatch.setitem(kinds, "_Own", _Own)
     save(tmp_path / "model.npz", fitted)
     assert isinstance(load(tmp_path / "model.npz").smoother, _Own)
-
-
-def test_a_path_may_be_a_string(tmp_path):
-    fitted = _fitted(next(iter(RIGS)))
-    save(f"{tmp_path}/model.npz", fitted)
-    assert _bits(load(f"{tmp_path}/model.npz")) == _bits(fitted)
 
 
 def test_settings_of_the_fit_are_kept(tmp_path):
@@ -200,10 +195,6 @@ def test_a_flipped_bit_changes_no_number_unnoticed(file):
         content[place] ^= 0x10
 
 
-def _other_npz(path: Path) -> None:
-    np.savez(path, x=np.zeros(3))
-
-
 def _other_header(path: Path) -> None:
     np.savez(path, header=np.frombuffer(b'{"kind": "notes"}', np.uint8))
 
@@ -211,7 +202,7 @@ def _other_header(path: Path) -> None:
 FOREIGN = {
     "empty": (lambda path: path.write_bytes(b""), "no model"),
     "text": (lambda path: path.write_text("time,u\n0,1\n"), "no model"),
-    "npz": (_other_npz, "no model"),
+    "npz": (lambda path: np.savez(path, x=np.zeros(3)), "no model"),
     "other npz with a header": (_other_header, "another program"),
     "pickle": (lambda path: path.write_bytes(pickle.dumps({"a": 1})), "no model"),
     "folder": (lambda path: path.mkdir(), "cannot be read"),

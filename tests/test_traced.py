@@ -19,6 +19,8 @@ from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
 from nnap_em.smoother.start import StartBank
 from nnap_em.storage.cache import Cache
 
+EXTENDED = ExtendedKalmanSmoother(StartBank((1, 1)))
+
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
@@ -64,7 +66,7 @@ def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
 
 @pytest.mark.parametrize("other", ["smoother", "constant", "shape", "type"])
 def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
-    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
+    smoother, (model, data) = EXTENDED, work
     _smoothed(work, smoother, monkeypatch)
     if other == "smoother":
         smoother = CubatureSmoother(smoother.bank)
@@ -82,19 +84,18 @@ def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
 
 
 def test_other_numbers_are_no_other_program(cache, work, monkeypatch):
-    smoother, (model, data) = ExtendedKalmanSmoother(StartBank((1, 1))), work
-    first = _smoothed(work, smoother, monkeypatch)
+    model, data = work
+    first = _smoothed(work, EXTENDED, monkeypatch)
     heavier = dataclasses.replace(model, log_q=model.log_q + 1.0)
-    second = _smoothed((heavier, data), smoother, monkeypatch)
+    second = _smoothed((heavier, data), EXTENDED, monkeypatch)
     assert len(_kept(cache)) == 1
     assert np.abs(np.asarray(first.state.cov - second.state.cov)).max() > 0
 
 
 def test_another_text_of_the_package_makes_another(cache, work, monkeypatch):
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
-    _smoothed(work, smoother, monkeypatch)
+    _smoothed(work, EXTENDED, monkeypatch)
     monkeypatch.setattr(traced, "_surroundings", lambda: "after an edit")
-    _smoothed(work, smoother, monkeypatch)
+    _smoothed(work, EXTENDED, monkeypatch)
     assert len(_kept(cache)) == 2
 
 
@@ -144,12 +145,11 @@ def test_a_closure_is_told_by_nothing():
 
 
 def test_what_is_damaged_is_made_anew(cache, work, monkeypatch):
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
-    first = _smoothed(work, smoother, monkeypatch)
+    first = _smoothed(work, EXTENDED, monkeypatch)
     (name,) = _kept(cache)
     whole = (cache.folder / name).read_bytes()
     (cache.folder / name).write_bytes(whole[: len(whole) // 2])
-    again = _smoothed(work, smoother, monkeypatch)
+    again = _smoothed(work, EXTENDED, monkeypatch)
     np.testing.assert_array_equal(first.state.mean, again.state.mean)
     assert len((cache.folder / name).read_bytes()) == len(whole)
 
@@ -166,8 +166,7 @@ class _Opened:
 
 def test_an_entry_is_data_and_runs_nothing(cache, work, monkeypatch, tmp_path):
     """Neither a pickle nor the name of a function in the place of a program."""
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
-    _smoothed(work, smoother, monkeypatch)
+    _smoothed(work, EXTENDED, monkeypatch)
     (name,) = _kept(cache)
     whole, mark = (cache.folder / name).read_bytes(), tmp_path / "mark"
     form, _, program = whole.partition(b"\n")
@@ -194,8 +193,7 @@ def test_a_shelf_that_cannot_be_written_is_none(work, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(traced._Programs, "cache", Cache(tmp_path / "file"))
     monkeypatch.setattr(traced._Programs, "ready", {})
-    smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
-    assert np.isfinite(np.asarray(_smoothed(work, smoother, monkeypatch).state.mean)).all()
+    assert np.isfinite(np.asarray(_smoothed(work, EXTENDED, monkeypatch).state.mean)).all()
 
 
 def test_what_a_killed_process_left_half_written_goes(tmp_path):

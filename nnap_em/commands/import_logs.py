@@ -22,7 +22,7 @@ from ..data.rig import read_rig, toml_text
 from ..em.build import build_system
 from ..import_.declared import read_plan
 from ..import_.folder import completed, places, write_sequences
-from ..import_.resample import Resampled, resample
+from ..import_.resample import resample
 from ..numerics.digits import counted
 from ..report.imported import describe, write_page
 from ..storage.files import replace_text, whole_folder
@@ -40,7 +40,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
         logs = []
         for path in args.logs:
             logs.append(resample(path, rig, build_system(rig).states, plan, shifts, args.unwrap))
-            log(f"{path}: {_summary(logs[-1])}")
+            used = [stretch.rows for stretch in logs[-1].sequences if not stretch.why]
+            log(f"{path}: {counted(len(used), 'sequence')}, {sum(used)} of {logs[-1].rows} rows")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
         text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
@@ -61,8 +62,3 @@ def _reaching(text: str, folder: Path, out: Path) -> str:
         return text
     path = toml_text(os.path.relpath(folder / file, out))
     return re.sub(r"(?m)^(\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda match: match[1] + path, text, count=1)
-
-
-def _summary(log: Resampled) -> str:
-    used = [stretch for stretch in log.sequences if not stretch.why]
-    return f"{counted(len(used), 'sequence')}, {sum(stretch.rows for stretch in used)} of {log.rows} rows"

@@ -61,7 +61,8 @@ def run(args: argparse.Namespace, log: Log) -> int:
             row = {"file": path.name, "sha256": mark} | _row(fitted, beside, candidates, rig, path, args.trust_readings)
             log(f"{path.name}: {row['reason'] or 'errors {:.2f} times those of the fit'.format(row['ratio'])}")
         rows.append(row)
-    judged = [None if row["reason"] else _judged(row) for row in rows]
+    arrays = lambda row: (np.asarray(row["estimate"]), np.asarray(row["cov"]))  # noqa: E731
+    judged = [None if row["reason"] else Judged(row["level"], *arrays(row)) for row in rows]
     seen = trend(beside, judged, args.rate)
     document: dict[str, Any] = {"fit": str(file), "sha256": digest, "rate": args.rate, "recordings": rows}
     if seen.alarm is not None:
@@ -110,10 +111,6 @@ def _broken(rig: Rig, logs: Logs) -> str:
     data = type(logs.data)(*(np.asarray(part) for part in logs.data))
     results = torques(rig, system, data, measure_scales(rig, system, data))
     return "; ".join(result.text for result in results if result.mark == ERROR)
-
-
-def _judged(row: dict[str, Any]) -> Judged:
-    return Judged(row["level"], np.asarray(row["estimate"]), np.asarray(row["cov"]))
 
 
 def _kept(path: Path, digest: str) -> list[dict[str, Any]]:

@@ -375,7 +375,7 @@ def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) 
 
 def _numbers(fits: Sequence[Fit]) -> Iterator[Number]:
     """The estimated parameters of the machine and of effects."""
-    tables = [{**_parameters(fit.fitted), **_effects(fit.fitted)} for fit in fits]
+    tables = [_estimates(fit.fitted) for fit in fits]
     periodic = "phase of"  # beginning of parameters of effects that are the same after a whole turn [rad]
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
@@ -388,16 +388,11 @@ def _numbers(fits: Sequence[Fit]) -> Iterator[Number]:
         yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
 
 
-def _parameters(fitted: Identified) -> dict[str, Estimate]:
-    """The estimated parameters of the machine."""
-    return {name: Estimate(*pair, fitted.rig.unit(name)) for name, pair in parameter_table(fitted).items()}
-
-
-def _effects(fitted: Identified) -> dict[str, Estimate]:
-    """The reported parameters of effects."""
+def _estimates(fitted: Identified) -> dict[str, Estimate]:
+    """The estimated parameters of the machine, and the reported ones of effects."""
     model = fitted.model
     pairs = zip(model.effects, covariances(model, fitted.m_step, fitted.state.hessian), strict=True)
-    return {
+    return {name: Estimate(*pair, fitted.rig.unit(name)) for name, pair in parameter_table(fitted).items()} | {
         f"{name} of {words(key_of(effect))}": estimate
         for effect, cov in pairs
         for name, estimate in estimates(effect, cov, model.system).items()

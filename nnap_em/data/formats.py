@@ -85,14 +85,11 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " 
     if len({values.shape for values in table.values()}) != 1 or np.isinf([*table.values()]).any():
         shapes = {name: values.shape for name, values in table.items()}
         raise DataError(f"{path}: columns {shapes}; write finite columns (NaN = missing) of one length")
-    line = ",".join([_digits(name, values) for name, values in table.items()])
+    # 12 digits, or all where a clock runs on from so long ago that samples would fall together
+    late = {name for name, values in table.items() if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4}
+    line = ",".join(["%r" if name in late else "%.12g" for name in table])
     body = "\n".join([line % row for row in zip(*(values.tolist() for values in table.values()), strict=True)])
     replace_text(path, f"{','.join(table)}\n{body.replace('nan', '')}\n")
-
-
-def _digits(name: str, values: Float[np.ndarray, " time"]) -> str:
-    """12 digits, or all where a clock runs on from so long ago that samples would fall together."""
-    return "%r" if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4 else "%.12g"
 
 
 def header_hint(path: Path) -> str | None:

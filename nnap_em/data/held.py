@@ -17,7 +17,8 @@ def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:
     An encoder that moves slowly repeats readings too, but its steps are single ones, and the faster it moves, the fewer
     rows lie between them.  `signals` are the column in some logs of one machine.
     """
-    changes = [_changes(y) for y in signals]
+    steps = [np.abs(np.diff(y[np.isfinite(y)])) for y in signals]
+    changes = [(np.flatnonzero(size), size[size > 0]) for size in steps]  # readings that are new, and by how much
     sizes = np.concatenate([size for _, size in changes]) if changes else np.zeros(0)
     if not sizes.size:
         return 1.0
@@ -41,9 +42,3 @@ def repeats(y: Float[np.ndarray, " time"], rows: float) -> Int[np.ndarray, " row
     part = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     new = np.repeat(first, count) + np.round(part * np.repeat((end - first) / count, count)).astype(int)
     return np.delete(k, new)
-
-
-def _changes(y: Float[np.ndarray, " time"]) -> tuple[Int[np.ndarray, " change"], Float[np.ndarray, " change"]]:
-    """Numbers of the readings that are new, and how far they are from the last."""
-    size = np.abs(np.diff(y[np.isfinite(y)]))
-    return np.flatnonzero(size), size[size > 0]

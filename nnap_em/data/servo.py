@@ -74,7 +74,9 @@ def _drive(table: Any, column: str, of_file: Drive) -> Drive:
     kind = _kind(section) or _kind(table) or of_file.kind
     for key in section.items:
         if key != "kind" and key not in KINDS[kind]:
-            section.refuse(key, f"an input of kind {kind!r} has no {key}", _possible(kind))
+            keys = ", ".join(KINDS[kind])
+            hint = f"possible are {keys}" if keys else f"write {_LINE} if it is the command of a servo"
+            section.refuse(key, f"an input of kind {kind!r} has no {key}", hint)
     numbers, scales = dict(of_file.numbers) if of_file.kind == kind else {}, {}
     for place in (table, section):
         for key in KINDS[kind]:
@@ -104,11 +106,6 @@ def _refuse_unknown(table: Any, columns: Collection[str]) -> None:
 
 def _kind(table: Any) -> str | None:
     return table.choice("kind", KINDS) if "kind" in table.items else None
-
-
-def _possible(kind: str) -> str:
-    keys = ", ".join(KINDS[kind])
-    return f"possible are {keys}" if keys else f"write {_LINE} if it is the command of a servo"
 
 
 def _number(table: Any, key: str, about: Key) -> Any:

@@ -93,8 +93,6 @@ def _scene(base: StateSpaceModel, numbers: OperatingPoint) -> OperatingPoint:
 COLUMNS_AT_ONCE = 1024
 """Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm; machines of two joints
 have fewer in all."""
-BUNCH = 4
-"""Stacks are filled up to a multiple of this, so that one more probe is no other program."""
 
 
 class Stack(NamedTuple):
@@ -124,7 +122,8 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     constants = [bool((a == a[0]).all()) for a in stacked]
     if all(constants):  # one probe, or one given twice
         constants = [False] * len(constants)
-    pad = lambda a: np.pad(a, [(0, -len(a) % BUNCH)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
+    bunch = 4  # stacks are filled up to a multiple of this, so that one more probe is no other program
+    pad = lambda a: np.pad(a, [(0, -len(a) % bunch)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
     leaves = [np.asarray(a[0]) if constant else pad(a) for a, constant in zip(stacked, constants, strict=True)]
     axes = [None if constant else 0 for constant in constants]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))

@@ -31,8 +31,6 @@ Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 
 SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
-LOOSER = 3.0
-"""Increase of the log of the process noise where sequences diverge: a looser filter follows them."""
 
 
 class Effort(NamedTuple):
@@ -141,7 +139,9 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
             fits.append(start())
         except FitError as error:
             failure = error
-        if fits and not _loses(fits, before.state) and (len(fits) > 1 or not afresh):
+        followed = np.isfinite(before.state.top).sum()
+        loses = all(np.isfinite(state.top).sum() < followed for state in fits)
+        if fits and not loses and (len(fits) > 1 or not afresh):
             break
     if not fits:
         raise failure
@@ -153,15 +153,10 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
     return state
 
 
-def _loses(fits: Sequence[EMState], before: EMState) -> bool:
-    """True where sequences that another model follows diverge in all fits."""
-    return all(np.isfinite(state.top).sum() < np.isfinite(before.top).sum() for state in fits)
-
-
 def _looser(hypothesis: Hypothesis, fits: Sequence[EMState]) -> StateSpaceModel:
-    """The last model that was fitted, or the hypothesis, with more noise of the process."""
+    """The last model that was fitted, or the hypothesis, with more noise of the process: a looser filter follows."""
     model = cast(StateSpaceModel, fits[-1].best) if fits else hypothesis.model
-    return eqx.tree_at(lambda m: m.log_q, model, model.log_q + LOOSER)
+    return eqx.tree_at(lambda m: m.log_q, model, model.log_q + 3.0)
 
 
 def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMState] | None:

@@ -241,18 +241,15 @@ def disputes(diagnosis: Diagnosis, files: Sequence[str], most: int = 3) -> list[
     for dispute in [disputed for step in diagnosis.last for disputed in step.disputed][:most]:
         against = list(dict.fromkeys(files[diagnosis.pieces[i] if diagnosis.pieces else i] for i in dispute.against))
         share = share_of(dispute.share, "the prediction error")
+        harm = dispute.harm
+        more = f"{harm:.0%} more error" if harm <= 1 else f"{number(1 + harm)} times the error"
         text = (
             f"{words(dispute.key)} would remove {share}, but {listed(against)} "
-            f"{'shows' if len(against) == 1 else 'show'} the opposite ({_more(dispute.harm)})"
+            f"{'shows' if len(against) == 1 else 'show'} the opposite (up to {more})"
         )
         place, share = place_of(dispute.key), dispute.share
-        out.append(Dispute(**place, share_of_error=share, files=against, harm=dispute.harm, description=text))
+        out.append(Dispute(**place, share_of_error=share, files=against, harm=harm, description=text))
     return out
-
-
-def _more(harm: float) -> str:
-    """Rise of an error by that share of it."""
-    return f"up to {harm:.0%} more error" if harm <= 1 else f"up to {number(1 + harm)} times the error"
 
 
 class SuspectReport(NamedTuple):

@@ -37,10 +37,6 @@ VIEW, OTHERS = 0.5, 10
 """The same two numbers for a comparison by the signals of one joint alone."""
 REPEATED = 0.5
 """Share of a force from which on, as the mean of its neighbours, it is a law of the machine."""
-NEIGHBOUR_TIME = 1.0
-"""Time between two moments of a recording from which on they are neighbours of each other [s]."""
-EDGE_SHARE = 0.25
-"""Share of its peak at which a disturbance begins and ends."""
 
 
 class Intervention(NamedTuple):
@@ -189,7 +185,8 @@ def disturbances(
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
     force = np.where(known[..., None], residual.force, np.nan)
     force[:, 0] = np.nan  # no reading before it fixes the start
-    samples, separation = places(residual._replace(valid=known), names, dt), max(1, round(NEIGHBOUR_TIME / dt))
+    apart = 1.0  # time between two moments of a recording from which on they are neighbours of each other [s]
+    samples, separation = places(residual._replace(valid=known), names, dt), max(1, round(apart / dt))
     if not samples.seq.size:
         return ()
     place, counts = neighbours(samples, separation)
@@ -241,8 +238,8 @@ def _sure(mean, std, samples: Places, place, counts) -> Float[np.ndarray, " plac
 
 
 def _extent(mean: Float[np.ndarray, " time"], row: int, sign: float) -> tuple[int, int]:
-    """First and last row about `row` at which the force is more than a share of its peak."""
-    small = ~(sign * mean > EDGE_SHARE * sign * mean[row])
+    """First and last row about `row` at which the force is more than a quarter of its peak."""
+    small = ~(sign * mean > 0.25 * sign * mean[row])
     before, after = np.flatnonzero(small[:row]), np.flatnonzero(small[row:])
     return int(before[-1] + 1) if before.size else 0, int(row + max(after[0] - 1, 0)) if after.size else mean.size - 1
 

@@ -18,8 +18,6 @@ from .smoothed import SmoothedFit, extended
 
 STARTS = 3
 """Places from which a law is fitted; one that is not linear, from all that there are."""
-PASSES = 10
-"""Passes of a fit from one of them, more than in a search: rivals are compared closely."""
 
 
 def proposals_for(fitted: Identified, data: Dataset) -> list[AbstractEffect]:
@@ -44,7 +42,8 @@ def with_rival(
     for entry in (s for n, s in enumerate(screened) if n < STARTS or not s.candidate.start.linear):
         full = fit.hypothesis.plus(seeded(entry.candidate, entry.coefficients), entry.candidate)
         path = extended(full.model, fit.path, fit.data)
-        trials.append(refit(full.model, full.m_step, path, fit.data, fit.used, passes=PASSES))
+        passes = 10  # more than in a search: rivals are compared closely
+        trials.append(refit(full.model, full.m_step, path, fit.data, fit.used, passes=passes))
     return _with(fitted, max(trials, key=lambda trial: float(np.nansum(trial.loglik)))) if trials else None
 
 

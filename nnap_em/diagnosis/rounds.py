@@ -21,9 +21,6 @@ from .verdict import EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, re
 
 _Law = TypeVar("_Law", Screened, Trial)
 
-SUSPECTS = 4
-"""Suspects that are listed: the right law was the fourth on a real arm with three recordings."""
-
 
 class Round(NamedTuple):
     """Outcome of a screening round."""
@@ -210,8 +207,9 @@ def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
     """
     near = [s for s in ranked if _listed(s) >= NAMED * max(map(_listed, ranked))]
     near.sort(key=lambda s: not s.candidate.start.named)
-    over = (s for s in near if suspected(_listed(s), s.floor, s.chance))
-    return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over)[:SUSPECTS]
+    over = [s for s in near if suspected(_listed(s), s.floor, s.chance)]
+    listed = 4  # the right law was the fourth on a real arm with three recordings
+    return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over[:listed])
 
 
 def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:

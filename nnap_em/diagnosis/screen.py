@@ -26,8 +26,6 @@ from .verdict import CHANCE, Share, agreed, required, sensible
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
-SHIFTABLE = 4
-"""Weighted moments of a sequence below which it takes no part in a placebo."""
 
 
 class Rows(NamedTuple):
@@ -145,8 +143,8 @@ def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> 
     columns = linearised.columns.copy()
     for weight, sequence in zip(linearised.weight, columns, strict=True):
         at = np.flatnonzero((weight > 0).any(axis=1))
-        if len(at) < SHIFTABLE:
-            sequence[..., nuisance:] = 0.0  # too few to lose their meaning: they take no part
+        if len(at) < 4:  # too few weighted moments to lose their meaning: they take no part
+            sequence[..., nuisance:] = 0.0
             continue
         by = rng.integers(len(at) // 4, 3 * len(at) // 4 + 1)
         moved = np.roll(sequence[at][..., nuisance:], by, axis=0)

@@ -119,7 +119,9 @@ class UnknownFunction(JointEffect):
         states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
         pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
-        near = {j: _signals_near(system, j) for j in around.joints}
+        # states of a joint and of those next to it: what a force at it may be a function of
+        pairs_of = dict(enumerate(zip(system.coordinates, system.rates, strict=True), 1))
+        near = {j: {name for other in system.neighbours(j) for name in pairs_of[other]} for j in around.joints}
         places = [(j, grid) for j in around.joints for grid in grids]
         rates = [] if around.moved is None else [(j, system.rates[j - 1]) for j in around.joints]
         friction = [_function(j, (axes[rate,](20),), around) for j, rate in rates if (rate,) in axes]
@@ -176,12 +178,6 @@ class UnknownFunction(JointEffect):
         return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std, basis)
 
 
-def _signals_near(system: AbstractSystem, joint: int) -> set[str]:
-    """States of a joint and of those next to it: what a force at it may be a function of."""
-    places = [j - 1 for j in system.neighbours(joint)]
-    return {names[i] for names in (system.coordinates, system.rates) for i in places}
-
-
 def free_form(effect: AbstractEffect, around: SearchScales) -> list[Candidate]:
     """The unknown functions of the same signals at the same joint: what `effect` would be, were its form not known."""
     axes = _axes(around)
@@ -205,7 +201,9 @@ def _axes(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], Abstrac
     system = around.system
     ranges = {}
     for i, (q, v) in enumerate(zip(system.coordinates, system.rates, strict=True)):
-        ranges[q,] = _range(float(around.low[i]), float(around.high[i]), system.angles[i])
+        low, high = float(around.low[i]), float(around.high[i])
+        margin, round_ = 0.02 * (high - low), system.angles[i] and high - low > 5.0  # it goes round: a whole turn
+        ranges[q,] = (-np.pi, np.pi, True) if round_ else (low - margin, high + margin, False)
         ranges[v,] = (-0.7 * float(around.speed[i]), 0.7 * float(around.speed[i]), False)
     for n in range(2, len(system.coordinates) + 1):  # the angle of a link in the world
         if all(system.angles[:n]):
@@ -216,9 +214,3 @@ def _axes(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], Abstrac
         for j, size in around.driven
     }
     return {**states, **inputs, ("time",): partial(Axis, ("time",), around.duration[0], around.ending, False)}
-
-
-def _range(low: float, high: float, angle: bool) -> tuple[float, float, bool]:
-    """The range of a coordinate; once it goes round, a whole turn."""
-    margin = 0.02 * (high - low)
-    return (-np.pi, np.pi, True) if angle and high - low > 5.0 else (low - margin, high + margin, False)

@@ -102,7 +102,8 @@ def design(
     fits = [(known(pair.one), known(pair.other)) for pair in rivals]
     pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
     discrimination = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
-    visited = _rates(path[np.asarray(data.valid) & used[:, None]], fit)
+    dof, followed = fit.nodes.shape[0], np.asarray(data.valid) & used[:, None] & np.isfinite(path).all(axis=-1)
+    visited = path[followed][:, dof : 2 * dof]
     slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
     slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
     friction = _friction(fit, visited, slow)
@@ -176,12 +177,6 @@ def _criterion(
     if discrimination is not None:
         criteria["discriminate"] = discrimination
     return Several(tuple(criteria.values())) if name == "all" else (criteria | singles)[name]
-
-
-def _rates(rows: Float[np.ndarray, "row state"], fit: Fit) -> Float[np.ndarray, "row dof"]:
-    """Velocities that were visited."""
-    dof = fit.nodes.shape[0]
-    return rows[np.isfinite(rows).all(axis=-1), dof : 2 * dof]
 
 
 def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:

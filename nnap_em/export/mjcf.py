@@ -161,7 +161,8 @@ def _opened(
     spec, machine = mujoco().MjSpec.from_string(fitted.rig.file), system.machine
     simulated = compiled(Path(machine.file), spec)
     _bodies(simulated, system)
-    mobility, bristles = _mobility(system), {}
+    still = jnp.asarray([joint.zero for joint in machine.joints], float)
+    mobility, bristles = np.diagonal(np.linalg.inv(np.asarray(system.mass(still)))), {}
     for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
         bristles |= _bristle(j, form, model, 1 / mobility[j])
         simulated.dof_armature[j] = float(system.values.get(f"{joint.name}.armature", joint.armature))
@@ -218,11 +219,6 @@ def _longest_step(forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]
 def _level(form: FrictionForm) -> float:
     """Coulomb torque of a bristle, which may not vanish."""
     return max(form.coulomb, 1e-2 * form.breakaway)
-
-
-def _mobility(system: Tree) -> Float[np.ndarray, " dof"]:
-    still = jnp.asarray([joint.zero for joint in system.machine.joints], float)
-    return np.diagonal(np.linalg.inv(np.asarray(system.mass(still))))
 
 
 def _springs(file: OpenFile) -> None:

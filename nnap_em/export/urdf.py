@@ -9,7 +9,6 @@ import numpy as np
 from .. import __version__
 from ..data.machine import Joint
 from ..fit.identify import Identified
-from ..model.servo import Servo
 from ..storage.files import replace_text
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
@@ -36,7 +35,9 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
     out = Path(out)
     system = as_it_is(fitted, fitted.model)
     forms = friction_forms(fitted)
-    left = [_of_servo(servo) for servo in fitted.model.servos or () if servo.feeds_back]
+    numbers_of = lambda servo: ", ".join(f"{key} = {float(value):.4g}" for key, value in servo.values.items())  # noqa: E731
+    servos = [servo for servo in fitted.model.servos or () if servo.feeds_back]
+    left = [f"the {servo.kind} servo of {servo.column}: {numbers_of(servo)}" for servo in servos]
     # Laws that URDF holds, by name: in the numbers of the bodies and in the damping
     laws = ("payload", "link_inertia", "link_length", "center_of_mass", "motor_back_emf")
     left += [named(effect) for effect in fitted.model.effects if effect.name not in laws]
@@ -44,7 +45,8 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
         form_misses = form._replace(breakaway=form.coulomb, offset=0.0) != form or form.missed > REPORTED_MISS
         left += [f"friction of {joint.name} beside Coulomb and viscous"] if form_misses else []
         left += [f"the spring of {joint.name}"] if joint.stiffness else []
-        left += [f"the armature of {joint.name}"] if _armature(system, joint) else []
+        armature = float(system.values.get(f"{joint.name}.armature", joint.armature))
+        left += [f"the armature of {joint.name}"] if armature else []
     root = ET.Element("robot", name=Path(system.machine.file).stem)
     root.append(
         ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} ")
@@ -71,18 +73,9 @@ def _joints(fitted: Identified, forms: list[FrictionForm]) -> list[tuple[float, 
     return numbers
 
 
-def _of_servo(servo: Servo) -> str:
-    numbers = ", ".join(f"{key} = {float(value):.4g}" for key, value in servo.values.items())
-    return f"the {servo.kind} servo of {servo.column}: {numbers}"
-
-
 def _base(system: Tree) -> str:
     names = {body.name for body in system.machine.bodies}
     return next(name for name in ("base", "base_link", "world", "nnap_base") if name not in names)
-
-
-def _armature(system: Tree, joint: Joint) -> float:
-    return float(system.values.get(f"{joint.name}.armature", joint.armature))
 
 
 def _body(root: ET.Element, system: Tree, laws: list, i: int, parent: str, pose: np.ndarray) -> tuple[str, np.ndarray]:
@@ -94,13 +87,16 @@ def _body(root: ET.Element, system: Tree, laws: list, i: int, parent: str, pose:
         joint, last = machine.joints[j], j == joints[-1]
         link = body.name if last else f"{body.name}_{k + 1}"
         anchor = _pose(np.eye(3), joint.anchor)
-        element = ET.SubElement(root, "joint", name=joint.name, type=_kind(joint))
+        kind = "prismatic" if joint.slide else "revolute" if joint.range else "continuous"
+        element = ET.SubElement(root, "joint", name=joint.name, type=kind)
         _origin(element, pose @ anchor @ _moved(joint, -joint.zero))
         ET.SubElement(element, "parent", link=parent)
         ET.SubElement(element, "child", link=link)
         ET.SubElement(element, "axis", xyz=_text(*joint.axis))
         viscous, dry, effort = laws[j]
-        _limits(element, joint, effort)
+        if kind != "continuous":
+            low, high = map(_text, joint.range or (-NO_LIMIT, NO_LIMIT))
+            ET.SubElement(element, "limit", lower=low, upper=high, effort=_text(effort), velocity=_text(NO_LIMIT))
         ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(dry))
         parent, pose = link, np.linalg.inv(anchor)
         if not last:
@@ -117,17 +113,6 @@ def _body(root: ET.Element, system: Tree, laws: list, i: int, parent: str, pose:
         place = pose @ np.array([*map(float, centre), 1.0])
         _inertial(link, float(mass), place[:3], np.array([[float(x) for x in row] for row in inertia]))
     return body.name, pose
-
-
-def _kind(joint: Joint) -> str:
-    return "prismatic" if joint.slide else "revolute" if joint.range else "continuous"
-
-
-def _limits(element: ET.Element, joint: Joint, effort: float) -> None:
-    if not (joint.range or joint.slide):
-        return
-    low, high = joint.range or (-NO_LIMIT, NO_LIMIT)
-    ET.SubElement(element, "limit", lower=_text(low), upper=_text(high), effort=_text(effort), velocity=_text(NO_LIMIT))
 
 
 def _inertial(link: ET.Element, mass: float, centre: np.ndarray, inertia: np.ndarray) -> None:

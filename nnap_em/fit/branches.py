@@ -18,8 +18,6 @@ BRANCH_DISTANCE = 1.0
 Paths of one branch, linearised about different starts, differ by up to 0.5 rad on machines; those of an arm that is
 folded and one that is stretched by 3.
 """
-REPORTED_PROBABILITY = 0.01
-"""Probability of a branch that is reported."""
 
 
 class Branch(NamedTuple):
@@ -69,7 +67,7 @@ def branches(
             gap = distance(angles[i], smoothed)
             most = int(np.argmax(gap.max(axis=0)))
             rows = np.flatnonzero(gap[:, most] > BRANCH_DISTANCE / 2)
-            if share >= REPORTED_PROBABILITY and gap.max() > BRANCH_DISTANCE:
+            if share >= 0.01 and gap.max() > BRANCH_DISTANCE:
                 span = int(rows[0]), int(rows[-1])
                 out.append(Branch(int(sequence), float(share), mean[i], second.angles[most], span))
     return tuple(out)

@@ -189,12 +189,6 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
 
 
-NOISE_EPOCHS = 12
-"""Epochs of EM for noise alone, at most."""
-WORSE = 1.2
-"""Error of the likelier fit over the horizon of use, over that of the fit to such errors, from which on they differ."""
-
-
 def _simulating(fitted: Identified, data: Dataset) -> Identified:
     """Equations whose parameters are those of the smallest errors over the horizon of use, with noise by EM.
 
@@ -222,7 +216,8 @@ def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
     rule = eqx.tree_at(lambda rule: rule.prior, fitted.m_step, _nothing(prior))
     begun = later_state(fitted.model, rule, key=fitted.state.key)
     longest = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    state = fit(begun, data, fitted.smoother, rule, epochs=NOISE_EPOCHS, schedule=Schedule(first=longest))
+    most = 12  # epochs of EM for noise alone
+    state = fit(begun, data, fitted.smoother, rule, epochs=most, schedule=Schedule(first=longest))
     best = simulated.fit(cast(StateSpaceModel, state.best), prior, data)
     hessian = jnp.asarray(simulated.precision(best))
     state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
@@ -236,7 +231,8 @@ def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulat
     each = zip(fitted.rig.measured, first, second, strict=True)
     parts = [f"{name}: {a:.3g} and {b:.3g} {unit(name)}".rstrip() for name, a, b in each]
     text = "errors of free simulations of the fit by likelihood and of the one to such errors, which is kept: "
-    odd = " They differ: something is missing in the equations." if np.any(first > WORSE * second) else ""
+    worse = 1.2  # error of the likelier fit over that of the fit to such errors from which on they differ
+    odd = " They differ: something is missing in the equations." if np.any(first > worse * second) else ""
     return f"{text}{', '.join(parts)}.{odd}"
 
 

@@ -28,8 +28,6 @@ from ..systems import AbstractSystem
 
 WIDTH, ORDER = 7, 4
 """Rows and degree of the polynomials that differentiate: a short window hardly bends a fast motion."""
-FILTER_LENGTHS = (9, 15, 25, 41, 61)
-"""Rows of the low-pass: the first that leaves accelerations a noise below `ACCEL_NOISE`, else the last that fits."""
 ACCEL_NOISE = 3e-3
 """Noise of a filtered acceleration as a share of its size: half of the smallest misfit that counts."""
 PIECE_ROWS, PIECES = 300, 15
@@ -52,12 +50,8 @@ ranks before that and explains too little.
 """
 UNEXPLAINED = 0.2
 """Largest share of the squared torque that a named mistake leaves unexplained."""
-TIED_RATIO = 1.1
-"""Ratio of the unexplained of two corrections up to which both mistakes are named."""
 UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
-CARRIED = 0.3
-"""Share of the declared gravity below which a torque holds none of it."""
 
 
 class Explanation(NamedTuple):
@@ -173,7 +167,10 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
         sources.append((noise, taps, window))
     q, v, a = (np.stack(part, axis=-1) for part in zip(*joints, strict=True))
     low = None
-    for bell in (_bell(size) for size in FILTER_LENGTHS if 2 * size < a.shape[1]):
+    # Rows of the low-pass: the first that leaves accelerations a noise below `ACCEL_NOISE`, else the last that fits
+    for length in (length for length in (9, 15, 25, 41, 61) if 2 * length < a.shape[1]):
+        window = np.hanning(length + 2)[1:-1]
+        bell = window / window.sum()
         passed = filtered(a, bell)
         passed = passed[np.isfinite(passed).all(axis=-1)]
         if len(passed) < FILTERED_ROWS:
@@ -261,7 +258,8 @@ def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     inertia, velocity, gravity = problem.plain
     rest, weight = problem.beyond(inertia + velocity - problem.applied(problem.inputs)), problem.beyond(gravity)
     share = -np.sum(rest * weight, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1e-300)
-    without = (np.abs(share) < CARRIED) & (np.std(weight, axis=0) > 0)
+    carried = 0.3  # share of the declared gravity below which a torque holds none of it
+    without = (np.abs(share) < carried) & (np.std(weight, axis=0) > 0)
     names = [name for name, joint in zip(rig.input_columns, problem.system.joints, strict=True) if without[joint - 1]]
     if names:
         text = (
@@ -311,7 +309,8 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
     best, explained = ranked[0], (ranked[0].remains <= LARGEST_REMAINDER * plain) & (ranked[0].remains <= UNEXPLAINED)
     if not np.any(explained & (plain > SMALLEST_MISFIT)):
         return []
-    return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(TIED_RATIO)]
+    tied = 1.1  # ratio of the unexplained of two corrections up to which both mistakes are named
+    return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(tied)]
 
 
 @eqx.filter_jit
@@ -341,12 +340,6 @@ def _derivative(order: int, dt: float) -> Float[np.ndarray, " tap"]:
     """Weights of the derivative of a polynomial in a window [Savitzky & Golay 1964, Analytical Chemistry 36(8)]."""
     powers = np.vander(np.arange(-(WIDTH // 2), WIDTH // 2 + 1) * dt, ORDER + 1, increasing=True)
     return math.factorial(order) * np.linalg.pinv(powers)[order]
-
-
-def _bell(size: int) -> Float[np.ndarray, " tap"]:
-    """Weights of a Hann window."""
-    weights = np.hanning(size + 2)[1:-1]
-    return weights / weights.sum()
 
 
 def _pieces(values: Float[np.ndarray, "seq time column"], valid: Bool[np.ndarray, "seq time"]) -> np.ndarray:

@@ -20,8 +20,6 @@ from .identify import Identified, MakeSmoother, Watch, begin, identify, unwatche
 
 OF_LOGS = ("name", "start", "limits", "ranges", "file")
 """Keys of a rig that belong to its logs; all others are those of the fit."""
-SAME_KEYS = ("system", "friction", "input_columns", "input_joints", "dt", "measured", "machine", "equations")
-"""Keys that must be the same, or the fit is of another machine."""
 
 
 def differences(fit: Rig, rig: Rig) -> list[str]:
@@ -32,7 +30,9 @@ def differences(fit: Rig, rig: Rig) -> list[str]:
     if fit.equations or rig.equations:
         raise DataError(f"rig {rig.name!r} is written as equations; start from a fit of a machine with joints")
     lines = list(_differing(_declared(fit), _declared(rig)))
-    foreign = [line for key, line in lines if key in SAME_KEYS]
+    # keys that must be the same, or the fit is of another machine
+    same = ("system", "friction", "input_columns", "input_joints", "dt", "measured", "machine", "equations")
+    foreign = [line for key, line in lines if key in same]
     if foreign:
         raise DataError(f"rig {rig.name!r} is not that of the fit: {'; '.join(foreign)}")
     return [line for _, line in lines]

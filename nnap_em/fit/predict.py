@@ -146,10 +146,6 @@ def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Arra
     return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
 
 
-DRAWN = 32
-"""Number of models drawn for the dependence of a smoothed state on the model."""
-
-
 def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
     """Smooth every state of each sequence from all its readings, the uncertainty of the model in the covariance.
 
@@ -170,7 +166,8 @@ def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
     """
     data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
     key_model, key_force = jax.random.split(jax.random.fold_in(fitted.state.key, SMOOTHED))
-    path, phi = posterior_of(fitted, data).state, phi_samples(fitted, DRAWN, key=key_model)
+    drawn = 32  # models for the dependence of a smoothed state on the model
+    path, phi = posterior_of(fitted, data).state, phi_samples(fitted, drawn, key=key_model)
     model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key_force)
     return each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
 

@@ -9,9 +9,6 @@ from ..data.machine import unpacked
 from ..data.rig import Rig
 from ..numerics.digits import counted
 
-NEAR_END = 0.005
-"""Share of the range within which a reading counts as at its end."""
-
 
 def at_stops(rig: Rig, data: Dataset) -> Iterator[str]:
     """A sentence for every measured joint whose readings touch an end of its range."""
@@ -23,7 +20,7 @@ def at_stops(rig: Rig, data: Dataset) -> Iterator[str]:
             continue
         y = np.asarray(data.y)[..., rig.measured.index(name)]
         low, high = joint.range
-        margin = NEAR_END * (high - low)
+        margin = 0.005 * (high - low)  # within which a reading counts as at its end
         touched = np.isfinite(y) & ((y < low + margin) | (y > high - margin))
         if touched.any():
             unit = rig.unit(name)

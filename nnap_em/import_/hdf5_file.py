@@ -112,16 +112,15 @@ def _opened(path: Path) -> Iterator[Any]:
         import h5py
     except ImportError:
         raise DataError(f"{path}: HDF5 files cannot be read without h5py; {EXTRA}") from None
+    hint = "use another copy, or write it again"
     try:
         file = h5py.File(path, "r")
     except OSError as error:
         if error.errno:
             raise unreadable(path, error) from None
-        hint = "use another copy, or write it again"
         raise DataError(f"{path}: no HDF5 file, or damaged or cut short; {hint}") from None
     with file:
         try:
             yield file
         except (OSError, RuntimeError) as error:
-            hint = "use another copy, or write it again"
             raise DataError(f"{path}: the file is damaged ({' '.join(str(error).split())}); {hint}") from None

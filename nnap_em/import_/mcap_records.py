@@ -76,8 +76,9 @@ class Frames:
                 chunk = (position, size)
                 self.chunks += 1
             elif code == INDEX:
-                channel, entries = _index(self.file.read(size))
-                index[channel] = entries
+                record = self.file.read(size)
+                channel, length = struct.unpack_from("<HI", record)
+                index[channel] = np.frombuffer(record, "<i8", length // 8, 6).reshape(-1, 2)
             elif code in (SCHEMA, CHANNEL, MESSAGE):
                 loose += struct.pack("<BQ", code, size) + self.file.read(size)
         if chunk is not None:
@@ -163,11 +164,6 @@ def walk(data: UInt8[np.ndarray, " byte"]) -> Walked:
             walked.channels[channel.id] = channel
         at += 9 + size
     return walked._replace(messages={channel: np.array(each, np.int64) for channel, each in rows.items()})
-
-
-def _index(record: bytes) -> tuple[int, Int[np.ndarray, "message two"]]:
-    channel, size = struct.unpack_from("<HI", record)
-    return channel, np.frombuffer(record, "<i8", size // 8, 6).reshape(-1, 2)
 
 
 def _batch(channel: int, data: UInt8[np.ndarray, " byte"], rows: Int[np.ndarray, "message two"]) -> Batch | None:

@@ -47,9 +47,11 @@ def write_mcap(path: Path, logs: Logs, channels: Mapping[str, Channel]) -> None:
     content = io.BytesIO()
     writer = Writer(content)
     writer.start(library="nnap_em")
-    numbers = {}
+    numbers, fixed = {}, {"file": {"type": "string"}, "time": {"type": "number", "description": "s"}}
     for topic, channel in channels.items():
-        schema = writer.register_schema(topic.lstrip("/"), "jsonschema", _schema(channel.units))
+        columns = {name: {"type": "number", "description": unit} for name, unit in channel.units.items()}
+        text = json.dumps({"type": "object", "properties": fixed | columns})
+        schema = writer.register_schema(topic.lstrip("/"), "jsonschema", text.encode())
         numbers[topic] = writer.register_channel(topic, "json", schema)
     valid = np.asarray(logs.data.valid)
     for i, (file, stamps) in enumerate(zip(logs.files, _stamps(logs), strict=True)):
@@ -62,12 +64,6 @@ def write_mcap(path: Path, logs: Logs, channels: Mapping[str, Channel]) -> None:
                 writer.add_message(numbers[topic], stamp, json.dumps(message).encode(), stamp)
     writer.finish()
     replace_bytes(path, content.getvalue())
-
-
-def _schema(units: Mapping[str, str]) -> bytes:
-    columns = {name: {"type": "number", "description": unit} for name, unit in units.items()}
-    fixed = {"file": {"type": "string"}, "time": {"type": "number", "description": "s"}}
-    return json.dumps({"type": "object", "properties": fixed | columns}).encode()
 
 
 def _stamps(logs: Logs) -> list[np.ndarray]:

@@ -87,11 +87,12 @@ def drafted(
     columns = from_one([meaning(name) for name in table])
     system = system or _system(path, columns, specs)
     spec = specs[system]
+    inputs = {c.name: spec.driven if c.number is None else c.number for c in columns if c.kind == "input"}
     measured = [name for name in table if name in spec.states]
     name = toml_text(path.resolve().parent.name or "rig")
     lines = [
         *_model(system, spec),
-        *_input(spec, columns),
+        *driven({name: str(joint) for name, joint in inputs.items() if joint <= spec.joints}),
         *sampling(table, columns),
         *measurement(table, measured, spec),
     ]
@@ -173,11 +174,6 @@ def _model(system: str, spec: SystemSpec) -> Iterator[str]:
 def _what(name: str) -> str:
     """The unit of a parameter, and what it is where its name is a usual one."""
     return ": ".join(filter(None, (parameter_unit(name), _PARAMETERS.get(name.rstrip("0123456789")))))
-
-
-def _input(spec: SystemSpec, columns: Sequence[_Column]) -> Iterator[str]:
-    inputs = {c.name: spec.driven if c.number is None else c.number for c in columns if c.kind == "input"}
-    return driven({name: str(joint) for name, joint in inputs.items() if joint <= spec.joints})
 
 
 def driven(inputs: Mapping[str, str], joints: bool = True) -> Iterator[str]:

@@ -57,7 +57,11 @@ def _machine(path: Path, model: Any, gears: Mapping[str, Gear]) -> Machine:
         bodies=_bodies(model),
         joints=tuple(_joint(model, j, gears) for j in range(model.njnt)),
         motors=tuple(_motors(model)),
-        joint_sensors=tuple(_joint_sensors(model)),
+        joint_sensors=tuple(
+            JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == "jointvel")
+            for i in range(model.nsensor)
+            if (kind := _kind("mjtSensor", model.sensor_type[i])) in ("jointpos", "jointvel")
+        ),
         sites=tuple(
             Site(model.site(i).name, int(model.site_bodyid[i]) - 1, vector(model.site_pos[i]))
             for i in range(model.nsite)
@@ -342,13 +346,6 @@ def _limits(model: Any, i: int) -> tuple[float, float] | None:
     if model.jnt_actfrclimited[joint]:
         ranges.append(np.sort(np.asarray(model.jnt_actfrcrange[joint]) / gear))
     return (max(float(x[0]) for x in ranges), min(float(x[1]) for x in ranges)) if ranges else None
-
-
-def _joint_sensors(model: Any) -> Iterator[JointSensor]:
-    for i in range(model.nsensor):
-        kind = _kind("mjtSensor", model.sensor_type[i])
-        if kind in ("jointpos", "jointvel"):
-            yield JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == "jointvel")
 
 
 def _sensors(model: Any) -> Iterator[Sensor]:

@@ -12,12 +12,10 @@ from ..comparison.compare import CHANGED, LEAST_SHARED, Comparison, Curve, Numbe
 from ..comparison.pooling import JointTest, Pooled
 from ..numerics.digits import number, with_std
 from .document import versions
-from .page import Picture, picture, rendered, write_report
+from .page import picture, rendered, write_report
 from .style import BLUE, GREEN, PURPLE, TRUTH, VERMILION, band, head, limits, styled, symbol
 from .wording import p_value
 
-SHOWN = 5
-"""Velocities of a curve in the table; compare.json has all."""
 LEGEND = (
     "±: one standard deviation. pooled: the answer of all fits together. between: standard deviation between fits "
     "beyond those that they state. p-value: chance of such differences where nothing changed, corrected for the number "
@@ -27,7 +25,11 @@ LEGEND = (
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
     """Write compare.json and compare.html into the folder `out`."""
-    document, pictures = describe(comparison), [_picture(comparison, curve) for curve in comparison.curves]
+    document, pictures = describe(comparison), []
+    caption = "With 90 % bands, on the velocities that all fits visited; below, the same minus the pooled curve."
+    for curve in comparison.curves:
+        title = f"{curve.name[0].upper()}{curve.name[1:]}"
+        pictures.append(picture("found", title, caption, comparison_figure(comparison, curve)))
     content = {"document": document, "rows": rows(comparison), "legend": LEGEND, "pictures": pictures}
     text = rendered("compare.html.j2", **content)
     write_report(out, "compare", document, text, comparison.fits[0].fitted.rig.named)
@@ -108,8 +110,8 @@ def rows(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _along(curve: Curve, count: int) -> Iterator[dict[str, Any]]:
-    """Some points of a curve."""
-    for at in np.linspace(0, len(curve.velocity) - 1, SHOWN).astype(int):
+    """Some points of a curve; compare.json has all."""
+    for at in np.linspace(0, len(curve.velocity) - 1, 5).astype(int):
         values = ["–"] * count
         for i, torque, std in zip(curve.fits, curve.torque[:, at], curve.std[:, at], strict=True):
             values[i] = with_std(float(torque), float(std))
@@ -168,12 +170,6 @@ def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
 
 
 # --- in figures
-
-
-def _picture(comparison: Comparison, curve: Curve) -> Picture:
-    caption = "With 90 % bands, on the velocities that all fits visited; below, the same minus the pooled curve."
-    title = f"{curve.name[0].upper()}{curve.name[1:]}"
-    return picture("found", title, caption, comparison_figure(comparison, curve))
 
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, "#56B4E9", "#E69F00")

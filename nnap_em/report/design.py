@@ -23,8 +23,6 @@ from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styl
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
-NOTED = 1.1
-"""Factor of certainty from which on a parameter is named in the verdict."""
 SEQUENCES_ACROSS = 3
 """Sequences in one figure."""
 
@@ -73,6 +71,8 @@ def describe(design: Design) -> dict[str, Any]:
     states, inputs = system.coordinates + system.rates, fitted.rig.input_columns
     force = dict(zip(inputs, (system.force_unit(joint) for joint in system.joints), strict=True))
     limits = design.limits
+    low, high = (*limits.low, *limits.lowest), (*limits.high, *limits.highest)
+    ends = zip((*inputs, *states), map(float, low), map(float, high), strict=True)
     document = {
         "format": 1,
         "rig": fitted.rig.name,
@@ -83,7 +83,7 @@ def describe(design: Design) -> dict[str, Any]:
         "dt": fitted.rig.dt,
         "starts": [dict(zip(states, map(float, start), strict=True)) for start in design.start],
         "limits": {
-            "values": _ranges((*inputs, *states), (*limits.low, *limits.lowest), (*limits.high, *limits.highest)),
+            "values": {name: [a, b] for name, a, b in ends},
             "rate": dict(zip(inputs, map(float, limits.rate), strict=True)),
             "declared": sorted({*fitted.rig.limits.values, *fitted.rig.limits.rate, *fitted.rig.limits.start}),
         },
@@ -92,10 +92,6 @@ def describe(design: Design) -> dict[str, Any]:
         "discrimination": pair_entries(design),
     }
     return document | {"verdict": _verdict(document)}
-
-
-def _ranges(names, low, high) -> dict[str, list[float]]:
-    return {name: [float(a), float(b)] for name, a, b in zip(names, low, high, strict=True)}
 
 
 def _sides(design: Design) -> dict[str, Information]:
@@ -177,7 +173,8 @@ def _verdict(document: dict[str, Any]) -> str:
             f"the friction band near rest of {joints} {best} times narrower (as much time of the old inputs: {old})"
         )
     surer = {name: p["now"] / p["expected"] for name, p in document["parameters"].items() if p["expected"] > 0}
-    told_most = sorted((name for name, times in surer.items() if times > NOTED), key=lambda name: -surer[name])
+    noted = 1.1  # factor of certainty from which on a parameter is named
+    told_most = sorted((name for name, times in surer.items() if times > noted), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
     for pair in document["discrimination"]:
         wrong, old = pair["misleading"]["expected"], pair["misleading"]["same_time_of_old_inputs"]

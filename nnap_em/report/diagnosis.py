@@ -6,10 +6,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from ..data.logs import Logs
-from ..data.rig import Rig
 from ..diagnosis.change import changes
 from ..diagnosis.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
 from ..diagnosis.innovations import tests
@@ -51,7 +49,9 @@ def write_diagnosis(
     left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
     partial = left["after"].without_effects() if accepted else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
-    velocities = _velocities(left["before"], len(names.rates))
+    before, dof = left["before"], len(names.rates)
+    followed = before.valid & before.used[:, None] & np.isfinite(before.state).all(axis=-1)
+    velocities = before.state[followed][:, dof : 2 * dof]
     nodes = visited_nodes(velocities) if names.rates else np.zeros((0, 2))
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if diagnosis.before.rig.friction}
     for name, table in tables.items():
@@ -68,6 +68,8 @@ def write_diagnosis(
     outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.complete), moved(diagnosis.after)
     if diagnosis.change:
         outcome, far = changes(diagnosis, accepted, error, rivals, suspects), []
+    command = "nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."
+    designed = [command] if diagnosis.before.rig.input_columns and not diagnosis.before.rig.equations else []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *(one.sentence for one in far)]),
         "moved": far,
@@ -86,7 +88,7 @@ def write_diagnosis(
         "disagreements": disputed,
         "undecided": [place_of(key) for key in rivals],
         "suspects": suspects,
-        "next": [*advice(accepted, disputed, rivals, suspects), *_experiment(diagnosis.before.rig)],
+        "next": [*advice(accepted, disputed, rivals, suspects), *designed],
     }
     write_page(out, document, figures, diagnosis.before.rig.named)
     log(document["verdict"])
@@ -142,24 +144,13 @@ def _prediction_picture(
 
 
 def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: Names) -> list[Picture]:
-    force = [
-        picture(
-            "residual",
-            "The force that the declared model lacks",
-            "What the smoothed motion needs beyond the declared model, against everything that could cause it.",
-            residual_figure(partial, names, left.get("after")),
-        )
-        for _ in names.coordinates[:1]
-    ]
-    return [
-        *force,
-        picture(
-            "residual",
-            "One-step errors",
-            "Left: the autocorrelation should stay within its bounds. Right: the quantiles should follow the line.",
-            innovation_figure(left["before"], names, left.get("after")),
-        ),
-    ]
+    after, out = left.get("after"), []
+    if names.coordinates:
+        title = "The force that the declared model lacks"
+        caption = "What the smoothed motion needs beyond the declared model, against everything that could cause it."
+        out.append(picture("residual", title, caption, residual_figure(partial, names, after)))
+    caption = "Left: the autocorrelation should stay within its bounds. Right: the quantiles should follow the line."
+    return [*out, picture("residual", "One-step errors", caption, innovation_figure(left["before"], names, after))]
 
 
 def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
@@ -187,13 +178,6 @@ def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> li
     return [picture("details", "The first screening round", caption, figure)]
 
 
-def _experiment(rig: Rig) -> list[str]:
-    """The command that designs the next experiment."""
-    if not rig.input_columns or rig.equations:
-        return []
-    return ["nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."]
-
-
 def _round(step: Step, dt: float) -> dict[str, Any]:
     return {
         "horizon_s": step.horizon * dt,
@@ -212,9 +196,3 @@ def _disturbance(force: Intervention, files: Sequence[str]) -> dict[str, Any]:
 
 def _screened(key: Key, gain: float) -> dict[str, Any]:
     return place_of(key) | {"name": key[0], "gain": gain}
-
-
-def _velocities(residuals: Residual, dof: int) -> Float[np.ndarray, "sample dof"]:
-    """Velocities on the paths that took part."""
-    inside = residuals.valid & residuals.used[:, None] & np.isfinite(residuals.state).all(axis=-1)
-    return residuals.state[inside][:, dof : 2 * dof]

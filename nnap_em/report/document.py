@@ -21,8 +21,6 @@ from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, pre
 from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law
 from .tables import INNER
 
-NO_TEST = "no test sequences (FOLDER/test/*.csv), so no prediction error"
-
 
 def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, began: float) -> dict[str, Any]:
     """The keys of every report; `began` is `time.perf_counter()` at the start."""
@@ -32,7 +30,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "rig": fitted.rig.name,
         "system": fitted.rig.system,
         "units": {name: system.unit(name) for name in system.readable},
-        "error_note": None if test else NO_TEST,
+        "error_note": None if test else "no test sequences (FOLDER/test/*.csv), so no prediction error",
         "masked": masked(train, test),
         "undetermined": []
         if fitted.rig.equations

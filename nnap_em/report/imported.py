@@ -16,15 +16,7 @@ from .document import versions
 from .page import picture, rendered, write_report
 from .style import BLUE, GREEN, READING, TRUTH, VERMILION, ZERO_LINE, head, styled
 
-DRAWN_LOGS = 6
-"""Logs that are drawn."""
-LOG_AXIS_RATIO = 10.0
-"""Times the shortest interval from which on intervals are drawn on a logarithmic axis."""
 _SPLITS = {"train": ("training", BLUE), "test": ("test", GREEN), None: ("dropped", READING)}
-NOTABLE = 0.2
-"""Share of a row from which on a delay, where it is surely one, is pointed out."""
-CERTAIN_DELAY = 4.0
-"""Standard deviations from which on a delay is surely one."""
 
 
 def describe(
@@ -81,9 +73,10 @@ def _log(log: Resampled, files: Iterator[str]) -> dict[str, Any]:
 
 def _remarks(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
     """Warnings for the owner before a fit."""
+    notable = 0.2  # share of a row from which on a delay, where it is surely one, is pointed out
     for log in logs:
         for entry in log.delays:
-            if surely(entry) and abs(entry.seconds) > NOTABLE * rig.dt:
+            if surely(entry) and abs(entry.seconds) > notable * rig.dt:
                 yield f"{log.path.name}: {delay_text(entry)}"
         for topic in log.topics:
             yield from (f"{log.path.name}: {topic.name or 'the table'}: {note}" for note in topic.notes)
@@ -91,8 +84,8 @@ def _remarks(logs: Sequence[Resampled], rig: Rig) -> Iterator[str]:
 
 
 def surely(entry: Delay) -> bool:
-    """True where a delay is more than chance."""
-    return bool(np.isfinite(entry.seconds) and abs(entry.seconds) > CERTAIN_DELAY * entry.std)
+    """True where a delay is more than chance: by four standard deviations."""
+    return bool(np.isfinite(entry.seconds) and abs(entry.seconds) > 4.0 * entry.std)
 
 
 def delay_text(entry: Delay) -> str:
@@ -113,7 +106,7 @@ def delay_text(entry: Delay) -> str:
 @styled
 def timeline(document: Mapping[str, Any]) -> Figure:
     """A row for each topic that is used and one for the sequences, and the intervals of the messages beside them."""
-    logs = document["logs"][:DRAWN_LOGS]
+    logs = document["logs"][:6]
     used = [[topic for topic in log["topics"] if topic.columns and topic.clock] for log in logs]
     heights = [len(topics) + 1 for topics in used]
     figure = Figure(figsize=(9.0, 1.1 + 0.42 * sum(heights) + 0.45 * len(logs)), layout="constrained")
@@ -133,7 +126,7 @@ def timeline(document: Mapping[str, Any]) -> Figure:
         left.set_ylim(len(topics) + 0.5, -0.5)
         right.set(ylim=left.get_ylim(), yticks=[], xlabel="interval [ms]")
         intervals = [1e3 / topic.rate for topic in topics]
-        if max(intervals) > LOG_AXIS_RATIO * min(intervals):
+        if max(intervals) > 10.0 * min(intervals):
             right.set_xscale("log")
         else:
             right.set_xlim(left=0.0)

@@ -14,11 +14,13 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.diagnosis import refit as refits
 from nnap_em.em import loop, multistep, stated
 from nnap_em.em.loop import EMState, Schedule
-from nnap_em.em.mstep import ScoringMStep
+from nnap_em.em.mstep import MStepInfo, ScoringMStep
 from nnap_em.em.multistep import Followed, OpenLoop
 from nnap_em.fit import identify
 from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.gaussian import CubatureSmoother
+from nnap_em.smoother.start import StartBank
 
 MODEL, RULE = slide()
 DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))
@@ -89,12 +91,37 @@ class _Along(NamedTuple):
 )
 def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(monkeypatch, best, tried, used, ess, taken):
     """Likelihoods along different paths differ by what is known of neither."""
-    monkeypatch.setattr(loop, "e_step", lambda *_, **__: SimpleNamespace(state=PATH))
+
+    def e_step(model, *_, **__):
+        assert _mass(model) == 1.0  # the step was made from the best
+        return SimpleNamespace(state=PATH)
+
+    monkeypatch.setattr(loop, "e_step", e_step)
     state, used = _state([0.0, 2.0, np.nan], ess=ess), np.array(used) > 0
     same = lambda: loop._rise(state, DATA, None, _Along(best, tried), used)  # noqa: E731
     after = loop._judge(state, _heavy(2.5), jnp.ones((1, 1)), np.array([-9.0, -7.0, -9.0]), used, same)
     assert _mass(after.best) == (1.5 if taken else 1.0)
     assert after.top[0] == (-9.0 if taken else 0.0)
+    assert after.stride == pytest.approx(0.6 if taken else 0.2)
+
+
+def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
+    horizons, judged = [], []
+
+    def em_step(model, data, *_, **__):
+        horizons.append(int(data.valid[0].sum()))
+        return (
+            model,
+            MStepInfo(jnp.ones((1, 1)), np.ones(4, bool)),
+            -10.0 * len(horizons) * np.ones(4),
+            np.full(4, np.inf),
+        )
+
+    monkeypatch.setattr(loop, "em_step", em_step)
+    monkeypatch.setattr(loop, "_rise", lambda *_: judged.append(horizons[-1]) or 1.0)
+    state = _state(np.full(4, -np.inf), epoch=1)
+    loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=6, schedule=Schedule(first=4, growth=3.0))
+    assert horizons == [4, 4, 9, 9, 9] and judged == [9, 9]
 
 
 def test_a_sequence_that_was_left_out_refuses_nothing():

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 
 from nnap_em.data.dataset import Dataset, active_steps
 from nnap_em.em.local import local, locals_along, readings_along, readings_at
+from nnap_em.em.loop import e_step
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import Quadratic, quadratic, spread
@@ -384,6 +385,16 @@ def test_fit_with_a_bound_is_the_optimum_among_what_is_possible(least):
     bound = np.array([least, (score[1] - normal[0, 1] * least) / normal[1, 1]])
     np.testing.assert_allclose(w, bound if least > free[0] else free, atol=np.sqrt(2 * 1e-3 / 20))
     assert w[0] >= least
+
+
+def test_the_likelihood_along_a_path_is_that_of_the_smoother_which_linearises_there(slides):
+    model, data, _, _ = slides
+    bank = StartBank((1, 1))
+    once, twice = (
+        e_step(model, data, ExtendedKalmanSmoother(bank, iterations=count), key=jax.random.key(0)) for count in (1, 2)
+    )
+    rule = ScoringMStep(MASS, jnp.zeros(0), (True, True), (True, True), log_q_prior=model.log_q, linearise=Tangent())
+    np.testing.assert_allclose(rule.loglik(model, once.state, data), twice.loglik, rtol=1e-12)
 
 
 def test_sequences_that_are_not_used_have_no_weight(slides):

@@ -52,6 +52,7 @@ def drawn(request):
     lost = _residual(dof, used=np.arange(SEQUENCES) > 0)
     return dof, {
         "residual": residual_figure(lost, names, _residual(dof, 1)),
+        "alone": innovation_figure(residual, names),
         "innovation": innovation_figure(lost, names, residual),  # the two may follow different sequences
         "error": error_figure(error, names),
         "friction": friction_figure({"before": table, "after": table}, names, visited),

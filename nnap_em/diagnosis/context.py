@@ -139,8 +139,8 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
             fits.append(start())
         except FitError as error:
             failure = error
-        followed = np.isfinite(before.state.top).sum()
-        loses = all(np.isfinite(state.top).sum() < followed for state in fits)
+        kept = np.isfinite(before.state.top).sum()
+        loses = all(np.isfinite(state.top).sum() < kept for state in fits)
         if fits and not loses and (len(fits) > 1 or not afresh):
             break
     if not fits:

@@ -91,7 +91,7 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
     None is accepted where one that is worth as much is of another cause.
     """
     model, values = fit.model, [case.removed for case in admissible]
-    ties = [_priced(case) for case in admissible] if context.white else values
+    ties = [_priced(case) for case in admissible] if context.white or not context.loss.multi_step else values
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), ties)]
     best = _form(leader, admissible, values, ties, model)

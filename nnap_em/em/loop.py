@@ -34,7 +34,7 @@ class EMState(NamedTuple):
     model: AbstractModel
     """The model that the next epoch tries."""
     best: AbstractModel
-    """The likeliest model so far at the present horizon."""
+    """The last model that was accepted at the present horizon."""
     proposal: AbstractModel
     """Model that the M-step proposes from `best`."""
     hessian: Float[Array, "phi phi"]
@@ -226,8 +226,8 @@ def fit(
     """EM from `state` until `epochs` are done or the likelihood rests.
 
     It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
-    nats twice running, or when a model on which sequences diverge was refused twice running. Before the last stage of
-    the M-step the next one then begins, from the likeliest model. Horizons are counted from shortly before the first
+    nats twice running, or when less than a fifth of a step would be tried, after two refusals. Before the last stage of
+    the M-step the next one then begins, from the best model. Horizons are counted from shortly before the first
     motion of each sequence.
     Raises FitError when no sequence can be followed.
     """
@@ -268,7 +268,7 @@ def fit(
 
 
 def _afresh(state: EMState) -> EMState:
-    """The state restarted from the likeliest model, without likelihoods to compare with."""
+    """The state restarted from the best model, without likelihoods to compare with."""
     return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
 
 
@@ -319,9 +319,9 @@ def _judge(
     """
     loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
     mean = float(np.mean(loglik[used]))
-    if np.nanmean(loglik - state.top) >= -0.5 or same() > 0:
+    if (rises := bool(np.nanmean(loglik - state.top) >= -0.5)) or same() > 0:
         top = np.where(used, loglik, np.nan)
-        stride = min(1.0, 2 * state.stride)
+        stride = min(1.0, 2 * state.stride) if rises else state.stride
         state = state._replace(best=state.model, proposal=proposal, hessian=hessian, top=top, stride=stride)
     else:
         state = state._replace(stride=state.stride / 3)

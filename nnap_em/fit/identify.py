@@ -72,7 +72,7 @@ class Identified(NamedTuple):
 
     @property
     def model(self) -> StateSpaceModel:
-        """The likeliest model."""
+        """The model that was fitted."""
         return cast(StateSpaceModel, self.state.best)
 
     @property

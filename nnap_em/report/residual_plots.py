@@ -214,7 +214,7 @@ def _half_turns(k: int) -> str:
 @styled
 def innovation_figure(before: Residual, names: Names, after: Residual | None = None) -> Figure:
     """Autocorrelation with its 95 % bounds and quantile plot of the innovations of every measured channel."""
-    sides = _sides(before, after, ("before" if after else "fit", "after"))
+    sides = _sides(before, after, ("before", "after")) if after else [(_followed(before), AFTER, "fit")]
     count = len(names.measured)
     pairs = 1 if count <= ACROSS else 2  # side by side
     deep = -(-count // pairs)

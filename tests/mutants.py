@@ -763,8 +763,8 @@ a law stays beside any remainder
 + form is None and 0 not in even(
 ## test_search.py::test_one_step_errors_come_last_and_where_noise_is_what_the_model_says
 one-step errors decide where innovations are not white
-- if white and complete and white_innovations(_outcome(before, hypothesis, state), data):
-+ if white and complete:
+- if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
++ if context.white and complete:
 external disturbances sought in white noise
 -     if white:
 +     if not white:

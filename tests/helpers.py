@@ -51,7 +51,7 @@ def nnap(*words: object) -> int:
 
 
 def written_again(rig: Rig, folder: Path) -> Rig:
-    """What is read of the rig.toml that is written of a rig."""
+    """The rig that `read_rig` gives back after `write_rig` wrote it."""
     write_rig(rig, folder / "again.toml")
     return read_rig(folder / "again.toml", specs)
 
@@ -128,7 +128,9 @@ def around(model: StateSpaceModel) -> SearchScales:
 
 
 def right_residual(seed: int, shape: tuple[int, int], dof: int, read: int, **changes) -> Residual:
-    """What a right model would leave, of states that move; `shape` counts sequences and rows, `read` readings."""
+    """The residual of a right model along moving states: white noise; `shape` is (sequences, rows), `read` the number
+    of readings.
+    """
     rng = np.random.default_rng(seed)
     sequences, rows = shape
     walk = 0.1 * np.cumsum(rng.normal(size=(*shape, 2 * dof)), axis=1)

@@ -1,4 +1,4 @@
-"""The transition of the common work alone, in JAX and in C: no particle filter can be faster."""
+"""The limits of the machine: the transition of the common work alone, in JAX and in C, and a smoother in C."""
 
 import ctypes
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common_work import Case, Size, common_logs, common_model, compiled
+from common_work import START, START_STD, Case, Size, common_logs, common_model, compiled
 
 from nnap_em.model.state_space import Inputs
 
@@ -36,25 +36,33 @@ def transition_case(what: str, transition, axis: int, size: Size) -> Case:
     return Case("limit", what, size, prepare)
 
 
-def build_c(flags: tuple[str, ...]) -> ctypes.CDLL:
-    """`transition.c` as a library; gcc is needed."""
-    folder = Path(tempfile.mkdtemp())
-    source, library = Path(__file__).with_name("transition.c"), folder / "transition.so"
+def build_c(name: str, *flags: str) -> ctypes.CDLL:
+    """A file of this folder as a library; gcc is needed."""
+    source, library = Path(__file__).with_name(name), Path(tempfile.mkdtemp(), "compiled.so")
     command = ["gcc", "-O3", "-march=native", "-ffast-math", *flags, "-shared", "-fPIC", source, "-o", library]
     subprocess.run([*command, "-lmvec", "-lm"], check=True)
     return ctypes.CDLL(str(library))
 
 
-def propagate_in_c(library: ctypes.CDLL, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Particles (seq, state, particle) after all inputs (seq, time, 1)."""
+def place(array: np.ndarray) -> ctypes.c_void_p:
+    """Where an array lies."""
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+def in_c() -> tuple[list[float], np.ndarray]:
+    """The lumped constants of the arm and its networks, in the order of the C files."""
     model = common_model()
     arm, m22 = model.system, model.system.I2 + model.system.m2 * model.system.lc2**2
     m11 = arm.I1 + arm.m1 * arm.lc1**2 + m22 + arm.m2 * arm.l1**2
     gravity1 = (arm.m1 * arm.lc1 + arm.m2 * arm.l1) * arm.g
-    lumped = [m11, m22, arm.m2 * arm.l1 * arm.lc2, gravity1, arm.m2 * arm.lc2 * arm.g, model.dt]
     weights = np.concatenate([np.ravel(w) for net in model.unknown.joints for w in net]).astype(np.float32)
-    place = lambda a: a.ctypes.data_as(ctypes.c_void_p)  # noqa: E731
-    lumped, u, x = np.asarray(lumped, np.float32), np.ascontiguousarray(u, np.float32), np.array(x, np.float32)
+    return [m11, m22, arm.m2 * arm.l1 * arm.lc2, gravity1, arm.m2 * arm.lc2 * arm.g, model.dt], weights
+
+
+def propagate_in_c(library: ctypes.CDLL, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Particles (seq, state, particle) after all inputs (seq, time, 1)."""
+    constants, weights = in_c()
+    lumped, u, x = np.asarray(constants, np.float32), np.ascontiguousarray(u, np.float32), np.array(x, np.float32)
     for seq in range(x.shape[0]):
         library.propagate(place(lumped), place(weights), place(u[seq]), u.shape[1], place(x[seq]), x.shape[2])
     return x
@@ -64,7 +72,7 @@ def c_case(what: str, flags: tuple[str, ...], size: Size) -> Case:
     """The transition in C; its numbers are first held against the library's."""
 
     def prepare():
-        library = build_c(flags)
+        library = build_c("transition.c", *flags)
         x, u = (np.asarray(a) for a in start_particles(size))
         move = lambda x, u: common_model().transition(x, Inputs.held(u))  # noqa: E731
         once = jax.vmap(jax.vmap(move, (1, None), 1))(jnp.asarray(x), jnp.asarray(u[:, 0]))
@@ -73,3 +81,25 @@ def c_case(what: str, flags: tuple[str, ...], size: Size) -> Case:
         return lambda: propagate_in_c(library, x, u)
 
     return Case("limit", what, size, prepare)
+
+
+def c_smoother_case(size: Size) -> Case:
+    """The extended Kalman filter and RTS smoother in C; `states` are its smoothed means."""
+    lanes = 16 * -(-size.sequences // 16)  # vectors of 512 bits; the last ones repeat sequences
+
+    def prepare():
+        library, (constants, weights) = build_c("smoother.c", f"-DLANES={lanes}"), in_c()
+        model, data, pick = common_model(), common_logs(size).data, np.arange(lanes) % size.sequences
+        variances = [*np.exp(model.log_q), *np.exp(model.log_r), *START, *np.square(START_STD)]
+        numbers = np.asarray([*constants, *variances], np.float32)
+        u = np.ascontiguousarray(np.asarray(data.u)[pick, :, 0].T, np.float32)
+        y = np.ascontiguousarray(np.asarray(data.y)[pick].transpose(1, 2, 0), np.float32)
+        rows, loglik = np.zeros((len(y), 72, lanes), np.float32), np.zeros(lanes, np.float32)
+
+        def run():
+            library.smooth(*map(place, (numbers, weights, u, y)), len(y), place(rows), place(loglik))
+            return rows
+
+        return run
+
+    return Case("limit", "C smoother", size, prepare, lambda rows: rows[:, :4, : size.sequences].transpose(2, 0, 1))

@@ -123,9 +123,14 @@ def speed_table(rows: list[dict], lines: list[list[str]]) -> list[str]:
     return table(shown, [[line[head.index(name)] for name in shown] for line in kept])
 
 
-def limit_lines(rows: list[dict]) -> list[str]:
-    """How far the filter is from the transition, and the transition from C."""
-    rate = {row["what"]: pace(row) * row["size"][2] for row in rows if row["who"] in ("nnap_em", "limit")}
+def limit_lines(group: str, rows: list[dict]) -> list[str]:
+    """How far the smoother is from one in C; the particle filter from the transition, and the transition from C."""
+    mine = [row for row in rows if row["who"] in ("nnap_em", "limit")]
+    if group == "extended":
+        rate = {row["what"]: pace(row) for row in mine}
+        pairs = {f"{row['what']} / C smoother": pace(row) / rate["C smoother"] for row in mine if row["who"] != "limit"}
+        return ["", *table(["sequence-steps/s of", "ratio"], [[k, f"{v:.2f}"] for k, v in pairs.items()])]
+    rate = {row["what"]: pace(row) * row["size"][2] for row in mine}
     most = max(row["size"][2] for row in rows if row["who"] == "nnap_em")
     ours = rate["our transition alone"]
     pairs = {
@@ -257,7 +262,7 @@ def main() -> None:
             cells = speed_rows(rows, memory)
             numbers += [[group, *line] for line in cells]
             section = ["", f"## {titles[group]}", "", *speed_table(rows, cells)]
-            lines += [*section, *(limit_lines(rows) if group == "filter" else [])]
+            lines += [*section, *(limit_lines(group, rows) if group in ("extended", "filter") else [])]
             print("\n".join(section), file=sys.stderr, flush=True)  # a later group that fails loses nothing
         if "growth" in args.only:
             lines += growth(args.quick, cpus[:1], cache, out)

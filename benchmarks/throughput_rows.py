@@ -24,7 +24,7 @@ from common_work import (
     smoother_case,
     wide_bank,
 )
-from limits import c_case, transition_case
+from limits import c_case, c_smoother_case, transition_case
 from peers import cuthbert_case, cuthbert_exact, dynamax_case, natural_transition, particles_case
 
 from nnap_em.em.loop import e_step, em_step
@@ -54,6 +54,7 @@ def groups(whole: Size, quick: bool) -> dict[str, list[Case]]:
             smoother_case("13 starts", ExtendedKalmanSmoother(wide_bank), plain),
             dynamax_case("extended", False, plain),
             dynamax_case("extended", True, plain),
+            c_smoother_case(plain),
         ],
         "sigma-point": [
             smoother_case("one start, one pass", CubatureSmoother(one_start, iterations=0), plain),

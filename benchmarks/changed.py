@@ -4,13 +4,15 @@
     python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
     python benchmarks/changed.py monitor --out out/changed slide-none slide-coulomb
     python benchmarks/changed.py compare --out out/changed dfki_c1-spring2-strong dfki_c0-recorded
+    python benchmarks/changed.py loaded --out out/changed kr300-15
     python benchmarks/changed.py table out/changed [--out docs/results/changed_table.md]
 
 planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
 planted in them; of `RIG-recorded` nothing is planted.  moved: 8 simulated recordings of 3 s, then 8 of the machine with
 a number that moved; `slide-coulomb-2` is seed 2.  monitor: 16 recordings, then 200 of 1.5 s, of which the Coulomb
-friction grows by 1 % a recording from number 100 on, or which are of the same machine.  One JSON file a case; a case
-that has one is not run again.
+friction grows by 1 % a recording from number 100 on, or which are of the same machine.  loaded: half of the recordings
+of an arm, then the others with so many kilograms more at the centre of mass of its last body.  One JSON file a case;
+a case that has one is not run again.
 """
 
 import argparse
@@ -30,10 +32,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from planted import _commit, score
 from planted_cases import case_of
 from planted_make import DATA, ROOT, make
+from scipy.signal import savgol_filter
 
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
@@ -60,7 +64,8 @@ def command(*arguments: str | Path) -> tuple[int, float, str]:
 def halves(source: Path, rig: Path, out: Path, odd: bool) -> None:
     """Every second recording of a data set, all windows of a recording together."""
     (out / "train").mkdir(parents=True)
-    shutil.copy(rig, out / "rig.toml")
+    for file in (rig, *source.glob("*.xml")):
+        shutil.copy(file, out / ("rig.toml" if file is rig else file.name))
     files = sorted((source / "train").glob("*.csv"))
     recordings = list(dict.fromkeys(re.sub(r"^\d+_|_w\d+$", "", path.stem) for path in files))
     if len(recordings) < 4:
@@ -106,6 +111,40 @@ def compared(name: str, out: Path) -> dict[str, Any]:
         status, spent, said = command("compare", first, second, "--out", found)
         report = json.loads((found / "compare.json").read_text()) if status == 0 else {}
     return {"case": f"compare {name}", "report": report, "seconds": spent, "said": said}
+
+
+def loaded(name: str, out: Path) -> dict[str, Any]:
+    """The other half of an arm's recordings, with a heavier last body in them: by MuJoCo, along the smoothed path."""
+    rig, more = name.split("-")
+    fit, half, found = fit_of(rig, out), out / "halves" / name, out / "found" / name
+    shutil.rmtree(half, ignore_errors=True)
+    halves(DATA / rig, DATA / rig / "rig.toml", half, True)
+    (model_file,) = half.glob("*.xml")
+    light, heavy = (mujoco.MjModel.from_xml_path(str(model_file)) for _ in range(2))
+    heavy.body_mass[-1] += float(more)
+    joints = [light.joint(j).name for j in range(light.njnt)]
+    for path in half.glob("train/*.csv"):
+        log = np.genfromtxt(path, delimiter=",", names=True)
+        dt = float(np.mean(np.diff(log["time"])))
+        path_of = [savgol_filter([log[j] for j in joints], 11, 3, order, dt) for order in range(3)]
+        force = inverse(heavy, path_of) - inverse(light, path_of)
+        mean = np.concatenate([0.5 * (force[:-1] + force[1:]), force[-1:]])
+        columns = {n: log[n] for n in log.dtype.names} | {
+            f"tau{j[1:]}": log[f"tau{j[1:]}"] + mean[:, i] for i, j in enumerate(joints)
+        }
+        write_csv(path, columns)
+    status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
+    report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    return {"case": name, "report": report, "seconds": spent, "said": said}
+
+
+def inverse(model: mujoco.MjModel, path: list[np.ndarray]) -> np.ndarray:
+    """Torques (time, joint) of angles, rates and accelerations (joint, time)."""
+    data, out = mujoco.MjData(model), []
+    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(*(a.T for a in path), strict=True):
+        mujoco.mj_inverse(model, data)
+        out.append(data.qfrc_inverse.copy())
+    return np.array(out)
 
 
 def machine(system: str, kind: str, size: float = 1.0):
@@ -197,7 +236,7 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {"planted": planted, "moved": moved, "monitor": monitored, "compare": compared}
+    kinds = {"planted": planted, "moved": moved, "monitor": monitored, "compare": compared, "loaded": loaded}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

@@ -19,7 +19,7 @@ from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, ahead
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
-from nnap_em.diagnosis.outcome import Step, Suspect
+from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round
@@ -489,12 +489,26 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     assert after.model is before.model
 
 
-@pytest.mark.parametrize(("measured", "lengths"), [(("x", "dx"), [9]), (("dx",), [4, 6])])
-def test_where_a_joint_is_hidden_rounds_begin_at_short_horizons(monkeypatch, measured, lengths):
+@pytest.mark.parametrize(
+    ("measured", "white", "lengths"),
+    [(("x", "dx"), False, [9]), (("dx",), True, [4, 6, 9]), (("dx",), False, [9, 4, 6])],
+)
+def test_where_a_joint_is_hidden_there_are_short_rounds_and_they_lead_where_readings_are_white(
+    monkeypatch, measured, white, lengths
+):
     seen, context = [], _context()
-    context = context._replace(before=context.before._replace(rig=dataclasses.replace(RIG, measured=measured)))
+    before = context.before._replace(rig=dataclasses.replace(RIG, measured=measured))
+    context = context._replace(before=before, white=white)
+    monkeypatch.setattr(search, "white_innovations", lambda *_: False)
     monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
     monkeypatch.setattr(search, "_ladder", lambda _: [4, 6])
     monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
     search.search(context, release=lambda fitted, data: fitted)
     assert seen == [lengths]
+
+
+def test_what_was_left_open_is_that_of_the_longest_round():
+    short, whole, later = Step(60, (), (), None, 3), Step(500, (), (), None, 4), Step(500, (), (), None, 5)
+    before = _context().before
+    assert Diagnosis(before, before, (), (whole, short)).last == (whole,)
+    assert Diagnosis(before, before, (), (short, whole, later)).last == (later,)

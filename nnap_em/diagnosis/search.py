@@ -114,11 +114,10 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
-    hidden = not set(before.model.system.coordinates) <= set(before.rig.measured)
-    lengths = _ladder(context) if hidden else [_first(context)]
-    hypothesis, state, steps, complete = _search(context, *begun, lengths)
+    hypothesis, state, steps, complete = _search(context, *begun, _lengths(context))
     if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
-        last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
+        lengths = [*_ladder(context), context.longest]
+        last = _search(context._replace(loss=OneStep()), hypothesis, state, lengths)
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
     if outcome is None:
@@ -158,8 +157,20 @@ def _determined(
     return hypothesis, None, steps
 
 
+def _lengths(context: SearchContext) -> list[int]:
+    """Rows of the rounds until a law is accepted; where a joint is hidden, short ones among them.
+
+    Short ones come first where readings are white, and elsewhere last: there a start that is not read errs as much as
+    a law, and stands for it. On real arms six of thirteen hidden cases were then named wrong, two when they come last.
+    """
+    every = [_first(context), context.longest]
+    if not set(context.before.model.system.coordinates) <= set(context.before.rig.measured):
+        every = [*_ladder(context), context.longest] if context.white else [*every, *_ladder(context)]
+    return list(dict.fromkeys(every))
+
+
 def _ladder(context: SearchContext) -> list[int]:
-    """Rows of the first rounds where a joint is hidden: the two shortest horizons of the fit, and one in the middle.
+    """Rows of short rounds where a joint is hidden: the two shortest horizons of the fit, and one in the middle.
 
     Over the whole length a fit takes a strong effect for process noise: on a simulated arm a spring explains 0.38
     of the multi-step error over 0.6 s and less than 0.09 over 5 s; of the one-step error 0.17, and nothing.
@@ -194,13 +205,13 @@ class _Searched(NamedTuple):
 def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
     """Forward selection and backward elimination by one loss, until neither changes anything or the time is up.
 
-    The rounds use `lengths` rows in turn, then, and after the first law at once, all.  A law that was accepted
-    in time is fitted over the whole length, however long that takes.
+    The rounds use `lengths` rows in turn, and all after the first law.  A law that was accepted in time is fitted over
+    the whole length, however long that takes.
     """
     searched: set[frozenset] = set()
     steps: list[Step] = []
     longest = context.longest
-    ahead = [longest] if state else [*(length for length in lengths if length < longest), longest]
+    ahead = [longest] if state else list(lengths)
     while True:
         length = ahead.pop(0)
         best = state.best if state else context.stages[length][0].best if length < longest else context.before.model

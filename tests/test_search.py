@@ -19,7 +19,7 @@ from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, ahead
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep, OneStep, readings
-from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
+from nnap_em.diagnosis.outcome import Step, Suspect
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round
@@ -471,8 +471,8 @@ def test_ratios_of_noise_are_held_at_those_of_the_first_model():
 def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     """A fifth of the declared standard deviation, and the declared one for all that is reported."""
     rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
-    held = search._held(rig)
-    assert held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
+    held, share = search._held(rig, MODEL, False)
+    assert share == 0.2 and held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
     before = _context().before._replace(rig=held, smoother=search.unbranched(StartBank((1, 1), (0,))))
     stds = []
 
@@ -489,11 +489,16 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     assert after.model is before.model
 
 
+@pytest.mark.parametrize(("measured", "white"), [(("x", "dx"), True), (("dx",), False)])
+def test_declared_numbers_are_free_where_readings_are_white_or_a_joint_is_hidden(measured, white):
+    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)}, measured=measured)
+    assert search._held(rig, MODEL, white) == (rig, 1.0)
+
+
 @pytest.mark.parametrize(
-    ("measured", "white", "lengths"),
-    [(("x", "dx"), False, [9]), (("dx",), True, [4, 6, 9]), (("dx",), False, [9, 4, 6])],
+    ("measured", "white", "lengths"), [(("x", "dx"), True, [9]), (("dx",), True, [4, 6]), (("dx",), False, [9])]
 )
-def test_where_a_joint_is_hidden_there_are_short_rounds_and_they_lead_where_readings_are_white(
+def test_where_a_joint_is_hidden_and_readings_are_white_rounds_begin_at_short_horizons(
     monkeypatch, measured, white, lengths
 ):
     seen, context = [], _context()
@@ -505,10 +510,3 @@ def test_where_a_joint_is_hidden_there_are_short_rounds_and_they_lead_where_read
     monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
     search.search(context, release=lambda fitted, data: fitted)
     assert seen == [lengths]
-
-
-def test_what_was_left_open_is_that_of_the_longest_round():
-    short, whole, later = Step(60, (), (), None, 3), Step(500, (), (), None, 4), Step(500, (), (), None, 5)
-    before = _context().before
-    assert Diagnosis(before, before, (), (whole, short)).last == (whole,)
-    assert Diagnosis(before, before, (), (short, whole, later)).last == (later,)

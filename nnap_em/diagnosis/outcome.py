@@ -80,5 +80,5 @@ class Diagnosis(NamedTuple):
 
     @property
     def last(self) -> tuple[Step, ...]:
-        """Longest and last round of every measure: one-step errors do not withdraw what multi-step errors left open."""
-        return tuple({step.measure: step for step in sorted(self.steps, key=lambda step: step.horizon)}.values())
+        """Last round of every measure: one-step errors do not withdraw what the multi-step errors left open."""
+        return tuple({step.measure: step for step in self.steps}.values())

@@ -131,13 +131,7 @@ def _environment() -> jinja2.Environment:
     names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence", "share")
     environment.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "highest": _highest}
     environment.tests |= {"finite": finite, "failed": _fails}
-    environment.globals |= {
-        "most": MOST_PICTURES,
-        "catalogue": catalogue,
-        "level": FAILS,
-        "at": _at,
-        "ratio": ratio,
-    }
+    environment.globals |= {"most": MOST_PICTURES, "catalogue": catalogue, "level": FAILS, "at": _at, "ratio": ratio}
     return environment
 
 

@@ -144,11 +144,14 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
     outcome = cause.explained(compare(fit, second, names=("may", "june")), *recorded)
     ((data, options),) = searched
     assert data is recorded[1].data and options["own"] is recorded[0].data and options["start"] is fit
-    assert outcome.cause.friction and outcome.verdict.startswith(
-        "Changed since may: the Coulomb friction of joint 1 by"
-    )
+    assert not outcome.cause.bent
+    assert outcome.verdict.startswith("Changed since may: the Coulomb friction of joint 1 by")
     ratios = [float(re.search(r"are ([0-9.]+) times", text)[1]) for text in outcome.cause.judged]
     assert min(ratios) > 1.5 and outcome.cause.judged[0].startswith("On the recordings of june the errors of may")
+    for p_value, bent in ((RISEN, "which the recordings do not confirm"), (RISEN / 2, "which is this change seen")):
+        none = closed._replace(after=closed.before, evidence=(), risen=closed.risen._replace(p_value=p_value))
+        monkeypatch.setattr(cause, "diagnose", lambda *_, none=none, **__: none)
+        assert cause.explained(compare(fit, second), *recorded).cause.bent.startswith(bent)
 
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():

@@ -119,12 +119,14 @@ def test_friction_is_not_blamed_where_it_cannot_be(changed):
         law = list(curve.law)
         law[3] = law[3]._replace(value=np.asarray(value), std=np.ones(2), test=certain)
         assert not changed._replace(curves=(curve._replace(law=tuple(law)),)).other
-    loaded = both._replace(cause=Cause("Changed since first: a payload.", False, ()))
+    loaded = both._replace(
+        cause=Cause("Changed since first: a payload.", "which is this change seen through friction", ())
+    )
     assert loaded.verdict.startswith(
         "Changed since first: a payload. The friction curves of joint 1 and joint 2 differ"
     )
     assert loaded.verdict.endswith("which is this change seen through friction.")
-    worn = changed._replace(cause=Cause("Changed since first: the Coulomb friction.", True, ()))
+    worn = changed._replace(cause=Cause("Changed since first: the Coulomb friction.", "", ()))
     assert "The friction of joint 1 (Coulomb" in worn.verdict
 
 

@@ -11,6 +11,7 @@ from ..diagnosis.change import changes
 from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along
+from ..diagnosis.verdict import RISEN
 from ..em.loop import SEARCHED
 from ..em.recorded import errors_of, left_out, level, levels, risen
 from ..fit.identify import Identified
@@ -37,10 +38,11 @@ def explained(comparison: Comparison, first: Recorded, second: Recorded, log: Lo
     judged = (*_judged(comparison, one, first, two, second), *_judged(comparison, two, second, one, first))
     diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=one, own=first.data)
     accepted = findings(diagnosis)
-    rates = {*one.model.system.rates}
-    friction = [{*f.effect.signals(one.model.system)} <= rates for f in accepted]
+    worn = all({*f.effect.signals(one.model.system)} <= {*one.model.system.rates} for f in accepted)
+    some = accepted or (diagnosis.risen is not None and diagnosis.risen.p_value < RISEN)
+    bent = "which is this change seen through friction" if some else "which the recordings do not confirm"
     text = changes(diagnosis, accepted, None).replace("the fit", comparison.names[0])
-    return comparison._replace(cause=Cause(text, bool(accepted) and all(friction), judged))
+    return comparison._replace(cause=Cause(text, "" if accepted and worn else bent, judged))
 
 
 def _judged(

@@ -125,8 +125,8 @@ class Cause(NamedTuple):
     """A change from one fit to the other, by their recordings (`cause.explained`)."""
 
     text: str
-    friction: bool
-    """True where all of it is friction."""
+    bent: str
+    """Why friction curves differ with it; empty where it is friction that changed."""
     judged: tuple[str, ...]
     """Sentences on the errors of each fit on the recordings of the other."""
 
@@ -165,13 +165,11 @@ class Comparison(NamedTuple):
         """Reason for which something other than friction changed; empty where there is none, or recordings decide."""
         bent = [curve for curve in self.curves if curve.changed]
         if self.cause is not None:
-            return "" if self.cause.friction or not bent else "which is this change seen through friction"
+            return self.cause.bent if bent else ""
         # joints wear one by one; a load, a sensor or the supply bends every curve
         reasons = ["several at once"] if len(bent) >= 2 else []
         reasons += [curve.impossible for curve in bent if curve.impossible]
-        return (
-            f"{listed(reasons)}: something other than friction changed, such as a load or a sensor" if reasons else ""
-        )
+        return f"{listed(reasons)}: something other than friction changed, such as a load or a sensor" * bool(reasons)
 
     @property
     def _tested(self) -> str:
@@ -186,7 +184,7 @@ class Comparison(NamedTuple):
         bent = [f"joint {curve.joint}" for curve in self.curves if curve.changed]
         if self.other:
             moved = [number.name for number in self.numbers if number.changed]
-            also = f" {listed(moved)} changed." if moved else ""
+            also = f" Different as well: {listed(moved)}." if moved else ""
             return f"The friction curves of {listed(bent)} differ {between}, {self.other}.{also}"
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""

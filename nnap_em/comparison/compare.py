@@ -126,7 +126,7 @@ class Cause(NamedTuple):
 
     text: str
     bent: str
-    """Why friction curves differ with it; empty where it is friction that changed."""
+    """Reason for which friction curves differ with it; empty where it is friction that changed."""
     judged: tuple[str, ...]
     """Sentences on the errors of each fit on the recordings of the other."""
 

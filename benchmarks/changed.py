@@ -26,6 +26,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,8 @@ def loaded(name: str, out: Path) -> dict[str, Any]:
     (model_file,) = half.glob("*.xml")
     light, heavy = (mujoco.MjModel.from_xml_path(str(model_file)) for _ in range(2))
     heavy.body_mass[-1] += float(more)
+    inputs = tomllib.loads((half / "rig.toml").read_text())["input"]
+    drives = dict(zip(inputs["joints"], inputs["columns"], strict=True))
     joints = [light.joint(j).name for j in range(light.njnt)]
     for path in half.glob("train/*.csv"):
         log = np.genfromtxt(path, delimiter=",", names=True)
@@ -129,10 +132,8 @@ def loaded(name: str, out: Path) -> dict[str, Any]:
         path_of = [savgol_filter([log[j] for j in joints], 11, 3, order, dt) for order in range(3)]
         force = inverse(heavy, path_of) - inverse(light, path_of)
         mean = np.concatenate([0.5 * (force[:-1] + force[1:]), force[-1:]])
-        columns = {n: log[n] for n in log.dtype.names} | {
-            f"tau{j[1:]}": log[f"tau{j[1:]}"] + mean[:, i] for i, j in enumerate(joints)
-        }
-        write_csv(path, columns)
+        torques = {drives[j]: log[drives[j]] + mean[:, i] for i, j in enumerate(joints)}
+        write_csv(path, {n: log[n] for n in log.dtype.names} | torques)
     status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
     report = json.loads((found / "report.json").read_text()) if status == 0 else None
     return {"case": name, "report": report, "seconds": spent, "said": said}

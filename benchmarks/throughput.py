@@ -124,7 +124,7 @@ def speed_table(rows: list[dict], lines: list[list[str]]) -> list[str]:
 
 
 def limit_lines(group: str, rows: list[dict]) -> list[str]:
-    """How far the smoother is from one in C; the particle filter from the transition, and the transition from C."""
+    """Table of ratios of speed: our smoother over one in C; our particle filter and transition over their limits."""
     mine = [row for row in rows if row["who"] in ("nnap_em", "limit")]
     if group == "extended":
         rate = {row["what"]: pace(row) for row in mine}

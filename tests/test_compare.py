@@ -126,6 +126,9 @@ def test_friction_is_not_blamed_where_it_cannot_be(changed):
         "Changed since first: a payload. The friction curves of joint 1 and joint 2 differ"
     )
     assert loaded.verdict.endswith("which is this change seen through friction.")
+    mass = curve.law[3]._replace(name="m", test=certain)
+    alone = changed._replace(curves=(), numbers=(mass,), cause=Cause("Nothing changed.", "which is no change", ()))
+    assert alone.verdict.startswith("Nothing changed. M differed between first and grown")
     worn = changed._replace(cause=Cause("Changed since first: the Coulomb friction.", "", ()))
     assert "The friction of joint 1 (Coulomb" in worn.verdict
 

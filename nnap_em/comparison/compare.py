@@ -169,7 +169,8 @@ class Comparison(NamedTuple):
         # joints wear one by one; a load, a sensor or the supply bends every curve
         reasons = ["several at once"] if len(bent) >= 2 else []
         reasons += [curve.impossible for curve in bent if curve.impossible]
-        return f"{listed(reasons)}: something other than friction changed, such as a load or a sensor" * bool(reasons)
+        other = "something other than friction changed, such as a load or a sensor"
+        return f"{listed(reasons)}: {other}" if reasons else ""
 
     @property
     def _tested(self) -> str:
@@ -182,18 +183,18 @@ class Comparison(NamedTuple):
             return f"{nothing} changed {between} beyond the stated errors: {tested} tested at {CHANGED:.0%}."
         changed = []
         bent = [f"joint {curve.joint}" for curve in self.curves if curve.changed]
+        moved = [number.name for number in self.numbers if number.changed]
         if self.other:
-            moved = [number.name for number in self.numbers if number.changed]
             also = f" Different as well: {listed(moved)}." if moved else ""
             return f"The friction curves of {listed(bent)} differ {between}, {self.other}.{also}"
         for curve in self.curves:
             parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
             changed += [f"the {curve.name}{parts}"] * curve.changed
-        changed += [number.name for number in self.numbers if number.changed]
-        unchanged = tests - len(changed)
+        unchanged = tests - len(changed) - len(moved)
         others = counted(unchanged, "other quantity", "other quantities")
         others = f"{others} did not" if unchanged else "no other quantity was tested"
-        text = f"{listed(changed)} changed {between}; {others}."
+        verb = "differed" if self.cause and self.cause.bent else "changed"
+        text = f"{listed([*changed, *moved])} {verb} {between}; {others}."
         return text[0].upper() + text[1:]
 
     def __str__(self) -> str:

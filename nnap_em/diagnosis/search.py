@@ -276,7 +276,8 @@ def diagnose(
     data = Dataset(*map(jax.device_put, sequences_of(data, rig)))
     stages: Stages = {}
 
-    white = white_readings(data, declared := begin(rig, data, key=key).model)
+    declared = begin(rig, data, key=key).model
+    white = white_readings(data, declared)
     held, hold = _held(rig, declared, white)
 
     def identified(part: Dataset) -> Identified:
@@ -301,10 +302,8 @@ def diagnose(
     before = identified(data)
     if rig.equations:
         return search_equations(before, data, log, end)
-    change, origin = (
-        start is not None,
-        None if start is None or own is None else along(start, own, unbranched(start.bank)),
-    )
+    change = start is not None
+    origin = None if start is None or own is None else along(start, own, unbranched(start.bank))
     ended = _ended(hold) if change else finished if hold == 1.0 else _released(rig)
     if white:
         context = SearchContext(before, stages, data, MultiStep(), effort, log, (), end, origin, change, white)

@@ -21,7 +21,7 @@ from nnap_em.diagnosis.screen import Screen, Screened
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.diagnosis.trial import Trial
 from nnap_em.diagnosis.verdict import Share
-from nnap_em.effects import AbstractEffect, Candidate, catalogue
+from nnap_em.effects import AbstractEffect, Candidate, catalogue, flat
 from nnap_em.effects.function import Axis
 
 MODEL, RULE = slide()
@@ -53,15 +53,26 @@ def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None
 
 
 def _run(
-    monkeypatch, entries, errors=None, gains=None, hypothesis=BARE, loss=MULTI, members=None, shortlist=8, white=None
+    monkeypatch,
+    entries,
+    errors=None,
+    gains=None,
+    hypothesis=BARE,
+    loss=MULTI,
+    members=None,
+    shortlist=8,
+    white=None,
+    steps=None,
 ):
     """A round over these candidates, and the names of those that were refitted in turn.
 
-    A refit removes what the screen said, or leaves `errors` by name; its gain is 100 nat, or that of `gains`.
+    A refit removes what the screen said, or leaves `errors` by name; its gain is 100 nat, or that of `gains`.  Of the
+    forms of a law it takes the one whose first number has the largest of `steps`.
     """
     tried = []
 
-    def refit(screened, null, fit, loss, passes):
+    def refit(forms, null, fit, loss, passes):
+        screened = max(forms, key=lambda s: float((steps or {}).get(float(flat(s.candidate.start)[0]), 0.0)))
         law = screened.candidate.start
         tried.append(law.name)
         removed = 1 - (errors or {}).get(law.name, 1 - screened.share.least)
@@ -336,6 +347,30 @@ def test_no_more_laws_are_refitted_than_the_shortlist_holds(monkeypatch):
     assert len(tried) == 2 and outcome.accepted is None
 
 
+@pytest.mark.parametrize(
+    ("share", "loss", "value"),
+    [(0.461, MULTI, 2.0), (0.449, MULTI, 1.0), (0.461, OneStep(), 1.0)],  # nine tenths of the best, 0.51
+)
+def test_a_law_is_refitted_from_another_start_that_explains_as_much(monkeypatch, share, loss, value):
+    entries = [_screened(_law("motor_gain", 1.0), 0.51), _screened(_law("motor_gain", 2.0), share)]
+    outcome, tried = _run(monkeypatch, entries, loss=loss, steps={2.0: 0.4, 1.0: 0.3})
+    assert tried == ["motor_gain"] and float(flat(outcome.accepted.effect)[0]) == value
+
+
+def test_of_the_starts_of_a_law_the_one_whose_step_removes_most_is_refitted(monkeypatch):
+    none = trial.Null(*2 * [Refit(MODEL, RULE, None, np.zeros(6), None)])
+    fit = SmoothedFit(BARE, BARE, None, DATA, np.ones(6, bool), 9)
+    begun = lambda hypothesis, *_: none.start._replace(model=hypothesis.model)  # noqa: E731
+    errors = {0.8: 1.6, 0.9: 0.8, 1.1: 0.9}
+    monkeypatch.setattr(trial, "begun", begun)
+    monkeypatch.setattr(trial, "extended", lambda *_: None)
+    monkeypatch.setattr(trial, "fitted", lambda start, *_: pytest.fail(str(start.model.effects[-1].excess)))
+    left = lambda _, null, start, *rest: errors[round(float(flat(start.model.effects[-1])[0]), 1)]  # noqa: E731
+    monkeypatch.setattr(MultiStep, "ratio", left)
+    with pytest.raises(pytest.fail.Exception, match=r"0\.9"):
+        trial.with_candidate([_screened(_law("motor_gain", value), 0.5) for value in errors], none, fit, MULTI, 8)
+
+
 def test_a_law_whose_step_removes_nothing_is_not_refitted(monkeypatch):
     """Along the step of the screen the nonlinear error falls by less than a third of what a refit must remove."""
     starts, none = [], trial.Null(*2 * [Refit(MODEL, RULE, None, np.zeros(6), None)])
@@ -346,8 +381,8 @@ def test_a_law_whose_step_removes_nothing_is_not_refitted(monkeypatch):
     monkeypatch.setattr(trial, "extended", lambda *_: None)
     monkeypatch.setattr(trial, "fitted", lambda *_: pytest.fail("refitted"))
     monkeypatch.setattr(MultiStep, "ratio", lambda *_: 1 - 0.029)
-    outcome = trial.with_candidate(law, none, fit, MULTI, 8)
+    outcome = trial.with_candidate([law], none, fit, MULTI, 8)
     assert starts and outcome.refit is None and outcome.rejection.code == "small"
     monkeypatch.setattr(MultiStep, "ratio", lambda *_: 1 - 0.031)
     with pytest.raises(pytest.fail.Exception, match="refitted"):
-        trial.with_candidate(law, none, fit, MULTI, 8)
+        trial.with_candidate([law], none, fit, MULTI, 8)

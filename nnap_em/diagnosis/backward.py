@@ -109,4 +109,4 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
         if (entry.reached or key in evidence.equivalent) and (key not in best or best[key].rank < entry.rank):
             best[key] = entry
     for entry in best.values():
-        yield with_candidate(entry, null, fit, context.loss, context.effort.passes)
+        yield with_candidate([entry], null, fit, context.loss, context.effort.passes)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar, cast
 
+import jax
 import numpy as np
 
 from ..effects import AbstractEffect, flat
@@ -52,7 +53,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             group = _group(admitted, model)[: context.effort.shortlist - len(tried)]
             cases = []
             for s in group:
-                case = with_candidate(s, cast(Null, null), *fitting)
+                case = with_candidate(_forms(s, fresh, context), cast(Null, null), *fitting)
                 cases.append(case if case.rejection else case._replace(before=explained(case, context)))
                 _log(cases[-1], context)
             tried += cases
@@ -62,7 +63,8 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
         step = step._replace(untried=len(admitted))
-    others = [s for s in ranked if not any(s is case.screened for case in tried)]
+    judged = {key_of(case.candidate.start) for case in tried}
+    others = [s for s in ranked if key_of(s.candidate.start) not in judged]
     suspects = _suspects(others) if context.loss.multi_step else ()
     return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
 
@@ -173,6 +175,14 @@ def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
         if key not in best or best[key].rank < screened.rank:
             best[key] = screened
     return sorted(best.values(), key=_listed, reverse=True)
+
+
+def _forms(law: Screened, every: Sequence[Screened], context: SearchContext) -> list[Screened]:
+    """A law, and where many steps decide itself from other frequencies, times or widths that explain as much."""
+    shape = jax.tree.structure(law.candidate.start)
+    same = [s for s in every if s.reached and s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
+    near = [same[i] for i in even([s.share.least for s in same])] if context.loss.multi_step else [law]
+    return [s for s in near if s is law or seeded(s.candidate, s.coefficients).is_physical()]
 
 
 def _log(case: Trial, context: SearchContext) -> None:

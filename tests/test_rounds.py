@@ -1,5 +1,6 @@
 """One screening round on numbers: which laws are refitted, in what order, and what is said of those that are not."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -383,6 +384,9 @@ def test_a_law_whose_step_removes_nothing_is_not_refitted(monkeypatch):
     monkeypatch.setattr(MultiStep, "ratio", lambda *_: 1 - 0.029)
     outcome = trial.with_candidate([law], none, fit, MULTI, 8)
     assert starts and outcome.refit is None and outcome.rejection.code == "small"
+    hidden = BARE.refitted(dataclasses.replace(MODEL, measured=(1,)))  # whose motion was inferred without the law
+    with pytest.raises(pytest.fail.Exception, match="refitted"):
+        trial.with_candidate([law], none, fit._replace(hypothesis=hidden), MULTI, 8)
     monkeypatch.setattr(MultiStep, "ratio", lambda *_: 1 - 0.031)
     with pytest.raises(pytest.fail.Exception, match="refitted"):
         trial.with_candidate([law], none, fit, MULTI, 8)

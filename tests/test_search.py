@@ -489,20 +489,21 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
     assert after.model is before.model
 
 
-@pytest.mark.parametrize(("measured", "white"), [(("x", "dx"), True), (("dx",), False)])
+@pytest.mark.parametrize(("measured", "white"), [((0, 1), True), ((1,), False)])
 def test_declared_numbers_are_free_where_readings_are_white_or_a_joint_is_hidden(measured, white):
-    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)}, measured=measured)
-    assert search._held(rig, MODEL, white) == (rig, 1.0)
+    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
+    assert search._held(rig, dataclasses.replace(MODEL, measured=measured), white) == (rig, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("measured", "white", "lengths"), [(("x", "dx"), True, [9]), (("dx",), True, [4, 6]), (("dx",), False, [9])]
+    ("measured", "white", "lengths"), [((0, 1), True, [9]), ((1,), True, [4, 6]), ((1,), False, [9])]
 )
 def test_where_a_joint_is_hidden_and_readings_are_white_rounds_begin_at_short_horizons(
     monkeypatch, measured, white, lengths
 ):
     seen, context = [], _context()
-    before = context.before._replace(rig=dataclasses.replace(RIG, measured=measured))
+    model = dataclasses.replace(MODEL, measured=measured)
+    before = context.before._replace(state=context.before.state._replace(model=model, best=model))
     context = context._replace(before=before, white=white)
     monkeypatch.setattr(search, "white_innovations", lambda *_: False)
     monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))

@@ -250,7 +250,7 @@ def interventions(fitted: Identified, data: Dataset, bar: float = LEVEL) -> tupl
     A hidden joint answers whatever pushes the others, so that the pushes cannot be located there.
     """
     rig, system = fitted.rig, fitted.model.system
-    if not set(system.coordinates) <= set(rig.measured):
+    if fitted.model.hides:
         return ()
     least = SMALL * measure_scales(rig, system, data).torque
     return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least, bar)

@@ -114,7 +114,7 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
     except FitError as error:
         context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
         begun = context.declared, None
-    lengths = _ladder(context) if context.white and _hides(before.rig, before.model) else [_first(context)]
+    lengths = _ladder(context) if context.white and before.model.hides else [_first(context)]
     hypothesis, state, steps, complete = _search(context, *begun, lengths)
     if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
@@ -364,15 +364,10 @@ def _compared(
     return _branching(diagnosis._replace(before=before, after=after, change=True))
 
 
-def _hides(rig: Rig, model: StateSpaceModel) -> bool:
-    """True where a coordinate is not read."""
-    return not set(model.system.coordinates) <= set(rig.measured)
-
-
 def _held(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:
     """The rig with declared numbers nearly held, and their standard deviation over the declared one."""
     # Readings that are white do not bend them; a law would stand for what they leave of a motion that is hidden
-    if white or rig.equations or _hides(rig, model):
+    if white or rig.equations or model.hides:
         return rig, 1.0
     narrow = {name: dataclasses.replace(number, std=HELD * number.std) for name, number in rig.parameters.items()}
     return dataclasses.replace(rig, parameters=narrow), HELD

@@ -71,6 +71,11 @@ class StateSpaceModel(AbstractModel):
     pace: float = eqx.field(static=True, default=1.0)
     """Time in which the horizons of predictions are counted [s]: 1 s for machines with joints."""
 
+    @property
+    def hides(self) -> bool:
+        """True where a coordinate is not read."""
+        return not set(range(len(self.system.coordinates))) <= set(self.measured)
+
     def __str__(self) -> str:
         names = self.system.readable
         noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)

@@ -13,7 +13,8 @@ from .keys import Key, elsewhere, key_of, remainder_of, words
 from .losses import readings
 from .propose import proposals, surroundings
 from .refit import Refit
-from .screen import Screened, screen
+from .rounds import best_of_kind
+from .screen import screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, null_of, with_candidate
 from .verdict import KEEP, Rejection, needed
@@ -99,14 +100,9 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
     was compared with that when it was found.  Of each the best candidate.
     """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    every = proposals(around, fit.model.effects, context.kinds)
-    keyed = [(key_of(candidate.start), candidate) for candidate in every]
+    keyed = [(key_of(c.start), c) for c in proposals(around, fit.model.effects, context.kinds)]
     moved = bool(fit.model.effects)
     some = [c for key, c in keyed if key in evidence.equivalent or (moved and elsewhere(key, law))]
-    best: dict[Key, Screened] = {}
-    for entry in screen(context.loss, fit, some, shifts=0).screened if some else ():
-        key = key_of(entry.candidate.start)
-        if (entry.reached or key in evidence.equivalent) and (key not in best or best[key].rank < entry.rank):
-            best[key] = entry
-    for entry in best.values():
+    listed = screen(context.loss, fit, some, shifts=0).screened if some else ()
+    for entry in best_of_kind(s for s in listed if s.reached or key_of(s.candidate.start) in evidence.equivalent):
         yield with_candidate([entry], null, fit, context.loss, context.effort.passes)

@@ -39,7 +39,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
     seen = screen(context.loss, fit, proposals(around, model.effects, context.kinds))
     fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
-    ranked = _best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
+    ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
     disputed = _disputed(fresh, seen) if context.loss.multi_step else ()
@@ -167,7 +167,7 @@ def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
     return (new or (place is not None and pairs[place][1] is not None)) and not completed(law, model)
 
 
-def _best_of_kind(every: Iterable[Screened]) -> list[Screened]:
+def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
     """The best candidate of every kind, by its listed share."""
     best: dict[Key, Screened] = {}
     for screened in every:
@@ -204,11 +204,7 @@ def _log(case: Trial, context: SearchContext) -> None:
 
 
 def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
-    best: dict[Key, float] = {}
-    for case in tried:
-        key = key_of(case.effect)
-        best[key] = max(best.get(key, -np.inf), case.removed)
-    return tuple(sorted(best.items(), key=lambda entry: -entry[1]))
+    return tuple(sorted(((key_of(case.effect), case.removed) for case in tried), key=lambda entry: -entry[1]))
 
 
 def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:

@@ -320,6 +320,12 @@ class JointEffect(AbstractEffect):
 
     joint: int = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
     """Counted from 1."""
+    arguments: ClassVar[tuple[str, ...]] = ()
+    """Signals of its force: "position" and "rate" are those of its joint."""
+
+    def signals(self, system):
+        own = {"position": system.coordinates, "rate": system.rates}
+        return tuple(own[name][self.joint - 1] if name in own else name for name in self.arguments)
 
     def own(self, values: Float[Array, " dof"]) -> Scalar:
         """Entry of an array at its joint."""

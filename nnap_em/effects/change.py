@@ -22,6 +22,7 @@ class CoulombChange(JointEffect):
     meaning: ClassVar[str] = "Coulomb friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m"}
+    arguments: ClassVar[tuple[str, ...]] = ("rate",)
     change: Scalar
     knee: Scalar = known()
     """Rate over which the sign is smoothed [rad/s]."""
@@ -37,9 +38,6 @@ class CoulombChange(JointEffect):
     def phrase(self, sizes):
         return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"
 
-    def signals(self, system):
-        return (system.rates[self.joint - 1],)
-
     def force(self, scene, memory):
         return self.at(scene, -self.change * jnp.tanh(self.own(scene.v) / self.knee))
 
@@ -51,6 +49,7 @@ class ViscousChange(JointEffect):
     meaning: ClassVar[str] = "Viscous friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}
+    arguments: ClassVar[tuple[str, ...]] = ("rate",)
     change: Scalar
 
     @classmethod
@@ -61,9 +60,6 @@ class ViscousChange(JointEffect):
 
     def phrase(self, sizes):
         return f"the viscous friction of joint {self.joint} by {sizes['change']}"
-
-    def signals(self, system):
-        return (system.rates[self.joint - 1],)
 
     def force(self, scene, memory):
         return self.at(scene, -self.change * self.own(scene.v))

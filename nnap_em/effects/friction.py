@@ -20,6 +20,7 @@ class PositionDependentFriction(JointEffect):
     confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
     words: ClassVar[dict[str, str]] = {"depth": "relative depth", "n": "periods per turn", "phase": "phase"}
+    arguments: ClassVar[tuple[str, ...]] = ("position", "rate")
     cosine: Scalar
     sine: Scalar
     n: Scalar
@@ -32,9 +33,6 @@ class PositionDependentFriction(JointEffect):
     def values(self):
         depth = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"depth": depth, "n": self.n, "phase": jnp.arctan2(-self.sine, self.cosine)}
-
-    def signals(self, system):
-        return system.coordinates[self.joint - 1], system.rates[self.joint - 1]
 
     def friction(self, torque, scene):
         angle = self.n * self.own(scene.q)
@@ -50,6 +48,7 @@ class FrictionDrift(JointEffect):
     confirm: ClassVar[str] = "Run the same motion cold and warm."
     units: ClassVar[dict[str, str]] = {"change": "-", "tau": "s"}
     words: ClassVar[dict[str, str]] = {"change": "relative change", "tau": "time constant"}
+    arguments: ClassVar[tuple[str, ...]] = ("rate", "time")
     change: Scalar
     pace: Scalar
     """Log of tau."""
@@ -64,9 +63,6 @@ class FrictionDrift(JointEffect):
 
     def values(self):
         return {"change": self.change, "tau": jnp.exp(self.pace)}
-
-    def signals(self, system):
-        return system.rates[self.joint - 1], "time"
 
     def friction(self, torque, scene):
         grown = 1 - jnp.exp(-scene.time * jnp.exp(-self.pace))

@@ -22,6 +22,7 @@ class PeriodicForce(JointEffect):
         "Log the motion at rest with the drives off: what pushes in time with the machine beside it?"
     )
     units: ClassVar[dict[str, str]] = {"size": "N m", "frequency": "Hz"}
+    arguments: ClassVar[tuple[str, ...]] = ("time",)
     sine: Float[Array, " harmonic"]
     cosine: Float[Array, " harmonic"]
     frequency: Scalar
@@ -42,9 +43,6 @@ class PeriodicForce(JointEffect):
         return {"size": jnp.sqrt(0.5 * jnp.sum(self.sine**2 + self.cosine**2) + 1e-30), "frequency": self.frequency}
 
     def inputs_named(self):
-        return ("time",)
-
-    def signals(self, system):
         return ("time",)
 
     def richer(self, around):

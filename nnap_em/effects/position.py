@@ -11,14 +11,7 @@ import numpy as np
 from .base import Candidate, JointEffect, Scalar, a, known, one, pair
 
 
-class PlaceEffect(JointEffect):
-    """A force that depends on the position of its own joint alone."""
-
-    def signals(self, system):
-        return (system.coordinates[self.joint - 1],)
-
-
-class TorsionalSpring(PlaceEffect):
+class TorsionalSpring(JointEffect):
     """-k (theta_j - theta0), which may stiffen or soften with the angle.
 
     Inside a cubic in the angle, which is linear in what is estimated: k is its slope where it pulls to neither side.
@@ -31,6 +24,7 @@ class TorsionalSpring(PlaceEffect):
     )
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
     words: ClassVar[dict[str, str]] = {"k": "stiffness", "theta0": "rest position"}
+    arguments: ClassVar[tuple[str, ...]] = ("position",)
     slope: Scalar
     """Stiffness at zero [N m/rad]."""
     moment: Scalar
@@ -78,7 +72,7 @@ class TorsionalSpring(PlaceEffect):
         return self.at(scene, self._pull(inside) - jnp.maximum(self._slope(inside), 0.0) * (angle - inside))
 
 
-class Cogging(PlaceEffect):
+class Cogging(JointEffect):
     """amplitude sin(k theta_j + phase), and an overtone of twice k: detents are seldom pure."""
 
     name: ClassVar[str] = "cogging"
@@ -86,6 +80,7 @@ class Cogging(PlaceEffect):
     confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
     words: ClassVar[dict[str, str]] = {"amplitude": "amplitude", "k": "periods per turn", "phase": "phase"}
+    arguments: ClassVar[tuple[str, ...]] = ("position",)
     sine: Scalar
     cosine: Scalar
     k: Scalar
@@ -142,7 +137,7 @@ class TorqueOffset(JointEffect):
         return self.at(scene, self.value)
 
 
-class HardStop(PlaceEffect):
+class HardStop(JointEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
     name: ClassVar[str] = "hard_stop"
@@ -150,6 +145,7 @@ class HardStop(PlaceEffect):
     confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
     words: ClassVar[dict[str, str]] = {"upper": "upper stop", "lower": "lower stop"}
+    arguments: ClassVar[tuple[str, ...]] = ("position",)
     substeps: ClassVar[int] = 4
     linear: ClassVar[bool] = False
     upper: Scalar
@@ -198,6 +194,7 @@ class EddyBrake(JointEffect):
     confirm: ClassVar[str] = "Let the joint coast through a turn at one speed and look where it slows."
     units: ClassVar[dict[str, str]] = {"c": "N m s/rad", "center": "rad"}
     words: ClassVar[dict[str, str]] = {"c": "largest damping", "center": "strongest at"}
+    arguments: ClassVar[tuple[str, ...]] = ("position", "rate")
     even: Scalar
     """c cos(2 center)."""
     odd: Scalar
@@ -211,9 +208,6 @@ class EddyBrake(JointEffect):
     def values(self):
         c = jnp.sqrt(self.even**2 + self.odd**2 + 1e-30)
         return {"c": c, "center": 0.5 * jnp.arctan2(self.odd, self.even)}
-
-    def signals(self, system):
-        return system.coordinates[self.joint - 1], system.rates[self.joint - 1]
 
     def force(self, scene, memory):
         twice = 2 * self.own(scene.q)

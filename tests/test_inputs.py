@@ -173,15 +173,15 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
     }
 
 
-def test_a_cogging_of_less_than_a_period_is_a_spring(plain):
-    """Of the range of 2 rad that was visited, four periods a turn show more than one, three do not."""
+def test_a_cogging_that_is_not_seen_to_repeat_is_none(plain):
+    """Of the range of 2 rad that was visited, five periods a turn show more than one and a half, 4.5 do not."""
     around = plain[-1]._replace(low=-np.ones(2), high=np.ones(2))
     coggings = {
         float(c.start.near): c.start.visible(around)
         for c in catalogue["cogging"].candidates(around)
         if c.start.joint == 2
     }
-    assert coggings[4.0] and not coggings[3.0] and coggings[24.0]
+    assert coggings[5.0] and not coggings[4.5] and coggings[24.0]
 
 
 def test_a_spring_is_straight_beyond_what_was_seen():

@@ -89,8 +89,8 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most: on the linear screen a friction of three periods a turn may explain as much as one of five.
 
-    Not refitted where the nonlinear error hardly falls along the step of the screen, friction and parameters moving
-    with it.  That is not asked where a coordinate is not read: its motion was inferred without the law.
+    Not refitted where every coordinate is read and the nonlinear error hardly falls along the step of the screen,
+    friction and parameters moving with it: the motion of another one was inferred without the law.
     """
     hypothesis = fit.hypothesis
 
@@ -103,8 +103,8 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
 
     foreseen, screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
     candidate, effect = screened.candidate, full.model.effects[-1]
-    asked = loss.multi_step and not hypothesis.model.hides
-    if asked and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
+    must_fall = loss.multi_step and not hypothesis.model.hides
+    if must_fall and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
         return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
     end = fitted(start, fit, loss, passes)
     after = full.refitted(end.model)

@@ -778,8 +778,8 @@ the motion of a joint that is not read must not follow a law
 + loss.multi_step
 ## test_rounds.py::test_of_the_starts_of_a_law_the_one_whose_step_removes_most_is_refitted
 the worst start of a law
-- foreseen, screened, full, start = max(
-+ foreseen, screened, full, start = min(
+- (_, foreseen), screened, full, start = max(
++ (_, foreseen), screened, full, start = min(
 # diagnosis/rounds.py
 ## test_rounds.py::test_a_law_is_refitted_from_another_start_that_explains_as_much
 a law from one start

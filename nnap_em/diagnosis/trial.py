@@ -87,24 +87,24 @@ def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: AbstractLoss, passes
 
 def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
-    whose step removes most: on the linear screen a friction of three periods a turn may explain as much as one of five.
+    whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
 
     Not refitted where every coordinate is read and the nonlinear error hardly falls along the step of the screen,
     friction and parameters moving with it: the motion of another one was inferred without the law.
     """
     hypothesis = fit.hypothesis
 
-    def stepped(form: Screened) -> tuple[float, Screened, Hypothesis, Refit]:
+    def stepped(form: Screened) -> tuple[tuple[bool, float], Screened, Hypothesis, Refit]:
         effect = seeded(form.candidate, form.coefficients)
         place = replaced(effect, hypothesis.model)
         full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, form.candidate)
         start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-        return 1 - loss.ratio(null.start, start, fit, form.band) if loss.multi_step else np.nan, form, full, start
+        share = 1 - loss.ratio(null.start, start, fit, form.band) if loss.multi_step else np.nan
+        return (start.model.effects[-1].is_physical(), share), form, full, start
 
-    foreseen, screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
-    candidate, effect = screened.candidate, full.model.effects[-1]
-    must_fall = loss.multi_step and not hypothesis.model.hides
-    if must_fall and not needed(foreseen, FORESEEN * required(screened.floor, complexity(effect))):
+    (_, foreseen), screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
+    candidate, must_fall = screened.candidate, loss.multi_step and not hypothesis.model.hides
+    if must_fall and not needed(foreseen, FORESEEN * required(screened.floor, complexity(candidate.start))):
         return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
     end = fitted(start, fit, loss, passes)
     after = full.refitted(end.model)

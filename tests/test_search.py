@@ -23,7 +23,7 @@ from nnap_em.diagnosis.outcome import Step, Suspect
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round
-from nnap_em.diagnosis.screen import Screened
+from nnap_em.diagnosis.screen import Screen, Screened
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.diagnosis.trial import Null, Trial, certainty
 from nnap_em.diagnosis.verdict import Share
@@ -451,6 +451,19 @@ def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth,
     after = backward.backward(_context(), hypothesis)
     assert _names(after.model) == [name]
     assert after.evidence[0].equivalent == tuple(key_of(_law(each)) for each in same)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_an_equivalent_that_the_motion_does_not_show_takes_no_place(monkeypatch, seen):
+    """As a cogging of one period a turn that of a spring, where less than a turn was visited."""
+    tried = []
+    monkeypatch.setattr(backward, "surroundings", lambda *_, **__: None)
+    monkeypatch.setattr(backward, "proposals", lambda *_: [_candidate("motor_gain")])
+    monkeypatch.setattr(catalogue["motor_gain"], "visible", lambda *_: seen)
+    monkeypatch.setattr(backward, "screen", lambda _, fit, some, shifts: tried.extend(some) or Screen((), (), ()))
+    evidence = _found(0.5)._replace(equivalent=(key_of(_law("motor_gain")),))
+    assert not list(backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, None))
+    assert bool(tried) == seen
 
 
 def test_a_likelihood_pays_for_the_numbers_of_a_law_that_takes_a_place():

@@ -100,9 +100,9 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
     was compared with that when it was found.  Of each the best candidate.
     """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    keyed = [(key_of(c.start), c) for c in proposals(around, fit.model.effects, context.kinds)]
-    moved = bool(fit.model.effects)
-    some = [c for key, c in keyed if key in evidence.equivalent or (moved and elsewhere(key, law))]
+    every = proposals(around, fit.model.effects, context.kinds)
+    keyed = [(key_of(c.start), c) for c in every if c.start.visible(around)]
+    some = [c for key, c in keyed if key in evidence.equivalent or (fit.model.effects and elsewhere(key, law))]
     listed = screen(context.loss, fit, some, shifts=0).screened if some else ()
     for entry in best_of_kind(s for s in listed if s.reached or key_of(s.candidate.start) in evidence.equivalent):
         yield with_candidate([entry], null, fit, context.loss, context.effort.passes)

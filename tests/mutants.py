@@ -783,7 +783,7 @@ the worst start of a law
 # diagnosis/rounds.py
 ## test_rounds.py::test_a_law_is_refitted_from_another_start_that_explains_as_much
 a law from one start
-- near = [same[i] for i in even([s.share.least for s in same])] if context.loss.multi_step else [law]
+- near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least] if context.loss.multi_step else [law]
 + near = [law]
 # effects/position.py
 ## test_inputs.py::test_a_cogging_that_is_not_seen_to_repeat_is_none

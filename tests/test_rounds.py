@@ -382,6 +382,13 @@ def _refitted_from(monkeypatch, left, values, model=MODEL) -> float | None:
     return None
 
 
+def test_a_start_that_one_part_contradicts_counts_beside_an_admitted_one(monkeypatch):
+    """A ripple of nine periods overshoots on one part, one of ten is admitted, and its refit goes to nine."""
+    right = _screened(_law("motor_gain", 2.0), 0.76, folds=(0.9, 0.9, -0.2))
+    outcome, _ = _run(monkeypatch, [_screened(_law("motor_gain", 1.0), 0.56), right], steps={2.0: 0.4, 1.0: 0.3})
+    assert not right.admissible and float(flat(outcome.accepted.effect)[0]) == 2.0
+
+
 def test_of_the_starts_of_a_law_the_one_whose_step_removes_most_is_refitted(monkeypatch):
     """Of those that stay physical: a cogging that goes to another number of periods is a different one."""
     errors = {0.8: 1.6, 0.9: 0.8, 1.1: 0.9, 1.2: 0.7}

@@ -462,7 +462,9 @@ def test_an_equivalent_that_the_motion_does_not_show_takes_no_place(monkeypatch,
     monkeypatch.setattr(catalogue["motor_gain"], "visible", lambda *_: seen)
     monkeypatch.setattr(backward, "screen", lambda _, fit, some, shifts: tried.extend(some) or Screen((), (), ()))
     evidence = _found(0.5)._replace(equivalent=(key_of(_law("motor_gain")),))
-    assert not list(backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, None))
+    assert not list(
+        backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, Null(*2 * [_refit(MODEL)]))
+    )
     assert bool(tried) == seen
 
 

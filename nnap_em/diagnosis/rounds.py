@@ -18,7 +18,7 @@ from .propose import proposals, seeded, surroundings
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, explained, null_of, with_candidate
-from .verdict import EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
+from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
 
@@ -178,10 +178,10 @@ def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
 
 
 def _forms(law: Screened, every: Sequence[Screened], context: SearchContext) -> list[Screened]:
-    """A law, and where many steps decide itself from other frequencies, times or widths that explain as much."""
+    """A law and, where many steps decide, its other starts that explain as much; a part may speak against them."""
     shape = jax.tree.structure(law.candidate.start)
-    same = [s for s in every if s.reached and s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
-    near = [same[i] for i in even([s.share.least for s in same])] if context.loss.multi_step else [law]
+    same = [s for s in every if s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
+    near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least] if context.loss.multi_step else [law]
     return [s for s in near if s is law or seeded(s.candidate, s.coefficients).is_physical()]
 
 

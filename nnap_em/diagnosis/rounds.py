@@ -178,7 +178,7 @@ def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
 
 
 def _forms(law: Screened, every: Sequence[Screened], context: SearchContext) -> list[Screened]:
-    """A law and, where many steps decide, its other starts that explain as much; a part may speak against them."""
+    """A law and, where many steps decide, its other starts that explain as much; a part may contradict them."""
     shape = jax.tree.structure(law.candidate.start)
     same = [s for s in every if s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
     near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least] if context.loss.multi_step else [law]

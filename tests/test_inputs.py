@@ -174,7 +174,7 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
 
 
 def test_a_cogging_that_is_not_seen_to_repeat_is_none(plain):
-    """Of the range of 2 rad that was visited, five periods a turn show more than one and a half, 4.5 do not."""
+    """The range of 2 rad that was visited holds more than one and a half of five periods a turn, and less of 4.5."""
     around = plain[-1]._replace(low=-np.ones(2), high=np.ones(2))
     coggings = {
         float(c.start.near): c.start.visible(around)

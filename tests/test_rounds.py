@@ -385,12 +385,14 @@ def _refitted_from(monkeypatch, left, values, model=MODEL) -> float | None:
 def test_a_start_that_one_part_contradicts_counts_beside_an_admitted_one(monkeypatch):
     """A ripple of nine periods overshoots on one part, one of ten is admitted, and its refit goes to nine."""
     right = _screened(_law("motor_gain", 2.0), 0.76, folds=(0.9, 0.9, -0.2))
-    outcome, _ = _run(monkeypatch, [_screened(_law("motor_gain", 1.0), 0.56), right], steps={2.0: 0.4, 1.0: 0.3})
-    assert not right.admissible and float(flat(outcome.accepted.effect)[0]) == 2.0
+    admitted, steps = _screened(_law("motor_gain", 1.0), 0.56), {2.0: 0.4, 1.0: 0.3}
+    for other, value in ((right, 2.0), (right._replace(survived=0.02), 1.0)):  # that friction can imitate is no start
+        outcome, _ = _run(monkeypatch, [admitted, other], steps=steps)
+        assert not other.admissible and float(flat(outcome.accepted.effect)[0]) == value
 
 
 def test_of_the_starts_of_a_law_the_one_whose_step_removes_most_is_refitted(monkeypatch):
-    """Of those that stay physical: a cogging that goes to another number of periods is a different one."""
+    """A start whose step is not physical comes last: a cogging of another number of periods is another law."""
     errors = {0.8: 1.6, 0.9: 0.8, 1.1: 0.9, 1.2: 0.7}
     sound = lambda law: float(law.excess) < 1.15  # noqa: E731
     monkeypatch.setattr(catalogue["motor_gain"], "is_physical", sound)

@@ -178,11 +178,11 @@ def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
 
 
 def _forms(law: Screened, every: Sequence[Screened], context: SearchContext) -> list[Screened]:
-    """A law and, where many steps decide, its other starts that explain as much; a part may contradict them."""
+    """A law and, where many steps decide, its other starts that explain as much; parts may contradict those."""
     shape = jax.tree.structure(law.candidate.start)
     same = [s for s in every if s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
     near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least] if context.loss.multi_step else [law]
-    return [s for s in near if s is law or seeded(s.candidate, s.coefficients).is_physical()]
+    return [s for s in near if s is law or (s.sound and seeded(s.candidate, s.coefficients).is_physical())]
 
 
 def _log(case: Trial, context: SearchContext) -> None:
@@ -228,9 +228,8 @@ def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
         folds = np.asarray(share.folds)
         held = seen.members[screened.band]
         against = held[folds < 0].any(axis=0)
-        if not 0 < 2 * against.sum() < held.any(axis=0).sum():
-            continue  # no odd ones: it is no law
-        if not seeded(screened.candidate, screened.coefficients).is_physical():
+        odd = 0 < 2 * against.sum() < held.any(axis=0).sum()  # without odd ones it is no law
+        if not odd or not seeded(screened.candidate, screened.coefficients).is_physical():
             continue
         key = key_of(start)
         entry = Disputed(key, share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))

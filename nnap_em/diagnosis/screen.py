@@ -97,10 +97,12 @@ class Screened(NamedTuple):
     @property
     def admissible(self) -> bool:
         """True where the parts left out confirm the share."""
-        start, multiple = self.candidate.start, float(self.coefficients[0])
-        if not sensible(multiple, self.far, self.survived, linear=start.linear):
-            return False
-        return agreed(self.share.folds, self.floor, responds=start.responds_to_feedback())
+        return self.sound and agreed(self.share.folds, self.floor, responds=self.candidate.start.responds_to_feedback())
+
+    @property
+    def sound(self) -> bool:
+        """True for strengths that a fit may reach and that friction and parameters cannot stand for."""
+        return sensible(float(self.coefficients[0]), self.far, self.survived, linear=self.candidate.start.linear)
 
 
 def spans(candidates: Sequence[Candidate]) -> list[slice]:
@@ -314,9 +316,8 @@ def _screened(
 ) -> Iterator[Screened]:
     for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
-        directions = round(float(shares.directions[i]))
         numbers = band, floor, chance, independent, float(shares.survived[i]), float(shares.far[i])
-        yield Screened(candidate, shares.coefficients[span], directions, share, *numbers)
+        yield Screened(candidate, shares.coefficients[span], round(float(shares.directions[i])), share, *numbers)
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:

@@ -55,8 +55,7 @@ class Trial(NamedTuple):
     @property
     def rejection(self) -> Rejection | None:
         """Reason against it; None where there is none."""
-        numbers = {"certainty": self.certainty, "amplitude": self.amplitude, "removed": self.removed}
-        numbers["before"] = self.before
+        numbers = {name: getattr(self, name) for name in ("certainty", "amplitude", "removed", "before")}
         return veto(
             possible=self.effect.is_physical(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
         )
@@ -103,7 +102,8 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
         return (start.model.effects[-1].is_physical(), share), form, full, start
 
     (_, foreseen), screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
-    candidate, must_fall = screened.candidate, loss.multi_step and not hypothesis.model.hides
+    candidate = screened.candidate
+    must_fall = loss.multi_step and not hypothesis.model.hides
     if must_fall and not needed(foreseen, FORESEEN * required(screened.floor, complexity(candidate.start))):
         return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
     end = fitted(start, fit, loss, passes)

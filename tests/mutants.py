@@ -128,6 +128,10 @@ contrasts that only the network knows are tested
 - variance >= LEAST_VARIANCE
 + variance >= 0.0
 # comparison/compare.py
+## test_compare.py::test_errors_of_a_machine_that_did_not_change_are_widened_to_the_difference
+errors are widened by the square of their ratio
+- math.sqrt(test.statistic / test.freedom)
++ test.statistic / test.freedom
 ## test_compare.py::test_alarms_are_as_frequent_as_the_level_says
 changes that are not corrected for their number
 - test._replace(p_value=float(value)) for test, value

@@ -29,8 +29,7 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
 from nnap_em.diagnosis.change import changes
-from nnap_em.diagnosis.findings import SuspectReport
-from nnap_em.diagnosis.outcome import Diagnosis
+from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.multistep import Grid
@@ -112,7 +111,7 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
     change = found.parameters["change"]
     assert found.effect.name == "coulomb_change"
     assert abs(change.value - GROWN) < 2 * change.std < 0.1 * GROWN
-    assert changes(closed, [found], None).startswith("Changed since the fit: the Coulomb friction of joint 1 by 0.")
+    assert changes(closed, [found]).startswith("Changed since the fit: the Coulomb friction of joint 1 by 0.")
     save(tmp_path / "after.npz", closed.after)
     assert float(load(tmp_path / "after.npz").model.effects[0].change) == float(found.effect.change)
 
@@ -120,9 +119,7 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
 def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     closed = diagnose(_rig(), _logs(2), key=jax.random.key(0), start=fit, own=_logs(0))
     assert not findings(closed) and closed.risen.p_value > RISEN
-    assert changes(closed, [], None).startswith(
-        "Nothing changed since the fit that these recordings could show: errors"
-    )
+    assert changes(closed, []).startswith("Nothing changed since the fit that these recordings could show: errors")
 
 
 def test_a_law_that_was_missing_before_is_no_change():
@@ -148,10 +145,21 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
     assert outcome.verdict.startswith("Changed since may: the Coulomb friction of joint 1 by")
     ratios = [float(re.search(r"are ([0-9.]+) times", text)[1]) for text in outcome.cause.judged]
     assert min(ratios) > 1.5 and outcome.cause.judged[0].startswith("On the recordings of june the errors of may")
-    for p_value, bent in ((RISEN, "which the recordings do not confirm"), (RISEN / 2, "which is this change seen")):
+    spring, mass = ("torsional_spring", 1, None, ()), ("payload", 1, None, ())
+    differ = compare(fit, second).curves[0].test
+    for p_value, rivals in ((RISEN, ()), (RISEN / 2, ()), (RISEN, (spring, mass))):
+        last = closed.steps[-1]._replace(rivals=rivals, suspects=())
         none = closed._replace(after=closed.before, evidence=(), risen=closed.risen._replace(p_value=p_value))
+        none = none._replace(steps=(last,))
         monkeypatch.setattr(cause, "diagnose", lambda *_, none=none, **__: none)
-        assert cause.explained(compare(fit, second), *recorded).cause.bent.startswith(bent)
+        seen = cause.explained(compare(fit, second), *recorded)
+        if rivals or p_value < RISEN:
+            assert seen.changed and not seen.widened and "Something changed" in seen.verdict
+            assert seen.curves[0].test == differ and "which is this change seen through friction" in seen.cause.bent
+        else:
+            assert not seen.changed and "now widened by that: the recordings do not confirm it" in seen.verdict
+            ratio = math.sqrt(differ.statistic / differ.freedom)
+            assert seen.widened["friction of joint 1"] == pytest.approx(ratio)
 
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
@@ -162,16 +170,16 @@ def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
 
 
 def test_where_nothing_explains_it_the_errors_decide(fit):
-    suspect = SuspectReport("payload", 1, None, [], 0.1, 0.0, "payload", "a payload would remove 10%", "Weigh it.")
+    last = Step(150, (), (), None, 1, suspects=(Suspect(("payload", 1, None, ()), 0.1, 0.0),))
     for p, least, text, ending in (
-        (0.9 * RISEN, 1e-3, "Something changed", "Suspected: a payload would remove 10%."),
+        (0.9 * RISEN, 1e-3, "Something changed", "where chance removes less than 1%."),
         (1.1 * RISEN, 0.9 * RISEN, "Nothing changed", "(p = 0.011)."),
         (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "(p = 0.011)."),
     ):
-        outcome = Diagnosis(fit, fit, (), (), change=True, risen=Risen(2.0, p, least))
-        sentence = changes(outcome, [], None, suspects=[suspect])
+        outcome = Diagnosis(fit, fit, (), (last,), change=True, risen=Risen(2.0, p, least))
+        sentence = changes(outcome, [])
         assert sentence.startswith(text) and sentence.endswith(ending) and "errors are 2.0 times" in sentence
-    assert "not at hand" in changes(outcome._replace(risen=None), [], None)
+    assert "not at hand" in changes(outcome._replace(risen=None), [])
 
 
 # --- errors by recording

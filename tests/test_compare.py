@@ -16,7 +16,16 @@ import scipy.stats
 from helpers import nnap
 
 from nnap_em import compare
-from nnap_em.comparison.compare import CHANGED, LEAST_SHARED, Cause, Comparison, corrected_tests, number, shared
+from nnap_em.comparison.compare import (
+    CHANGED,
+    LEAST_SHARED,
+    Cause,
+    Comparison,
+    corrected_tests,
+    number,
+    shared,
+    unconfirmed,
+)
 from nnap_em.comparison.pooling import LEAST_VARIANCE, joint_test, pool
 from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.hypothesis import Hypothesis
@@ -131,6 +140,21 @@ def test_friction_is_not_blamed_where_it_cannot_be(changed):
     assert alone.verdict.startswith("Nothing changed. M differed between first and grown")
     worn = changed._replace(cause=Cause("Changed since first: the Coulomb friction.", "", ()))
     assert "The friction of joint 1 (Coulomb" in worn.verdict
+
+
+def test_errors_of_a_machine_that_did_not_change_are_widened_to_the_difference(changed, unchanged):
+    """As Birge has it: the statistic is then its degrees of freedom, and values stay; what agrees is as it was."""
+    wide, (before,) = unconfirmed(changed), changed.curves
+    (after,), ratio = wide.curves, math.sqrt(before.test.statistic / before.test.freedom)
+    assert before.changed and not wide.changed and wide.widened == {"friction of joint 1": ratio} and ratio > 1
+    assert after.test.statistic == pytest.approx(after.test.freedom)
+    np.testing.assert_allclose(after.std, ratio * before.std)
+    np.testing.assert_array_equal(after.torque, before.torque)
+    assert (after.law[0].std > before.law[0].std).all()
+    assert wide.numbers[0].std.tolist() == changed.numbers[0].std.tolist()
+    assert describe(wide)["widened"] == wide.widened
+    assert wide.verdict.startswith("Friction of joint 1 differs between first and grown by ")
+    assert not unconfirmed(unchanged).widened
 
 
 @pytest.mark.parametrize("p, text", [(1.01e-6, "1.0 × 10⁻⁶"), (0.99e-6, "< 10⁻⁶"), (0.0, "< 10⁻⁶")])

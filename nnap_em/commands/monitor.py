@@ -75,7 +75,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
         key = jax.random.fold_in(fitted.state.key, SEARCHED)
         diagnosis = diagnose(rig, whole.data, key=key, log=log, start=fitted, own=own.data)
         accepted = findings(diagnosis)
-        document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted, None)}
+        document |= {"effects": [entry(f) for f in accepted], "since_fit": changes(diagnosis, accepted)}
     write_monitor(args.out, fitted, beside, seen, document, log)
     return 4 if seen.alarm is not None else 0  # the exit status of a machine that changed
 

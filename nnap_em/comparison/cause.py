@@ -1,6 +1,5 @@
 """Two fits of one machine, each on the recordings of the other: one law behind the quantities that differ."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -8,17 +7,15 @@ import jax
 from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..diagnosis.change import changes
-from ..diagnosis.findings import findings
+from ..diagnosis.findings import findings, undecided
 from ..diagnosis.search import diagnose
-from ..diagnosis.smoothed import along
+from ..diagnosis.smoothed import along, risen_since
 from ..diagnosis.verdict import RISEN
 from ..em.loop import SEARCHED
-from ..em.recorded import errors_of, left_out, level, levels, risen
-from ..fit.identify import Identified
 from ..fit.known import known
 from ..numerics.digits import number
 from ..storage.log import Log, silent
-from .compare import Cause, Comparison
+from .compare import Cause, Comparison, Fit, unconfirmed
 
 
 class Recorded(NamedTuple):
@@ -33,27 +30,23 @@ def explained(comparison: Comparison, first: Recorded, second: Recorded, log: Lo
 
     Raises FitError where one of them follows no recording of the other.
     """
-    one, two = (fit.fitted for fit in comparison.fits)
-    key = jax.random.fold_in(one.state.key, SEARCHED)
-    judged = (*_judged(comparison, one, first, two, second), *_judged(comparison, two, second, one, first))
-    diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=one, own=first.data)
-    accepted = findings(diagnosis)
-    worn = all({*f.effect.signals(one.model.system)} <= {*one.model.system.rates} for f in accepted)
-    some = accepted or (diagnosis.risen is not None and diagnosis.risen.p_value < RISEN)
-    bent = "which is this change seen through friction" if some else "which the recordings do not confirm"
-    text = changes(diagnosis, accepted, None).replace("the fit", comparison.names[0])
-    return comparison._replace(cause=Cause(text, "" if accepted and worn else bent, judged))
+    one, two = comparison.fits
+    judged = _judged(one, first, two, second), _judged(two, second, one, first)
+    start, key = one.fitted, jax.random.fold_in(one.fitted.state.key, SEARCHED)
+    diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=start, own=first.data)
+    accepted, test = findings(diagnosis), diagnosis.risen
+    worn = all({*f.effect.signals(start.model.system)} <= {*start.model.system.rates} for f in accepted)
+    some = accepted or undecided(diagnosis) or (test is not None and test.p_value < RISEN)
+    text = changes(diagnosis, accepted).replace("the fit", one.name)
+    bent = "" if accepted and worn else "which is this change seen through friction"
+    return (comparison if some else unconfirmed(comparison))._replace(cause=Cause(text, bent, judged))
 
 
-def _judged(
-    comparison: Comparison, fit: Identified, own: Recorded, other: Identified, recorded: Recorded
-) -> Iterator[str]:
+def _judged(fit: Fit, own: Recorded, other: Fit, recorded: Recorded) -> str:
     """A sentence on the errors of a fit on the recordings of the other."""
-    names = {id(each.fitted): each.name for each in comparison.fits}
-    beside = along(fit, jax.device_put(own.data), fit.smoother)
-    out = levels(left_out(beside.model, beside.m_step, beside.path, beside.data, beside.used))
-    put = known(fit, recorded.rig, recorded.data, key=jax.random.fold_in(fit.state.key, SEARCHED))
-    now = along(put, jax.device_put(recorded.data), put.smoother)
-    test = risen(out.level, level(errors_of(now.model, now.m_step, now.path, now.data), out.scale))
+    one = fit.fitted
+    put = known(one, recorded.rig, recorded.data, key=jax.random.fold_in(one.state.key, SEARCHED))
+    pairs = (one, own.data), (put, recorded.data)
+    test = risen_since(*(along(each, jax.device_put(data), each.smoother) for each, data in pairs))
     size = f"{number(test.ratio, 2)} times those on its own recordings left out (p = {number(test.p_value, 2)})"
-    yield f"On the recordings of {names[id(other)]} the errors of {names[id(fit)]} are {size}"
+    return f"On the recordings of {other.name} the errors of {fit.name} are {size}"

@@ -2,7 +2,8 @@
 
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,7 +143,9 @@ class Comparison(NamedTuple):
     """Effects and parameters that some fits have and others lack."""
     warnings: tuple[str, ...]
     cause: Cause | None = None
-    """None where the recordings are not at hand, or nothing changed."""
+    """None where the recordings are not at hand, or no quantity differs."""
+    widened: Mapping[str, float] = {}
+    """Multiple of the stated errors to which those of a quantity are widened, as recordings show no change."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -177,6 +180,11 @@ class Comparison(NamedTuple):
         """The outcome of the tests in one sentence."""
         tests = sum(number.test is not None for number in self.numbers) + len(self.curves)
         between = f"between {listed(self.names)}"
+        if self.widened:
+            verb = "differs" if len(self.widened) == 1 else "differ"
+            times = listed([f"{ratio:.1f}" for ratio in self.widened.values()])
+            text = f"{listed([*self.widened])} {verb} {between} by {times} times the stated errors, now widened by that"
+            return f"{text[0].upper()}{text[1:]}: the recordings do not confirm it."
         if not self.changed:
             nothing = "No tested quantity" if self.differences else "Nothing"
             tested = counted(tests, "quantity", "quantities")
@@ -232,24 +240,26 @@ def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Compar
     together = tuple(fit._replace(name=label) for fit, label in zip(opened, labels, strict=True))
     for one, two in itertools.combinations(together, 2):
         _check(one, two)
-    return judged(
-        Comparison(
-            together,
-            tuple(_curves(together)),
-            tuple(_numbers(together)),
-            tuple(_differences(together)),
-            tuple(_warnings(together)),
-        )
-    )
+    return _beside(together, {})
 
 
-def judged(comparison: Comparison) -> Comparison:
-    """The same with p-values that are corrected for the number of quantities."""
-    tests = [quantity.test for quantity in (*comparison.curves, *comparison.numbers)]
+def _beside(fits: tuple[Fit, ...], widened: Mapping[str, float]) -> Comparison:
+    """All quantities with their tests, and their p-values corrected for the number of quantities."""
+    curves, numbers = tuple(_curves(fits, widened)), tuple(_numbers(fits, widened))
+    tests = [quantity.test for quantity in (*curves, *numbers)]
     corrected = iter(corrected_tests([test for test in tests if test is not None]))
-    curves = tuple(curve._replace(test=next(corrected)) for curve in comparison.curves)
-    numbers = tuple(n if n.test is None else n._replace(test=next(corrected)) for n in comparison.numbers)
-    return comparison._replace(curves=curves, numbers=numbers)
+    curves = tuple(curve._replace(test=next(corrected)) for curve in curves)
+    numbers = tuple(n if n.test is None else n._replace(test=next(corrected)) for n in numbers)
+    return Comparison(fits, curves, numbers, tuple(_differences(fits)), tuple(_warnings(fits)), widened=widened)
+
+
+def unconfirmed(comparison: Comparison) -> Comparison:
+    """The same where recordings show no change: fits that differ by more than they state show what their errors are.
+
+    Of each quantity that differs they are widened by (Q / degrees of freedom)^1/2 [Birge 1932, Phys. Rev. 40, 207].
+    """
+    tests = {each.name: each.test for each in (*comparison.curves, *comparison.numbers) if each.changed and each.test}
+    return _beside(comparison.fits, {name: math.sqrt(test.statistic / test.freedom) for name, test in tests.items()})
 
 
 def corrected_tests(tests: Sequence[JointTest]) -> list[JointTest]:
@@ -337,7 +347,7 @@ def _identity(fitted: Identified) -> tuple:
 # --- the quantities
 
 
-def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
+def _curves(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Curve]:
     """The friction of every joint of which all fits visited a common range of velocities."""
     places = tuple(i for i, fit in enumerate(fits) if fit.fitted.rig.friction)
     if len(places) < 2:
@@ -352,6 +362,7 @@ def _curves(fits: Sequence[Fit]) -> Iterator[Curve]:
         torque, cov = (
             np.stack([np.asarray(getattr(table, part)[j]) for table in tables]) for part in ("torque", "cov")
         )
+        cov = widened.get(f"friction of joint {j + 1}", 1.0) ** 2 * cov
         std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
         angle = fits[0].fitted.model.system.angles[j]
         pooled, test = pool(torque, std), joint_test(torque, cov)
@@ -372,13 +383,14 @@ def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) 
     return tuple(row._replace(test=test) for row, test in zip(rows, tests, strict=True))
 
 
-def _numbers(fits: Sequence[Fit]) -> Iterator[Number]:
+def _numbers(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Number]:
     """The estimated parameters of the machine and of effects."""
     tables = [_estimates(fit.fitted) for fit in fits]
     periodic = "phase of"  # beginning of parameters of effects that are the same after a whole turn [rad]
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
         value, std = (np.asarray([np.nan if entry is None else entry[i] for entry in entries], float) for i in range(2))
+        std = widened.get(name, 1.0) * std
         if name.startswith(periodic):
             first = value[np.isfinite(value)][0]
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi

@@ -4,36 +4,28 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..numerics.digits import number
-from .findings import Finding, SuspectReport, verdict
-from .keys import Key, listed, words
+from .findings import Finding, suspected, undecided, verdict
+from .keys import listed, words
 from .outcome import Diagnosis
 from .verdict import RISEN
 
 
-def changes(
-    diagnosis: Diagnosis,
-    accepted: Sequence[Finding],
-    error: Mapping[str, Any] | None,
-    rivals: Sequence[Key] = (),
-    suspects: Sequence[SuspectReport] = (),
-) -> str:
+def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[str, Any] | None = None) -> str:
     """The outcome in one sentence, where nothing is named with the test of whether errors have risen."""
     if not diagnosis.complete:
-        first = changes(diagnosis._replace(complete=True), accepted, error, rivals, suspects)
+        first = changes(diagnosis._replace(complete=True), accepted, error)
         return f"{first} The search is not finished: more may have changed."
     if accepted:
         return verdict(accepted, error, opening="Changed since the fit:")
-    if rivals:
+    if rivals := undecided(diagnosis):
         return f"Something changed since the fit, but {listed([*map(words, rivals)])} explain the same; none is added."
-    suspected = f" Suspected: {suspects[0].description}." if suspects else ""
+    also = "".join(f" Suspected: {suspect.description}." for suspect in suspected(diagnosis)[:1])
     test = diagnosis.risen
     if test is None:
-        return f"Nothing is certain to have changed since the fit, whose own recordings are not at hand.{suspected}"
+        return f"Nothing is certain to have changed since the fit, whose own recordings are not at hand.{also}"
     size = f"errors are {number(test.ratio, 2)} times those on its recordings left out (p = {number(test.p_value, 2)})"
     if test.p_value < RISEN:
-        return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{suspected}"
-    if test.least >= RISEN:
-        return (
-            f"Nothing is certain to have changed since the fit, and so few recordings cannot show it by errors: {size}."
-        )
-    return f"Nothing changed since the fit that these recordings could show: {size}."
+        return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{also}"
+    few = "is certain to have changed since the fit, and so few recordings cannot show it by errors"
+    many = "changed since the fit that these recordings could show"
+    return f"Nothing {few if test.least >= RISEN else many}: {size}."

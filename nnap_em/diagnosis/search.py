@@ -21,7 +21,6 @@ from ..effects.sensor import SensorQuantization
 from ..em.loop import EMState, FitError, e_step
 from ..em.mstep import not_diverged
 from ..em.noise import white_readings
-from ..em.recorded import errors_of, left_out, level, levels, risen
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel
@@ -41,7 +40,7 @@ from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step, Suspect
 from .quantised import quantised
 from .rounds import Round, screening_round
-from .smoothed import SmoothedFit, along
+from .smoothed import SmoothedFit, along, risen_since
 from .trial import Trial, certainty
 from .undisturbed import disturbance_free
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
@@ -353,15 +352,10 @@ def _compared(
     diagnosis: Diagnosis, origin: SmoothedFit | None, data: Dataset, ended: Callable[[Identified, Dataset], Identified]
 ) -> Diagnosis:
     """The outcome of a search for changes, with the test of whether errors have risen."""
-    if origin is not None:
-        before = diagnosis.before
-        out = levels(left_out(origin.model, origin.m_step, origin.path, origin.data, origin.used))
-        path = e_step(before.model, data, before.smoother, key=before.state.key).state
-        now = level(errors_of(before.model, before.m_step, path, data), out.scale)
-        diagnosis = diagnosis._replace(risen=risen(out.level, now))
-    before = ended(diagnosis.before, data)
+    now = along(diagnosis.before, data, diagnosis.before.smoother)
+    risen, before = None if origin is None else risen_since(origin, now), ended(diagnosis.before, data)
     after = diagnosis.after if any(evidence is not None for evidence in diagnosis.evidence) else before
-    return _branching(diagnosis._replace(before=before, after=after, change=True))
+    return _branching(diagnosis._replace(before=before, after=after, change=True, risen=risen))
 
 
 def _held(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:

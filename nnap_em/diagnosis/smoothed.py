@@ -11,6 +11,7 @@ from jaxtyping import Bool, Int
 from ..data.dataset import Dataset
 from ..em.loop import e_step
 from ..em.mstep import ScoringMStep, not_diverged
+from ..em.recorded import Risen, errors_of, left_out, level, levels, risen
 from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -58,6 +59,12 @@ def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> Smoo
     return SmoothedFit(
         hypothesis, hypothesis, posterior.state, data, np.asarray(not_diverged(posterior, data)), data.t.shape[1]
     )
+
+
+def risen_since(own: SmoothedFit, now: SmoothedFit) -> Risen:
+    """Test of whether the errors of a fit are larger on new recordings than on its own, each left out."""
+    out = levels(left_out(own.model, own.m_step, own.path, own.data, own.used))
+    return risen(out.level, level(errors_of(now.model, now.m_step, now.path, now.data), out.scale))
 
 
 @eqx.filter_jit

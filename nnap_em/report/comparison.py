@@ -48,6 +48,7 @@ def describe(comparison: Comparison) -> dict[str, Any]:
         "verdict": comparison.verdict,
         "cause": comparison.cause,
         "changed": comparison.changed,
+        "widened": comparison.widened,
         "level": CHANGED,
         "least_shared": LEAST_SHARED,
         "fits": [

@@ -67,7 +67,7 @@ def write_diagnosis(
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.complete), moved(diagnosis.after)
     if diagnosis.change:
-        outcome, far = changes(diagnosis, accepted, error, rivals, suspects), []
+        outcome, far = changes(diagnosis, accepted, error), []
     command = "nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."
     designed = [command] if diagnosis.before.rig.input_columns and not diagnosis.before.rig.equations else []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {

@@ -731,6 +731,10 @@ the fit that is behind wins
 - np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3)
 + np.nan_to_num(b, nan=-1e3) - np.nan_to_num(a, nan=-1e3)
 # diagnosis/rounds.py
+## test_rounds.py::test_a_free_function_is_no_change_where_errors_have_not_risen_since_the_fit
+a free function is a change whatever the errors
+- law.named or context.functions
++ True
 ## test_rounds.py::test_refits_decide_between_laws_that_the_screen_cannot_tell_apart
 the least likely of even laws is first
 - return case.gain - PRICE
@@ -761,6 +765,10 @@ a worse law takes the place of another
 - if lead > 1:
 + if lead < 1:
 # diagnosis/search.py
+## test_search.py::test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect
+two recordings are as sure as many
+- max(len({*context.pieces} or context.data.t) - 1, 1)
++ math.inf
 ## test_search.py::test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part
 a law stays beside any remainder
 - form is None and 0 in even(

@@ -24,6 +24,7 @@ from nnap_em.diagnosis.trial import Trial
 from nnap_em.diagnosis.verdict import Share
 from nnap_em.effects import AbstractEffect, Candidate, catalogue, flat
 from nnap_em.effects.function import Axis
+from nnap_em.em.recorded import Risen
 
 MODEL, RULE = slide()
 BARE = Hypothesis(MODEL, RULE)
@@ -64,6 +65,7 @@ def _run(
     shortlist=8,
     white=None,
     steps=None,
+    risen=None,
 ):
     """A round over these candidates, and the names of those that were refitted in turn.
 
@@ -91,7 +93,7 @@ def _run(
     fit = SmoothedFit(BARE, hypothesis, None, DATA, np.ones(6, bool), 9)
     before = SimpleNamespace(rig=RIG)
     effort, white = SEARCH_EFFORT._replace(shortlist=shortlist), not loss.multi_step if white is None else white
-    context = SearchContext(before, {}, DATA, loss, effort, lambda text: None, white=white)
+    context = SearchContext(before, {}, DATA, loss, effort, lambda text: None, white=white, risen=risen)
     return screening_round(fit, context), tried
 
 
@@ -191,6 +193,17 @@ def test_of_a_chain_of_laws_that_contain_each_other_one_stands(monkeypatch):
     laws = [_screened(_function("x"), 0.42), _screened(_function("x", "dx"), 0.46), _screened(_spring(), 0.38)]
     outcome, _ = _run(monkeypatch, laws)
     assert outcome.accepted.effect.name == "torsional_spring"
+
+
+def test_a_free_function_is_no_change_where_errors_have_not_risen_since_the_fit(monkeypatch):
+    """It is a suspect then, and what it contains does not take its place; a law with a name is told by its form."""
+    laws = [_screened(_function("x"), 0.5), _screened(_spring(), 0.2)]
+    for p, function in ((0.022, True), (0.023, False)):  # two standard deviations
+        risen = Risen(1.2, p, 1e-4)
+        outcome, tried = _run(monkeypatch, laws, risen=risen)
+        assert (outcome.accepted is not None) == function and tried == ["unknown_function"]
+        assert [s.key[0] for s in outcome.step.suspects] == ([] if function else ["unknown_function"])
+        assert _run(monkeypatch, laws[1:], risen=risen)[0].accepted.effect.name == "torsional_spring"
 
 
 @pytest.mark.parametrize(("remainder", "accepted"), [(0.28, "unknown_function"), (0.26, "air_drag")])

@@ -331,20 +331,30 @@ def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(remo
 
 
 @pytest.mark.parametrize(
-    ("certain", "names"), [(2.1, ["motor_gain", "dead_zone"]), (1.9, ["dead_zone"]), (0.9, ["dead_zone"])]
+    ("certain", "pieces", "white", "stays"),
+    [
+        (2.1, (), True, True),
+        (1.9, (), True, False),
+        (2.7, (), False, True),  # six recordings: Student's t of five degrees of freedom
+        (2.6, (), False, False),
+        (14.1, (0, 0, 0, 1, 1, 1), False, True),  # two
+        (13.9, (0, 0, 0, 1, 1, 1), False, False),
+        (13.9, (0, 0, 0, 1, 1, 1), True, True),
+    ],
 )
-def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, certain, names):
-    """The gain is 1, of so many standard deviations as stated; the dead zone of 2 is sure."""
+def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, certain, pieces, white, stays):
+    """The gain is 1, of so many standard deviations as stated; the dead zone of 20 is sure."""
+    names = ["motor_gain", "dead_zone"] if stays else ["dead_zone"]
     hypothesis = _with("motor_gain", "dead_zone")
     records = (_found(0.5)._replace(candidate=_candidate("motor_gain"), share=0.3, chance=0.1), _found(0.5))
     hypothesis = hypothesis._replace(evidence=records)
-    spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": np.eye(1)}
+    spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": 0.01 * np.eye(1)}
     monkeypatch.setattr(search, "covariances", lambda model, *_: [spreads[e.name] for e in model.effects])
     monkeypatch.setattr(search, "extend", lambda context, one, length: _emstate(one.model, 1.0))
     monkeypatch.setattr(search, "backward", lambda context, one: one)
     rounds = [Step(9, (), (), key_of(effect), 2) for effect in hypothesis.model.effects]
     state, log = _emstate(hypothesis.model, 1.0), []
-    context = _context()._replace(log=log.append)
+    context = _context()._replace(log=log.append, pieces=pieces, white=white)
     left, outcome, steps = search._determined(context, hypothesis, state, rounds, lambda fitted, data: fitted)
     assert _names(left.model) == _names(outcome.model) == names
     dropped = key_of(hypothesis.model.effects[0])

@@ -32,10 +32,10 @@ def explained(comparison: Comparison, first: Recorded, second: Recorded, log: Lo
     """
     one, two = comparison.fits
     judged = _judged(one, first, two, second), _judged(two, second, one, first)
-    start, key = one.fitted, jax.random.fold_in(one.fitted.state.key, SEARCHED)
+    start, system, key = one.fitted, one.fitted.model.system, jax.random.fold_in(one.fitted.state.key, SEARCHED)
     diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=start, own=first.data)
     accepted, test = findings(diagnosis), diagnosis.risen
-    worn = all({*f.effect.signals(start.model.system)} <= {*start.model.system.rates} for f in accepted)
+    worn = all(set() < {*f.effect.signals(system)} <= {*system.rates} for f in accepted)
     some = accepted or undecided(diagnosis) or (test is not None and test.p_value < RISEN)
     text = changes(diagnosis, accepted).replace("the fit", one.name)
     bent = "" if accepted and worn else "which is this change seen through friction"

@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import stats
 
 from ..data.dataset import Dataset, horizon
 from ..effects import AbstractEffect, catalogue
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
+from ..em.recorded import Risen
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
@@ -23,6 +25,7 @@ from ..storage.log import Log
 from .hypothesis import Hypothesis
 from .losses import AbstractLoss
 from .smoothed import SmoothedFit
+from .verdict import DETERMINED
 
 _Tree = TypeVar("_Tree")
 
@@ -70,8 +73,15 @@ class SearchContext(NamedTuple):
     """True where that is the question: the declared model is a fit, and its laws stay."""
     white: bool = False
     """True where readings carry white noise: one-step errors then count, last and among laws that predict alike."""
+    risen: Risen | None = None
+    """Test of whether errors have risen since that fit; None where its recordings are not at hand."""
     kinds: Collection[type[AbstractEffect]] = catalogue.values()
     """Laws that are tried."""
+
+    @property
+    def functions(self) -> bool:
+        """True where free functions may be named: since a fit only if errors have risen, as they fit any chance."""
+        return self.risen is None or bool(self.risen.p_value < stats.norm.sf(DETERMINED))
 
     @property
     def longest(self) -> int:

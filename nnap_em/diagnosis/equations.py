@@ -308,15 +308,12 @@ def _passes(case: Case) -> bool:
 
 def _certain(case: Case) -> bool:
     """True where every strength is determined beside its level and share; parts left out confirm that it is there."""
-    cov = np.linalg.inv(simulated.precision(case.of))
     std = np.asarray(case.of.prior.std)
-    cov = cov * np.outer(std, std)
+    cov = np.linalg.inv(simulated.precision(case.of)) * np.outer(std, std)
     sizes = [flat(effect).size for effect in case.of.model.effects[-len(case.laws) :]]
-    for law, effect, place in zip(case.laws, case.effects, np.cumsum([0, *sizes[:-1]]) - sum(sizes), strict=True):
-        part = np.arange(flat(law.start).size) + place
-        if certainty(law, effect, cov[np.ix_(part, part)]) < DETERMINED:
-            return False
-    return True
+    parts = np.split(np.arange(-sum(sizes), 0), np.cumsum(sizes)[:-1])
+    each = zip(case.laws, case.effects, parts, strict=True)
+    return all(certainty(law, effect, cov[np.ix_(part, part)]) >= DETERMINED for law, effect, part in each)
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:

@@ -90,7 +90,7 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
     """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form; among those by
     likelihood where readings are white.
 
-    None is accepted where one that is worth as much is of another cause.
+    None where one that is worth as much is of another cause, nor a free function where no error rose since a fit.
     """
     model, values = fit.model, [case.removed for case in admissible]
     ties = [_priced(case) for case in admissible] if context.white or not context.loss.multi_step else values
@@ -104,6 +104,9 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
+    if not (law.named or context.functions):
+        context.log(f"  {words(key_of(law))} is no change: errors have not risen since the fit")
+        return outcome._replace(step=outcome.step._replace(suspects=_suspects([best.screened])))
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = list(zip(candidates, overlaps(outcome.screen, best.screened), strict=True))
     same = [key_of(c) for c, part in parts if c.named and part < SAME]

@@ -40,7 +40,7 @@ from .losses import AbstractLoss, MultiStep, OneStep
 from .outcome import Diagnosis, Step, Suspect
 from .quantised import quantised
 from .rounds import Round, screening_round
-from .smoothed import SmoothedFit, along, risen_since
+from .smoothed import along, risen_since
 from .trial import Trial, certainty
 from .undisturbed import disturbance_free
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
@@ -133,8 +133,11 @@ def _determined(
 ) -> tuple[Hypothesis, Identified | None, list[Step]]:
     """The outcome without laws that are not determined as they are stated, the least sure first: those are suspects.
 
-    The search counts rows by their likelihood, which is surer than recordings agree.
+    The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is
+    hardly known, and chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
     """
+    others = math.inf if context.white else max(len({*context.pieces} or context.data.t) - 1, 1)
+    chance = stats.t.isf(stats.norm.sf(DETERMINED), others)
     while state is not None and any(evidence is not None for evidence in hypothesis.evidence):
         outcome = release(_outcome(context.before, hypothesis, state), context.data)
         model, found = outcome.model, hypothesis.evidence
@@ -144,7 +147,7 @@ def _determined(
             for one, effect, cov in zip(found, model.effects, spreads, strict=True)
         ]
         least = int(np.argmin(sure))
-        if sure[least] > DETERMINED:
+        if sure[least] > chance:
             return hypothesis, outcome, steps
         law, evidence = key_of(model.effects[least]), cast(Evidence, found[least])
         context.log(f"  {words(law)} is removed: it {Rejection('uncertain', sure[least]).sentence}")
@@ -304,19 +307,17 @@ def diagnose(
     change = start is not None
     origin = None if start is None or own is None else along(start, own, unbranched(start.bank))
     ended = _ended(hold) if change else finished if hold == 1.0 else _released(rig)
-    if white:
-        context = SearchContext(before, stages, data, MultiStep(), effort, log, (), end, origin, change, white)
-        diagnosis = search(context, release=ended)
-        return _compared(diagnosis, origin, data, ended) if change else _branching(diagnosis)
-    before, data, disturbances, pieces = disturbance_free(identified, before, data)
+    before, data, disturbances, pieces = (before, data, (), ()) if white else disturbance_free(identified, before, data)
     if disturbances:
         log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
-    context = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end, origin, change)
-    diagnosis = search(context, release=ended)._replace(interventions=disturbances, pieces=pieces)
-    if change:
-        return _compared(diagnosis, origin, data, ended)
-    before = ended(before, data)
-    return _branching(diagnosis._replace(before=before, after=diagnosis.after if diagnosis.evidence else before))
+    risen = None if origin is None else risen_since(origin, along(before, data, before.smoother))
+    context = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end, origin, change, white, risen)
+    diagnosis = search(context, release=ended)._replace(interventions=disturbances, pieces=pieces, risen=risen)
+    if change or not white:
+        before = ended(before, data)
+        found = any(evidence is not None for evidence in diagnosis.evidence)
+        diagnosis = diagnosis._replace(before=before, after=diagnosis.after if found else before, change=change)
+    return _branching(diagnosis)
 
 
 def _put(
@@ -346,16 +347,6 @@ def _ended(hold: float) -> Callable[[Identified, Dataset], Identified]:
         return forgotten(finished(fitted._replace(m_step=rule, state=state), data))
 
     return release
-
-
-def _compared(
-    diagnosis: Diagnosis, origin: SmoothedFit | None, data: Dataset, ended: Callable[[Identified, Dataset], Identified]
-) -> Diagnosis:
-    """The outcome of a search for changes, with the test of whether errors have risen."""
-    now = along(diagnosis.before, data, diagnosis.before.smoother)
-    risen, before = None if origin is None else risen_since(origin, now), ended(diagnosis.before, data)
-    after = diagnosis.after if any(evidence is not None for evidence in diagnosis.evidence) else before
-    return _branching(diagnosis._replace(before=before, after=after, change=True, risen=risen))
 
 
 def _held(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:

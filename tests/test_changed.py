@@ -1,12 +1,14 @@
 """Searches that begin from a fit: its posterior is the prior, a change is found alone, alarms have their rate."""
 
 import dataclasses
+import itertools
 import json
 import math
 import re
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -32,6 +34,7 @@ from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
+from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.multistep import Grid
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
@@ -142,18 +145,24 @@ def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypat
     ((data, options),) = searched
     assert data is recorded[1].data and options["own"] is recorded[0].data and options["start"] is fit
     assert not outcome.cause.bent
+    biased = findings(closed)[0]._replace(effect=SensorBias(jnp.asarray(0.1), channel="pos"))
+    with monkeypatch.context() as patch:
+        patch.setattr(cause, "findings", lambda _: [biased])
+        assert "seen through friction" in cause.explained(compare(fit, second), *recorded).cause.bent
     assert outcome.verdict.startswith("Changed since may: the Coulomb friction of joint 1 by")
     ratios = [float(re.search(r"are ([0-9.]+) times", text)[1]) for text in outcome.cause.judged]
     assert min(ratios) > 1.5 and outcome.cause.judged[0].startswith("On the recordings of june the errors of may")
     spring, mass = ("torsional_spring", 1, None, ()), ("payload", 1, None, ())
     differ = compare(fit, second).curves[0].test
-    for p_value, rivals in ((RISEN, ()), (RISEN / 2, ()), (RISEN, (spring, mass))):
+    for p_value, rivals in itertools.product((RISEN, RISEN / 2), ((), (spring, mass))):
         last = closed.steps[-1]._replace(rivals=rivals, suspects=())
         none = closed._replace(after=closed.before, evidence=(), risen=closed.risen._replace(p_value=p_value))
         none = none._replace(steps=(last,))
         monkeypatch.setattr(cause, "diagnose", lambda *_, none=none, **__: none)
         seen = cause.explained(compare(fit, second), *recorded)
-        if rivals or p_value < RISEN:
+        tied = "Torsional spring at joint 1 and payload at joint 1 explain the same; none is added." in seen.verdict
+        assert tied == bool(rivals)
+        if p_value < RISEN:
             assert seen.changed and not seen.widened and "Something changed" in seen.verdict
             assert seen.curves[0].test == differ and "which is this change seen through friction" in seen.cause.bent
         else:

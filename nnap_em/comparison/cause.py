@@ -7,7 +7,7 @@ import jax
 from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..diagnosis.change import changes
-from ..diagnosis.findings import findings, undecided
+from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
 from ..diagnosis.smoothed import along, risen_since
 from ..diagnosis.verdict import RISEN
@@ -36,7 +36,7 @@ def explained(comparison: Comparison, first: Recorded, second: Recorded, log: Lo
     diagnosis = diagnose(second.rig, second.data, key=key, log=log, start=start, own=first.data)
     accepted, test = findings(diagnosis), diagnosis.risen
     worn = all(set() < {*f.effect.signals(system)} <= {*system.rates} for f in accepted)
-    some = accepted or undecided(diagnosis) or (test is not None and test.p_value < RISEN)
+    some = accepted or (test is not None and test.p_value < RISEN)
     text = changes(diagnosis, accepted).replace("the fit", one.name)
     bent = "" if accepted and worn else "which is this change seen through friction"
     return (comparison if some else unconfirmed(comparison))._replace(cause=Cause(text, bent, judged))

@@ -17,15 +17,15 @@ def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[st
         return f"{first} The search is not finished: more may have changed."
     if accepted:
         return verdict(accepted, error, opening="Changed since the fit:")
-    if rivals := undecided(diagnosis):
-        return f"Something changed since the fit, but {listed([*map(words, rivals)])} explain the same; none is added."
-    also = "".join(f" Suspected: {suspect.description}." for suspect in suspected(diagnosis)[:1])
-    test = diagnosis.risen
+    test, rivals = diagnosis.risen, listed([*map(words, undecided(diagnosis))])
+    tied = f" {rivals[0].upper()}{rivals[1:]} explain the same; none is added." if rivals else ""
+    also = tied or "".join(f" Suspected: {suspect.description}." for suspect in suspected(diagnosis)[:1])
+    none = "Nothing is certain to have changed since the fit"
     if test is None:
-        return f"Nothing is certain to have changed since the fit, whose own recordings are not at hand.{also}"
+        return f"{none}, whose own recordings are not at hand.{also}"
     size = f"errors are {number(test.ratio, 2)} times those on its recordings left out (p = {number(test.p_value, 2)})"
     if test.p_value < RISEN:
         return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{also}"
-    few = "is certain to have changed since the fit, and so few recordings cannot show it by errors"
-    many = "changed since the fit that these recordings could show"
-    return f"Nothing {few if test.least >= RISEN else many}: {size}."
+    if test.least >= RISEN:
+        return f"{none}, and so few recordings cannot show it by errors: {size}.{tied}"
+    return f"{none if tied else 'Nothing changed since the fit that these recordings could show'}: {size}.{tied}"

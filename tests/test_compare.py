@@ -21,6 +21,7 @@ from nnap_em.comparison.compare import (
     LEAST_SHARED,
     Cause,
     Comparison,
+    _numbers,
     corrected_tests,
     number,
     shared,
@@ -155,6 +156,8 @@ def test_errors_of_a_machine_that_did_not_change_are_widened_to_the_difference(c
     assert describe(wide)["widened"] == wide.widened
     assert wide.verdict.startswith("Friction of joint 1 differs between first and grown by ")
     assert not unconfirmed(unchanged).widened
+    mass, wider = changed.numbers[0], next(iter(_numbers(changed.fits, {"m": 3.0})))
+    assert wider.pooled.value == pytest.approx(mass.pooled.value) and wider.pooled.std > 2 * mass.pooled.std
 
 
 @pytest.mark.parametrize("p, text", [(1.01e-6, "1.0 × 10⁻⁶"), (0.99e-6, "< 10⁻⁶"), (0.0, "< 10⁻⁶")])

@@ -390,13 +390,13 @@ def _numbers(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Numb
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
         value, std = (np.asarray([np.nan if entry is None else entry[i] for entry in entries], float) for i in range(2))
-        std = widened.get(name, 1.0) * std
         if name.startswith(periodic):
             first = value[np.isfinite(value)][0]
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
         priors = (fit.fitted.rig.parameters[name].std for fit in fits if name in fit.fitted.rig.parameters)
         prior = min((prior for prior in priors if prior > 0), default=np.inf)
-        yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
+        unit, by = next(entry.unit for entry in entries if entry is not None), widened.get(name, 1.0)
+        yield number(name, unit, value, by * std, by * prior)
 
 
 def _estimates(fitted: Identified) -> dict[str, Estimate]:

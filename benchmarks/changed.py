@@ -6,7 +6,7 @@
     python benchmarks/changed.py monitor --out out/changed slide-none slide-coulomb
     python benchmarks/changed.py compare --out out/changed dfki_c1-spring2-strong dfki_c0-recorded
     python benchmarks/changed.py loaded --out out/changed kr300-15
-    python benchmarks/changed.py table out/changed [--out docs/results/changed_table.md]
+    python benchmarks/changed.py table out/changed [--out docs/results/changed_planted.csv]
 
 planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
 planted in them; of `RIG-recorded` nothing is planted.  real: the same with a number of joint 2 that moved, its Coulomb
@@ -18,7 +18,9 @@ the centre of mass of its last body.  One JSON file a case; a case that has one 
 """
 
 import argparse
+import csv
 import dataclasses
+import io
 import json
 import math
 import os
@@ -247,7 +249,10 @@ def monitored(name: str, out: Path) -> dict[str, Any]:
     return {"case": f"month-{name}", "report": report, "status": status, "seconds": spent, "said": said}
 
 
-def row(record: dict[str, Any]) -> str:
+COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
+
+
+def row(record: dict[str, Any]) -> list[str]:
     """A line of the table."""
     report = record.get("report") or {}
     named = "; ".join(effect["description"] for effect in report.get("effects", [])) or "nothing"
@@ -256,11 +261,12 @@ def row(record: dict[str, Any]) -> str:
         f"{e['name']} {e.get('joint') or e.get('channel') or ''} {json.dumps(e['parameters'])}"
         for e in (record.get("truth") or {}).get("effects", [])
     )
-    scored = ""
+    right, false = "", ""
     if record.get("truth") and record.get("report"):
         done = score(record, {})
-        scored = f"{done.named} of {done.truths}, {done.extras} extra"
-    return f"| {record['case']} | {truth} | {named} | {scored} | {verdict} | {record['seconds']:.0f} |"
+        right, false = f"{done.named} of {done.truths}", str(done.extras)
+    code = str(record.get("code", ""))
+    return [record["case"], truth, named, right, false, verdict, f"{record['seconds']:.0f}", code]
 
 
 def main() -> None:
@@ -285,9 +291,9 @@ def main() -> None:
     args = arguments.parse_args()
     if args.command == "table":
         records = [json.loads(path.read_text()) for path in sorted(args.folder.glob("*.json"))]
-        head = "| case | truth | named | score | verdict | processor s |\n| --- | --- | --- | --- | --- | --- |\n"
-        text = head + "\n".join(map(row, records)) + "\n"
-        print(text) if args.out is None else replace_text(args.out, text)
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *map(row, records)])
+        print(text.getvalue()) if args.out is None else replace_text(args.out, text.getvalue())
         return
     jax.config.update("jax_enable_x64", True)
     for name in args.cases:
@@ -296,7 +302,7 @@ def main() -> None:
             record = kinds[args.command](name, args.out) | {"code": _commit()}
             args.out.mkdir(parents=True, exist_ok=True)
             replace_text(file, json.dumps(record))
-            print(row(record), flush=True)
+            print(" | ".join(row(record)), flush=True)
 
 
 if __name__ == "__main__":

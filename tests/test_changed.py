@@ -183,7 +183,7 @@ def test_where_nothing_explains_it_the_errors_decide(fit):
     for p, least, text, ending in (
         (0.9 * RISEN, 1e-3, "Something changed", "where chance removes less than 1%."),
         (1.1 * RISEN, 0.9 * RISEN, "Nothing changed", "(p = 0.011)."),
-        (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "(p = 0.011)."),
+        (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "where chance removes less than 1%."),
     ):
         outcome = Diagnosis(fit, fit, (), (last,), change=True, risen=Risen(2.0, p, least))
         sentence = changes(outcome, [])

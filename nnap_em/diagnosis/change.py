@@ -27,5 +27,5 @@ def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[st
     if test.p_value < RISEN:
         return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{also}"
     if test.least >= RISEN:
-        return f"{none}, and so few recordings cannot show it by errors: {size}.{tied}"
+        return f"{none}, and so few recordings cannot show it by errors: {size}.{also}"
     return f"{none if tied else 'Nothing changed since the fit that these recordings could show'}: {size}.{tied}"

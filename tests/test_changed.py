@@ -119,6 +119,13 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
     assert float(load(tmp_path / "after.npz").model.effects[0].change) == float(found.effect.change)
 
 
+def test_nothing_changed_since_a_fit_that_has_a_law(closed):
+    """The law of the fit is no finding, and stays."""
+    again = diagnose(_rig(), _logs(3, GROWN), key=jax.random.key(0), start=closed.after, own=_logs(1, GROWN))
+    assert not findings(again) and changes(again, []).startswith("Nothing changed since the fit")
+    assert [effect.name for effect in again.after.model.effects] == ["coulomb_change"]
+
+
 def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     closed = diagnose(_rig(), _logs(2), key=jax.random.key(0), start=fit, own=_logs(0))
     assert not findings(closed) and closed.risen.p_value > RISEN

@@ -208,7 +208,7 @@ def _sized(finding: Finding) -> str:
 
 def friction_change(diagnosis: Diagnosis, velocity: Float[np.ndarray, "dof node"]) -> str | None:
     """Change of the learned friction by the added effects."""
-    if not (diagnosis.evidence and diagnosis.before.rig.friction):
+    if not (any(diagnosis.evidence) and diagnosis.before.rig.friction):
         return None
     first, second = (
         np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (diagnosis.before, diagnosis.after)

@@ -119,9 +119,8 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
         last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
         hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
     hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
-    if outcome is None:
-        return Diagnosis(before, before, (), tuple(steps), complete=complete)
-    return Diagnosis(before, outcome, cast(tuple[Evidence, ...], hypothesis.evidence), tuple(steps), complete=complete)
+    found = cast(tuple[Evidence, ...], hypothesis.evidence)
+    return Diagnosis(before, outcome or before, found, tuple(steps), complete=complete)
 
 
 def _determined(

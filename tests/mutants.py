@@ -778,8 +778,8 @@ one-step errors decide where innovations are not white
 - if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
 + if context.white and complete:
 external disturbances sought in white noise
--     if white:
-+     if not white:
+- (before, data, (), ()) if white else
++ (before, data, (), ()) if not white else
 # diagnosis/trial.py
 ## test_rounds.py::test_a_law_whose_step_removes_nothing_is_not_refitted
 a refit without a look

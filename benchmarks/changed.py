@@ -49,6 +49,7 @@ from nnap_em.data.rig import Declared, write_rig
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.storage.files import replace_text
 
+COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
 GROWN, LENGTH, FIRST = 0.01, 200, 100
 UNCERTAIN = {"slide": {"m": 0.1}, "pendulum": {"m": 0.05}, "acrobot": {"m2": 0.06}}
 """Numbers that are estimated, with the standard deviation that is declared [kg]."""
@@ -249,9 +250,6 @@ def monitored(name: str, out: Path) -> dict[str, Any]:
     return {"case": f"month-{name}", "report": report, "status": status, "seconds": spent, "said": said}
 
 
-COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
-
-
 def row(record: dict[str, Any]) -> list[str]:
     """A line of the table."""
     report = record.get("report") or {}
@@ -273,14 +271,8 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {
-        "planted": planted,
-        "moved": moved,
-        "monitor": monitored,
-        "compare": compared,
-        "loaded": loaded,
-        "real": real,
-    }
+    kinds = {"planted": planted, "real": real, "moved": moved, "monitor": monitored, "compare": compared}
+    kinds |= {"loaded": loaded}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

@@ -137,7 +137,7 @@ def _determined(
     """
     others = math.inf if context.white else max(len({*context.pieces} or context.data.t) - 1, 1)
     chance = stats.t.isf(stats.norm.sf(DETERMINED), others)
-    while state is not None and any(evidence is not None for evidence in hypothesis.evidence):
+    while state is not None and any(hypothesis.evidence):
         outcome = release(_outcome(context.before, hypothesis, state), context.data)
         model, found = outcome.model, hypothesis.evidence
         spreads = covariances(model, outcome.m_step, outcome.state.hessian)
@@ -314,8 +314,8 @@ def diagnose(
     diagnosis = search(context, release=ended)._replace(interventions=disturbances, pieces=pieces, risen=risen)
     if change or not white:
         before = ended(before, data)
-        found = any(evidence is not None for evidence in diagnosis.evidence)
-        diagnosis = diagnosis._replace(before=before, after=diagnosis.after if found else before, change=change)
+        after = diagnosis.after if any(diagnosis.evidence) else before
+        diagnosis = diagnosis._replace(before=before, after=after, change=change)
     return _branching(diagnosis)
 
 

@@ -40,9 +40,10 @@ def _log(model, rows=ROWS, columns=1, seed=0) -> Dataset:
     return jax.tree.map(jnp.asarray, Dataset(t, u, y, np.ones(rows, bool)))
 
 
-def _replay(start, step, data: Dataset, time=0.0):
-    """All states; the inputs of a row are those that were held until it."""
+def _replay(start, step, data: Dataset, time=0.0, linear=False):
+    """All states; the inputs of a row are those that were held until it, or its own where they are linear."""
     held = jnp.concatenate([jnp.full_like(data.u[:1], jnp.nan), data.u[:-1]])  # those before the first are not used
+    held = data.u if linear else held
 
     def one(state, row):
         state = step(state, *row)
@@ -89,12 +90,15 @@ def _bristle():
     return DynamicFriction(**{k: NUMBER(v) for k, v in numbers.items()}, shape=jnp.zeros(5), **known, joint=1)
 
 
-@pytest.mark.parametrize("linearise", [CUBATURE, TANGENT], ids=["cubature", "tangent"])
-def test_the_same_numbers_as_the_filter(dressed, linearise):
+@pytest.mark.parametrize(
+    "linearise, linear", [(CUBATURE, False), (TANGENT, False), (TANGENT, True)], ids=["cubature", "tangent", "linear"]
+)
+def test_the_same_numbers_as_the_filter(dressed, linearise, linear):
     model, columns = dressed
+    model = dataclasses.replace(model, linear=linear)
     data = _log(model, columns=columns)
     filtered = ekf(model, model.start, prepare(model, data), linearise)
-    states = _replay(*functions(model, (), restart_prior(model), 1, linearise), data)
+    states = _replay(*functions(model, (), restart_prior(model), 1, linearise), data, linear=linear)
     np.testing.assert_allclose(states.mean, filtered.state.mean, rtol=1e-9, atol=1e-11)
     np.testing.assert_allclose(states.cov, filtered.state.cov, rtol=1e-9, atol=1e-13)
     np.testing.assert_allclose(states.innovation, filtered.innovation, rtol=1e-9, atol=1e-9)
@@ -129,7 +133,7 @@ def test_a_law_of_the_command_without_a_form_for_one_row_is_named():
         pytest.raises(ValueError, match="'input_delay' has no form for one row"),
     ):
         patch.setattr(type(late), "stream", lambda self, dt: None)
-        hooks.command_stream((late,), None, slide()[0].system, 0.05)
+        hooks.command_stream((late,), None, slide()[0].system, hooks.Sampling(0.05))
 
 
 @pytest.fixture(scope="module")

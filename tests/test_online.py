@@ -75,10 +75,8 @@ LAWS = {
 
 
 def _compare(source, fitted, t, u, y, atol, kind=np.float64):
-    found, states = (
-        play(source, t, held(u), y, fitted.model.log_q.shape[0], kind),
-        replay(observer(fitted), t, held(u), y),
-    )
+    u = u if fitted.model.linear else held(u)
+    found, states = play(source, t, u, y, fitted.model.log_q.shape[0], kind), replay(observer(fitted), t, u, y)
     states = jax.tree.map(np.asarray, states)
     std = np.sqrt(np.diagonal(states.cov, axis1=1, axis2=2))
     assert np.max(np.abs(found.mean - states.mean) / std) < atol
@@ -97,8 +95,10 @@ def test_c_gives_the_numbers_of_python_over_10000_rows_with_gaps(plain):
 
 
 @pytest.mark.parametrize("laws", LAWS)
-def test_c_has_laws_of_command_and_sensor(laws, tmp_path):
+@pytest.mark.parametrize("linear", [False, True], ids=["held", "linear"])
+def test_c_has_laws_of_command_and_sensor(laws, linear, tmp_path):
     fitted = _fit(*LAWS[laws])
+    fitted = fitted._replace(state=fitted.state._replace(best=dataclasses.replace(fitted.model, linear=linear)))
     write_observer(fitted, tmp_path / "dressed.c")
     _compare(tmp_path / "dressed.c", fitted, *_log(), 1e-9)
 
@@ -169,6 +169,20 @@ def test_stamps_say_which_rows_are_missing(plain):
     other = np.where(np.arange(100) < 60, t, t + 1e6)  # another clock: one row is not read, then a new start
     flags = play(source, other, held(u), y, 2).flags
     assert flags[60] & JUMP and flags[61] & RESTARTED and not flags[62:].any()
+
+
+def test_linear_inputs_go_straight_over_rows_that_never_came(plain, tmp_path):
+    fitted = plain[0]._replace(state=plain[0].state._replace(best=dataclasses.replace(plain[0].model, linear=True)))
+    write_observer(fitted, tmp_path / "linear.c")
+    t, u, y = _log(100, seed=1)
+    y = np.where(np.isnan(y), 0.0, y)
+    gone, without, straight = np.delete(np.arange(100), [50, 51]), y.copy(), u.copy()
+    without[50:52] = np.nan
+    straight[50:52] = u[49] + (u[52] - u[49]) * np.array([[1.0], [2.0]]) / 3
+    whole = play(tmp_path / "linear.c", t, straight, without, 2)
+    np.testing.assert_allclose(
+        play(tmp_path / "linear.c", t[gone], u[gone], y[gone], 2).mean[50:], whole.mean[52:], rtol=1e-12
+    )
 
 
 def test_a_table_is_as_exact_as_it_says():

@@ -171,7 +171,7 @@ MISTAKES = {  # name: (in GOOD, instead, then the message names the place, what 
     "dt negative": ("dt = 0.01", "dt = -0.01", "[sampling] dt:", "-0.01", "above 0"),
     "dt a text": ("dt = 0.01", 'dt = "10 ms"', "[sampling] dt:", "'10 ms'", "finite number"),
     "dt missing": ("dt = 0.01", "", "[sampling] dt:", "missing", "dt = 0.01 (s)"),
-    "hold of first order": ("zero-order", "first-order", "[sampling] input_hold:", "'first-order'", "zero-order"),
+    "hold of second order": ("zero-order", "second-order", "[sampling] input_hold:", "'second-order'", "first-order"),
     "clock unheard of": ('"sequence"', '"wall"', "[sampling] clock:", "'wall'", "possible here: sequence, session"),
     "nothing measured": ('["theta1", "dtheta1"]', "[]", "[measurement] columns:", "[]", 'columns = ["theta1"'),
     "measured no state": ('"dtheta1"]', '"thteta1"]', "[measurement] columns:", "'thteta1'", "did you mean 'theta1'?"),

@@ -51,11 +51,12 @@ def _track(null: StateSpaceModel, one) -> Track:
     rate = jax.vmap(lambda x, u: null.rate(x, u, still))
     rates = rate(mean, inputs)
     middle = mean + 0.5 * null.dt * rates
-    acceleration = rate(middle, inputs)[:, dof : 2 * dof]
+    between = inputs.at(0.5)
+    acceleration = rate(middle, between)[:, dof : 2 * dof]
     along = lambda x, rate, u: jax.jvp(lambda x: null.true(x, u), (x,), (rate,))  # noqa: E731
     true, past = jax.vmap(along)(mean, rates, inputs)
     past = past.at[0].set(0.0)  # the first row has none
-    drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, inputs)
+    drive = jax.vmap(lambda x, u: null.scene(x, u).drive)(middle, between)
     friction = jax.vmap(null.unknown)(middle[:, dof : 2 * dof])
     return Track(middle[:, : 2 * dof], acceleration, drive, friction, true, past, inputs)
 
@@ -67,7 +68,7 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     driven = scenes._replace(drive=drive)
 
     def remember(m, scene):
-        return integrate(lambda m: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
+        return integrate(lambda m, _: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
 
     memory = jnp.zeros((track.middle.shape[0], effect.memory), track.middle.dtype)
     if effect.memory:

@@ -76,7 +76,7 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
     def one(mean, cov, seq):
         def step(m, slices):
             x, u = slices
-            memory_rate = lambda m: model.rate(jnp.concatenate([x, m]), u, still)[width:]  # noqa: E731
+            memory_rate = lambda m, part: model.rate(jnp.concatenate([x, m]), u.at(part), still)[width:]  # noqa: E731
             return integrate(memory_rate, m, model.dt, model.steps), m
 
         _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))

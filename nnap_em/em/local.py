@@ -57,7 +57,7 @@ def _sensitivities(
 
         def pushed(p):
             changed = prior.write(model, value.at[held].set(p))
-            scene = changed.scene(middle, u)
+            scene = changed.scene(middle, u.at(0.5))
             nothing = jnp.zeros(0, x.dtype)
             return sum((e.force(scene, nothing) for e in changed.effects if e.held), still)
 

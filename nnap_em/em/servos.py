@@ -76,7 +76,7 @@ def torque_along(
     ahead = np.concatenate([q[:, LAG:], np.repeat(q[:, -1:], LAG, axis=1)], axis=1)
     behind = np.concatenate([np.repeat(q[:, :1], LAG, axis=1), q[:, :-LAG]], axis=1)
     columns = jnp.asarray(scale, float) if scale.size else None
-    fed = jax.vmap(lambda u, scale: servo.at(scale).fed(u, dt))(jnp.asarray(u, float), columns)
+    fed = jax.vmap(lambda u, scale: servo.at(scale).fed(u, hooks.Sampling(dt).through))(jnp.asarray(u, float), columns)
     each = jax.vmap(jax.vmap(lambda scale, *row: servo.at(scale).torque(*row)))
     rate = jnp.asarray((ahead - behind) / (2 * LAG * dt), float)
     return np.asarray(each(columns, fed, jnp.asarray(q, float), rate))

@@ -30,13 +30,23 @@ static void transition(const real *in, const real *p, real x[N][2 * N])
 {
     static const real ahead[4] = {(real)0.5, (real)0.5, 1, 0}, share[4] = {1, 2, 2, 1};
     const real h = (real)(DT / SUBSTEPS);
+#if LINEAR
+    static const real when[4] = {0, (real)0.5, (real)0.5, 1};
+    real now[ROW];
+    for (int i = 0; i < ROW; i++) now[i] = in[i];
+#else
+    const real *now = in;
+#endif
     for (int n = 0; n < SUBSTEPS; n++) {
         real at[N][2 * N], start[N][2 * N], slope[N][2 * N];
         for (int i = 0; i < N; i++)
             for (int j = 0; j < 2 * N; j++) at[i][j] = start[i][j] = x[i][j];
         for (int stage = 0; stage < 4; stage++) {
             const real forward = h * ahead[stage], part = h / 6 * share[stage];
-            rate((const real (*)[2 * N])at, in, p, slope);
+#if LINEAR
+            for (int i = 0; i < D; i++) now[i] = in[i] + (n + when[stage]) / SUBSTEPS * in[CHANGE + i];
+#endif
+            rate((const real (*)[2 * N])at, now, p, slope);
             for (int i = 0; i < N; i++)
                 for (int j = 0; j < 2 * N; j++) {
                     at[i][j] = start[i][j] + forward * slope[i][j];
@@ -260,14 +270,18 @@ static void report(nnap_state *s, int best)
     for (int k = 0; k < s->live; k++) s->branch[k].log_weight -= top;
 }
 
-/* One row: inputs held since the row before, readings. */
+/* One row: inputs held since the row before, or where these are linear those of the row; readings. */
 static int row(nnap_state *s, const real *u, const real *y)
 {
     const int first = s->age < -0.5 * DT;
     const real gate = s->rows < SETTLING ? INFINITY : GATE;
-    real in[2 * D + 2 + SCALES + 1] = {0}, out[MEMORY + D + 1], value[M];
+    const int takes = LINEAR || !first;
+    real in[ROW] = {0}, out[MEMORY + D + 1], value[M];
     int flags = 0, now[M], before[M], waiting = 0, count = 0, beyond = 0, best;
-    for (int i = 0; i < COLUMNS && !first; i++) {
+#if LINEAR
+    for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
+#endif
+    for (int i = 0; i < COLUMNS && takes; i++) {
         if (isfinite(u[i])) s->u[i] = u[i];
         else flags |= nnap_NO_INPUT;
     }
@@ -281,13 +295,18 @@ static int row(nnap_state *s, const real *u, const real *y)
         count += now[i] + before[i];
     }
     for (int i = 0; i < D; i++) in[i] = in[D + i] = s->fed[i];
-    if (!first) {
-        const real begins = s->age < 0.5 * DT;
+    if (takes) {
+        const real begins = LINEAR ? first : s->age < 0.5 * DT;
         commands(s->memory, s->u, &begins, s->parameter, out);
         for (int i = 0; i < MEMORY; i++) s->memory[i] = out[i];
-        for (int i = 0; i < D; i++) in[i] = s->fed[i] = out[MEMORY + i];
+        for (int i = 0; i < D; i++) s->fed[i] = out[MEMORY + i];
     }
+#if LINEAR
+    for (int i = 0; i < D; i++) in[CHANGE + i] = s->fed[i] - in[i];
+#else
+    for (int i = 0; i < D; i++) in[i] = s->fed[i];
     for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
+#endif
     in[2 * D] = (real)(s->time + 0.5 * DT);
     in[2 * D + 1] = (real)s->age;
     for (int k = 0; k < s->live; k++) {
@@ -298,7 +317,10 @@ static int row(nnap_state *s, const real *u, const real *y)
     }
     s->time += DT;
     s->age += DT;
-    for (int i = 0; i < D; i++) in[D + i] = in[i];
+    for (int i = 0; i < D; i++) in[D + i] = in[i], in[i] = s->fed[i];
+#if LINEAR
+    for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
+#endif
     in[2 * D] = (real)(s->time + 0.5 * DT);
     in[2 * D + 1] = (real)s->age;
     for (int k = 0; k < s->live; k++) {
@@ -379,7 +401,15 @@ int nnap_step(nnap_state *s, double time, const real *u, const real *y)
     }
     if (rows < 1) return nnap_JUMP;
     if (rows > 1) flags |= nnap_JUMP;
-    for (int k = 1; k < (int)rows; k++) flags |= row(s, u, nothing) & nnap_RESTARTED;
+    for (int k = 1; k < (int)rows; k++) {
+#if LINEAR
+        real between[COLUMNS + !COLUMNS];
+        for (int i = 0; i < COLUMNS; i++) between[i] = s->u[i] + (u[i] - s->u[i]) / ((real)rows - k + 1);
+        flags |= row(s, between, nothing) & nnap_RESTARTED;
+#else
+        flags |= row(s, u, nothing) & nnap_RESTARTED;
+#endif
+    }
     s->stamp = isfinite(time) ? time : s->stamp + DT;
     return flags | row(s, u, y);
 }

@@ -1,6 +1,6 @@
 /* Observer of $rig: written by nnap_em $version.
    SI units, a row every $dt s.  States: $states.
-   Inputs u, held from the row before to this one: $columns.
+   Inputs u, $held: $columns.
    Readings y; NaN is none: $measured.
    Parameters: $parameters.
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.noise import reading_noise, resolution
-from ..data.rig import Rig, RigError
+from ..data.rig import HELD, LINEAR, Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
 from ..em.equations import motion
@@ -28,7 +28,7 @@ from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
 from .identify import Identified, begin
-from .inverse_dynamics import UNEXPLAINED, explanations, gains, mistakes, regression
+from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
 from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
@@ -43,6 +43,8 @@ model."""
 REVERSALS = 20
 """Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
 distance over which friction turns and its size."""
+SAME_HOLD = 0.25
+"""Distance to the lag of the other hold, half a row, within which that is meant [rows]: half way."""
 _LONG = 20.0, 500  # s and rows of a sequence from which on it is better cut: a hidden joint is lost later on
 
 
@@ -320,8 +322,27 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
         )
     elif np.all(plain < UNEXPLAINED):
         text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
-        slopes = zip(rig.input_columns, gains(problem), strict=True)
-        yield CheckResult(OK, "dynamics", "".join([text, *(f"; {name}: slope {slope:.3g}" for name, slope in slopes)]))
+        slopes, lags = gains(problem), [lag(problem, i) for i in range(len(rig.input_columns))]
+        columns = list(zip(rig.input_columns, slopes, lags, strict=True))
+        text += "".join(f"; {name}: slope {slope:.3g}, {when} rows late" for name, slope, when in columns)
+        yield CheckResult(OK, "dynamics", text)
+        yield from (
+            CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}") for name, _, when in columns if when.counts
+        )
+
+
+def late(rig: Rig, when: Lag) -> str:
+    """An input that acts at another time than its hold has it, and the line to write."""
+    other, between = (LINEAR, -0.5) if rig.input_hold == HELD else (HELD, 0.5)
+    kind = "a measured signal, which is not held" if other == LINEAR else "a command that is held"
+    side = f"{abs(when.rows):.2g} +- {when.std:.1g} rows {'later' if when.rows > 0 else 'earlier'}"
+    text = f"torque and motion agree best if it acts {side} than `input_hold` has it ({when.rows * rig.dt:.2g} s)"
+    if abs(when.rows - between) < SAME_HOLD:
+        return f'{text}: it is {kind}; write [sampling] input_hold = "{other}"'
+    cause = (
+        "a drive or a bus that is late (`diagnose` finds input_delay)" if when.rows > 0 else "readings that are late"
+    )
+    return f"{text}: {cause}, or two clocks (`nnap-em import --shift TOPIC=SECONDS`)"
 
 
 def drives(

@@ -83,7 +83,7 @@ def _columns(
     def driven(system, servos, q, v, u):
         if not servos:
             return jnp.zeros_like(q)
-        fed = jnp.stack([servo.fed(u[i][None], 1.0)[0] for i, servo in enumerate(servos)])
+        fed = jnp.stack([servo.fed(u[i][None], hooks.Sampling(1.0).through)[0] for i, servo in enumerate(servos)])
         return system.drive(hooks.driven((), servos, system, fed, q, v))
 
     def force(values, a):

@@ -22,7 +22,7 @@ from scipy.optimize import lsq_linear
 
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
-from ..data.rig import Rig
+from ..data.rig import HELD, LINEAR, Rig
 from ..data.servo import TORQUE
 from ..systems import AbstractSystem
 
@@ -54,6 +54,34 @@ UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
 
 
+TRIANGLE = {HELD: (0.5, 0.5, 0.0), LINEAR: (1 / 6, 2 / 3, 1 / 6)}
+"""Weights of the row before, a row and the next in the force that a second difference feels, a mean over both intervals
+with a triangle as its weight: of inputs that are held, and of inputs that are linear."""
+BLOCKS = 20
+"""Blocks of rows whose errors are taken as independent."""
+LATE, SURE_LAG = 0.25, 5.0
+"""Lag that counts [rows, and its standard deviations]: those of real torques differ by more than their blocks show."""
+REACH = 6
+"""Largest lag of a torque that is looked for [rows]."""
+
+
+class Lag(NamedTuple):
+    """The time by which an input acts later than its declared hold has it."""
+
+    rows: float
+    """Below 0 where it acts earlier [rows]."""
+    std: float
+    """Standard deviation of it, by blocks of rows."""
+
+    def __str__(self) -> str:
+        return f"{self.rows:.2f} +- {self.std:.1g}"
+
+    @property
+    def counts(self) -> bool:
+        """True where it is nearer to half a row, by which held and linear inputs differ, than to none, and certain."""
+        return abs(self.rows) > max(LATE, SURE_LAG * self.std) and abs(self.rows) < REACH - 1
+
+
 class Explanation(NamedTuple):
     """A correction of the log, and the part of the torques that stays unexplained with it."""
 
@@ -71,7 +99,7 @@ class Motion(NamedTuple):
     v: Float[np.ndarray, "piece time dof"]
     a: Float[np.ndarray, "piece time dof"]
     torque: Float[np.ndarray, "piece time input"]
-    """Generalised force of every input, mean over the intervals before and behind a row [N m, or N]."""
+    """Generalised force of every input, mean over the intervals before and behind a row, as `TRIANGLE` [N m, or N]."""
     inertial: Float[np.ndarray, " tap"]
     """Filter of what holds an acceleration."""
     direct: Float[np.ndarray, "dof tap"]
@@ -181,7 +209,7 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     if low is None:
         return None
     edge = WIDTH // 2
-    torque = np.concatenate([np.full_like(u[:, :1], np.nan), 0.5 * (u[:, 1:] + u[:, :-1])], axis=1)
+    torque = np.pad(filtered(u, np.array(TRIANGLE[rig.input_hold])), ((0, 0), (1, 1), (0, 0)), constant_values=np.nan)
     torque = torque[:, edge:-edge, : len(system.joints)] * np.asarray(system.gears)
     return Motion(q, v, a, torque, np.pad(low, edge), np.stack([np.convolve(low, window) for *_, window in sources]))
 
@@ -225,6 +253,41 @@ def gains(problem: Regression) -> Float[np.ndarray, " input"]:
         columns = [problem.beyond(np.outer(problem.inputs[:, i], np.ones(needed.shape[1])))[:, joint - 1] for i in of]
         out[of] = np.linalg.lstsq(np.stack(columns, axis=1), needed[:, joint - 1], rcond=None)[0]
     return out
+
+
+def lag(problem: Regression, i: int) -> Lag:
+    """Lag of input i at which its torque agrees best with the inverse dynamics, friction and uncertain numbers free.
+
+    The best whole number of rows, then one step of Gauss and Newton.
+    """
+    joint, motion = problem.system.joints[i] - 1, problem.motion
+    needed, others = problem.plain.sum(axis=0), problem.parts(slopes=True).sum(axis=0)[:, joint] * problem.std
+
+    def beyond(torque: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        return problem.beyond(np.repeat(torque[:, None], needed.shape[1], axis=1))[:, joint]
+
+    def torque(shift: int) -> Float[np.ndarray, "piece time"]:
+        return np.pad(motion.torque, ((0, 0), (REACH, REACH), (0, 0)), constant_values=np.nan)[
+            :, REACH - shift : REACH - shift + motion.torque.shape[1], i
+        ]
+
+    def at(torque: Float[np.ndarray, "piece time"]) -> Float[np.ndarray, "piece time"]:
+        return filtered(torque, motion.direct[joint])
+
+    inside = np.isfinite(at(torque(REACH)) + at(torque(-REACH)))[problem.rows]
+    rest = beyond(needed[:, joint] - problem.applied(problem.inputs)[:, joint] + problem.inputs[:, i])
+    free = _directions(np.stack([rest * 0, *map(beyond, others.T)], axis=1)[inside])
+    tried = []
+    for shift in range(1 - REACH, REACH):
+        early, now, late = (np.nan_to_num(at(torque(shift + k)))[problem.rows] for k in (-1, 0, 1))
+        pair = beyond(0.5 * (late - early))[inside], (rest - beyond(now))[inside]
+        moved, error = (a - free @ (free.T @ a) for a in pair)
+        tried.append((float(error @ error), shift, moved, error))
+    _, shift, moved, error = min(tried)
+    size = float(moved @ moved) + 1e-300
+    rows = float(moved @ error) / size
+    blocks = np.array_split(moved * (error - rows * moved), BLOCKS)
+    return Lag(shift + rows, math.sqrt(sum(float(block.sum()) ** 2 for block in blocks)) / size)
 
 
 def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:

@@ -88,7 +88,7 @@ class Observer(NamedTuple):
     step: Callable[[Observation, Float[Array, " column"], Float[Array, " obs"]], Observation]
     """`step(state, u, y)`: `u` are the inputs held from the row before to this one, `y` its readings; NaN is none.
 
-    In the first row `u` counts for nothing."""
+    In the first row `u` counts for nothing.  With a first-order hold `u` are the inputs of the row itself."""
     states: tuple[str, ...]
     """Names of the states that are coordinates and rates."""
     inputs: tuple[str, ...]
@@ -165,10 +165,11 @@ def functions(
     """`start` and `step` of a model whose `angles` may be in several places, with the prior of a new start."""
     if isinstance(model.unknown, FrictionNetwork) and model.log_q.shape[0] <= MOST_UNROLLED:
         model = dataclasses.replace(model, unknown=model.unknown.by_entry())
-    commands = hooks.command_stream(model.effects, model.servos, model.system, model.dt)
+    commands = hooks.command_stream(model.effects, model.servos, model.system, model.rows)
     dtype, drives, dof = model.log_q.dtype, len(model.system.joints), len(model.system.coordinates)
+    linear = model.linear
     q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
-    waits = np.asarray([place >= 2 * dof for place in model.measured])
+    waits = np.asarray([place >= 2 * dof and not linear for place in model.measured])
     columns = drives + len({place for servo in model.servos or () for _, place, _ in servo.scales})
     zero = jnp.zeros((), dtype)
 
@@ -189,16 +190,22 @@ def functions(
 
     def taken(state: _Memory, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
         first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
-        u = jnp.where(first, 0.0, jnp.where(sound, u, state.u))
-        memory, fed = commands.step(state.commands, u, state.age < 0.5 * model.dt)
-        memory, fed = jax.tree.map(lambda a, b: jnp.where(first, a, b), (state.commands, state.fed), (memory, fed))
+        u = jnp.where(first & (not linear), 0.0, jnp.where(sound, u, state.u))
+        memory, fed = commands.step(state.commands, u, first if linear else state.age < 0.5 * model.dt)
+        if not linear:
+            memory, fed = jax.tree.map(lambda a, b: jnp.where(first, a, b), (state.commands, state.fed), (memory, fed))
         scale, time, age = u[drives:] if columns > drives else None, state.time + model.dt, state.age + model.dt
+        held = Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale)
+        here = Inputs(fed, fed, time + 0.5 * model.dt, age, scale)  # `fed` stands for what is not decided yet
+        if linear:
+            scaled = None if scale is None else state.u[drives:]
+            held = held._replace(u=state.fed, scale=scaled, change=fed - state.fed)
+            here = here._replace(before=state.fed, change=jnp.zeros_like(fed))
         return _Row(
             first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
             late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),
-            held=Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale),
-            here=Inputs(fed, fed, time + 0.5 * model.dt, age, scale),  # `fed` stands for what is not decided yet
-            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & ~first}), time=time, age=age,
+            held=held, here=here,
+            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & (linear | ~first)}), time=time, age=age,
         )  # fmt: skip
 
     def filtered(x: Gaussian, row: _Row, late: Float[Array, " obs"]) -> tuple[Gaussian, Array, Array]:
@@ -235,7 +242,7 @@ def functions(
         (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
         outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
         after = _Memory(
-            every, log_weight, row.memory, row.u, row.held.u, row.late, row.time, row.age,
+            every, log_weight, row.memory, row.u, row.here.u, row.late, row.time, row.age,
             jnp.where(sane, jnp.minimum(state.rows + 1, SETTLING), 1.0),
         )  # fmt: skip
         return Observation(

@@ -35,6 +35,11 @@ def held(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.n
     return signal.y[_before(signal, at + SAME_TIME * dt)]
 
 
+def straight(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
+    """The value on the line from the one given last to the next."""
+    return np.interp(at, signal.t, signal.y)
+
+
 def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
     """The mean from each row to the next of a signal that is held between its values."""
     before = np.append(0.0, np.cumsum(signal.y[:-1] * np.diff(signal.t)))

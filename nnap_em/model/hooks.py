@@ -7,12 +7,44 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.actuator import InputDelay
-from ..effects.base import AbstractEffect, OperatingPoint, Scalar
+from ..effects.base import AbstractEffect, OperatingPoint, Scalar, Stream
 from ..systems.base import AbstractSystem
 from ..systems.plant import AbstractPlant
 from .servo import LAWS, Servo
 
 Effects = Sequence[AbstractEffect]
+
+
+class Sampling(NamedTuple):
+    """Rows of the inputs, and their course between two rows."""
+
+    dt: float
+    """Interval [s]."""
+    linear: bool = False
+    """True where an input goes straight from row to row; False where it is held."""
+
+    def through(self, effect: AbstractEffect, u: Float[Array, " time"]) -> Float[Array, " time"]:
+        """An input that was 0 before its first row, after a law that takes time.
+
+        Held: its mean over each interval.  Linear: its values in the rows, by the law of its slopes, which are held; in
+        the first row it stood already.
+        """
+        if not self.linear or type(effect).input is AbstractEffect.input:
+            return effect.input(u, self.dt)
+        return jnp.concatenate([u[:1], u[:1] + jnp.cumsum(effect.input(jnp.diff(u), self.dt))])
+
+    def stream(self, effect: AbstractEffect) -> Stream | None:
+        """`through` row by row; the memory of a linear one ends in the value before, and in what became of it."""
+        stream = effect.stream(self.dt)
+        if not self.linear or stream is None:
+            return stream
+
+        def step(memory, u):
+            inner, change = stream.step(memory[:-2], u - memory[-2])
+            after = memory[-1] + change
+            return jnp.concatenate([inner, jnp.stack([u, after])]), after
+
+        return Stream(jnp.concatenate([stream.memory, jnp.zeros(2, stream.memory.dtype)]), step)
 
 
 class CommandStream(NamedTuple):
@@ -26,12 +58,12 @@ class CommandStream(NamedTuple):
 
 
 def reaching(
-    effects: Effects, system: AbstractPlant, u: Float[Array, "time input"], dt: float
+    effects: Effects, system: AbstractPlant, u: Float[Array, "time input"], rows: Sampling
 ) -> Float[Array, "time input"]:
     """Torques at the joints of the commanded torques of a sequence [N m]."""
     for effect in effects:
         if (i := system.input_of(effect.joint, effect.channel)) is not None:
-            late = system.late(lambda column, effect=effect: effect.input(column, dt), u[:, i])
+            late = system.late(lambda column, effect=effect: rows.through(effect, column), u[:, i])
             u = u.at[:, i].set(effect.drive(late))
     return u
 
@@ -41,19 +73,19 @@ def fed(
     servos: Sequence[Servo],
     system: AbstractSystem,
     u: Float[Array, "time input"],
-    dt: float,
+    rows: Sampling,
     scale: Float[Array, "time column"] | None = None,
 ) -> Float[Array, "time input"]:
     """Values that the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`).
 
     `scale` are the columns that numbers of the servos are proportional to (`Servo.at`).
     """
-    values = jnp.stack([servo.at(scale).fed(u[:, i], dt) for i, servo in enumerate(servos)], axis=1)
-    return late(effects, servos, system, values, dt)
+    values = jnp.stack([servo.at(scale).fed(u[:, i], rows.through) for i, servo in enumerate(servos)], axis=1)
+    return late(effects, servos, system, values, rows)
 
 
 def late(
-    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, fed: Float[Array, "time input"], dt: float
+    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, fed: Float[Array, "time input"], rows: Sampling
 ) -> Float[Array, "time input"]:
     """Values at the drives of those that commands set, with the effects that take time."""
     columns = []
@@ -61,19 +93,19 @@ def late(
         column, before = fed[:, i], servo.before(fed[:, i])
         for effect in effects:
             if effect.joint == joint:
-                column = before + effect.input(column - before, dt)
+                column = before + rows.through(effect, column - before)
         columns.append(column)
     return jnp.stack(columns, axis=1)
 
 
 def command_stream(
-    effects: Effects, servos: Sequence[Servo] | None, system: AbstractSystem, dt: float
+    effects: Effects, servos: Sequence[Servo] | None, system: AbstractSystem, rows: Sampling
 ) -> CommandStream:
     """`reaching` or `fed` row by row.
 
     Raises ValueError where a law of the command has no form for one row.
     """
-    lines = [_line(effects, servos[i] if servos else None, joint, dt) for i, joint in enumerate(system.joints)]
+    lines = [_line(effects, servos[i] if servos else None, joint, rows) for i, joint in enumerate(system.joints)]
 
     def step(memory, u, first):
         scale = u[len(lines) :] if u.shape[0] > len(lines) else None
@@ -83,20 +115,23 @@ def command_stream(
     return CommandStream(tuple(memory for memory, _ in lines), step)
 
 
-def _line(effects: Effects, servo: Servo | None, joint: int, dt: float) -> tuple[Any, Callable[..., Any]]:
+def _line(effects: Effects, servo: Servo | None, joint: int, rows: Sampling) -> tuple[Any, Callable[..., Any]]:
     """Memory and step of one drive: the command as in the first row, what it set, then the memory of each law."""
-    laws = [(effect, effect.stream(dt)) for effect in effects if effect.joint == joint]
+    laws = [(effect, rows.stream(effect)) for effect in effects if effect.joint == joint]
     for effect, stream in laws:
         if stream is None and type(effect).input is not AbstractEffect.input:
             raise ValueError(f"{effect.name!r} has no form for one row: give it `stream` beside `input`")
-    delay = InputDelay(servo.values["delay"], joint=0).stream(dt) if servo and "delay" in servo.values else None
+    delay = rows.stream(InputDelay(servo.values["delay"], joint=0)) if servo and "delay" in servo.values else None
     streams = [stream for stream in (delay, *(stream for _, stream in laws)) if stream]
 
     def step(memory, u, scale, first):
         (begun, stood, *before), after = memory, []
 
         def through(stream, value, base):
-            own, late = stream.step(before[len(after)], value - base)
+            memory = before[len(after)]
+            if rows.linear:  # before the first row the input stood as in it
+                memory = jnp.where(first, memory.at[-2:].set(value - base), memory)
+            own, late = stream.step(memory, value - base)
             after.append(own)
             return base + late
 

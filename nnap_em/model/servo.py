@@ -78,11 +78,14 @@ class Servo(eqx.Module):
         """True where the torque depends on the motion."""
         return self.kind != "torque"
 
-    def fed(self, u: Float[Array, " time"], dt: float) -> Float[Array, " time"]:
-        """Values that the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m]."""
+    def fed(self, u: Float[Array, " time"], through: Callable[..., Array]) -> Float[Array, " time"]:
+        """Values that the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m].
+
+        `through` is that of `hooks.Sampling`.
+        """
         if "delay" in self.values:
             first = u[:1]
-            u = first + InputDelay(self.values["delay"], joint=0).input(u - first, dt)
+            u = first + through(InputDelay(self.values["delay"], joint=0), u - first)
         return LAWS[self.kind].feed(self.values, u)
 
     def before(self, fed: Float[Array, " time"]) -> Float[Array, " 1"]:

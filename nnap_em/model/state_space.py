@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -36,6 +37,12 @@ class Inputs(NamedTuple):
     """Since the first row [s]."""
     scale: Float[Array, "*time column"] | None = None
     """Columns that numbers of servos are proportional to; None where there are none."""
+    change: Float[Array, "*time input"] | None = None
+    """Change of `u` until the next row, linear in time; None where inputs are held."""
+
+    def at(self, part: Scalar | float) -> "Inputs":
+        """The inputs at some part of the step, 0 in the row and 1 in the next."""
+        return self if self.change is None else self._replace(u=self.u + part * self.change)
 
     @classmethod
     def held(cls, u: Float[Array, " input"]) -> "Inputs":
@@ -68,6 +75,8 @@ class StateSpaceModel(AbstractModel):
     """Laws that the declared physics lacks."""
     servos: tuple[Servo, ...] | None = None
     """Law that makes torque of every input; None where the inputs are torques."""
+    linear: bool = eqx.field(static=True, default=False)
+    """True where inputs go straight from row to row (first-order hold); False where they are held."""
     pace: float = eqx.field(static=True, default=1.0)
     """Time in which the horizons of predictions are counted [s]: 1 s for machines with joints."""
 
@@ -94,10 +103,11 @@ class StateSpaceModel(AbstractModel):
         if self.servos:
             drives = len(self.servos)
             scale = u[:, drives:] if u.shape[1] > drives else None
-            u = hooks.fed(self.effects, self.servos, self.system, u[:, :drives], self.dt, scale)
+            u = hooks.fed(self.effects, self.servos, self.system, u[:, :drives], self.rows, scale)
         else:
-            u = hooks.reaching(self.effects, self.system, u, self.dt)
-        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale)
+            u = hooks.reaching(self.effects, self.system, u, self.rows)
+        change = jnp.diff(u, axis=0, append=u[-1:]) if self.linear else None
+        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale, change)
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> OperatingPoint:
         """State of the machine at one moment, as effects get it."""
@@ -110,10 +120,14 @@ class StateSpaceModel(AbstractModel):
     def driving(
         self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs
     ) -> Float[Array, "time dof"]:
-        """Generalised force of the inputs along states, with `effects` on top of what reaches the drives [N m]."""
-        if not (servos := self.servos):
-            return jax.vmap(self.system.drive)(hooks.reaching(effects, self.system, u.u, self.dt))
-        fed, dof = hooks.late(effects, servos, self.system, u.u, self.dt), len(self.system.coordinates)
+        """Generalised force of the inputs along states in the middle of the steps, with `effects` on top [N m]."""
+        servos, dof = self.servos, len(self.system.coordinates)
+        arrive = partial(hooks.late, effects, servos) if servos else partial(hooks.reaching, effects)
+        fed = arrive(self.system, u.u, self.rows)
+        if self.linear:
+            fed = 0.5 * (fed + jnp.concatenate([fed[1:], fed[-1:]]))
+        if not servos:
+            return jax.vmap(self.system.drive)(fed)
 
         def at(x: Float[Array, " state"], fed: Float[Array, " input"], scale) -> Float[Array, " dof"]:
             q, v = x[:dof], x[dof : 2 * dof]
@@ -138,7 +152,7 @@ class StateSpaceModel(AbstractModel):
     ) -> Float[Array, " state"]:
         """Mean of the state one sample later."""
         extra = jnp.zeros(len(self.system.ports), x.dtype) if force is None else force
-        return integrate(lambda x: self.slopes(x, u, extra), x, self.dt, self.steps)
+        return integrate(lambda x, part: self.slopes(x, u.at(part), extra), x, self.dt, self.steps)
 
     def resolved(self) -> "StateSpaceModel":
         """This model with the integration steps that its friction requires, a power of two: programs are shared.
@@ -158,6 +172,11 @@ class StateSpaceModel(AbstractModel):
             if servo.column == column and key in servo.values:
                 return servo.values[key]
         return self.system.parameter(name)
+
+    @property
+    def rows(self) -> hooks.Sampling:
+        """Interval of the rows, and the course of the inputs between them."""
+        return hooks.Sampling(self.dt, self.linear)
 
     @property
     def steps(self) -> int:
@@ -188,9 +207,12 @@ class StateSpaceModel(AbstractModel):
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
             """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
-            before, reach = u._replace(u=u.before), jnp.minimum(delay, u.age)
-            still = jnp.zeros(len(self.system.ports), x.dtype)
-            return self.true(integrate(lambda x: -reach * self.rate(x, before, still), x, 1.0, 3), before, force)
+            change = None if u.change is None else u.u - u.before
+            before, reach = u._replace(u=u.before, change=change), jnp.minimum(delay, u.age)
+            still, back = jnp.zeros(len(self.system.ports), x.dtype), reach / self.dt
+            at = lambda part: before.at(jnp.maximum(1 - part * back, 0.0))  # noqa: E731
+            ago = integrate(lambda x, part: -reach * self.rate(x, at(part), still), x, 1.0, 3)
+            return self.true(ago, at(1.0), force)
 
         return hooks.read(self.effects, names, self.true(x, u, force), past)
 

@@ -54,25 +54,25 @@ class RK4(diffrax.AbstractSolver):
 
 
 def integrate(
-    rate: Callable[[Float[Array, " state"]], Float[Array, " state"] | Sequence[Float[Array, ""]]],
+    rate: Callable[[Float[Array, " state"], Float[Array, ""]], Float[Array, " state"] | Sequence[Float[Array, ""]]],
     x: Float[Array, " state"],
     dt: float,
     substeps: int,
 ) -> Float[Array, " state"]:
-    """State after `dt` [s] of x' = rate(x), by `substeps` equal steps of `RK4`.
+    """State after `dt` [s] of x' = rate(x, s), by `substeps` equal steps of `RK4`; s goes from 0 to 1 in that time.
 
-    The input is held over the interval (zero-order hold), so the rate does not depend on time.  A rate may be handed
-    over entry by entry: an array of many joints' accelerations is computed anew for every entry that is read.
+    A rate may be handed over entry by entry: an array of many joints' accelerations is computed anew for every entry
+    that is read.
     """
     solver = RK4()
-    term = diffrax.ODETerm(lambda t, y, args: tuple(rate(jnp.stack(y))))
+    term = diffrax.ODETerm(lambda t, y, step: tuple(rate(jnp.stack(y), (step + t / h) / substeps)))
     zero, h = jnp.zeros((), x.dtype), jnp.asarray(dt / substeps, x.dtype)
 
-    def body(x, _):
-        x, *_ = solver.step(term, zero, h, x, None, None, made_jump=False)
+    def body(x, step):
+        x, *_ = solver.step(term, zero, h, x, step, None, made_jump=False)
         return x, None
 
-    entries, _ = jax.lax.scan(body, tuple(x), None, length=substeps)
+    entries, _ = jax.lax.scan(body, tuple(x), jnp.arange(substeps, dtype=x.dtype))
     return jnp.stack(entries)
 
 

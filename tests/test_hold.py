@@ -1,0 +1,146 @@
+"""Inputs that go straight from row to row: closed forms, and scipy's simulation of linear systems (`lsim`)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import rig_text, slide
+from scipy.integrate import solve_ivp
+from scipy.signal import lsim
+
+from nnap_em.data.dataset import Dataset, pad
+from nnap_em.data.rig import HELD, LINEAR, read_rig, write_rig
+from nnap_em.effects import catalogue
+from nnap_em.em.build import build_system
+from nnap_em.fit.check import late
+from nnap_em.fit.inverse_dynamics import lag, regression
+from nnap_em.model import hooks
+from nnap_em.model.state_space import Inputs, with_effects
+from nnap_em.systems import specs
+
+DT, ROWS = 0.05, 40
+LINES = hooks.Sampling(DT, linear=True)
+
+
+def _model(effects=(), linear=True):
+    return dataclasses.replace(with_effects(slide()[0], effects), linear=linear)
+
+
+def _log(u) -> Dataset:
+    rows = len(u)
+    return Dataset(
+        jnp.asarray(DT * np.arange(rows)), jnp.asarray(u)[:, None], jnp.full((rows, 2), jnp.nan), jnp.ones(rows, bool)
+    )
+
+
+def _run(model, u):
+    step = lambda x, inputs: (model.transition(x, inputs), x)  # noqa: E731
+    return np.asarray(jax.lax.scan(step, jnp.asarray([0.1, -0.2]), model.inputs(_log(u)))[1])
+
+
+def _signal(rows=ROWS):
+    return np.sin(2.7 * DT * np.arange(rows)) + 0.3 * np.random.default_rng(0).normal(size=rows)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_mass_moves_as_its_force_does(linear):
+    """m x'' = u: scipy holds the input, or draws a line between its rows."""
+    model, u = _model(linear=linear), _signal()
+    system = ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1 / float(model.system.m)]], np.eye(2), np.zeros((2, 1)))
+    _, _, x = lsim(system, u, DT * np.arange(ROWS), X0=[0.1, -0.2], interp=linear)
+    np.testing.assert_allclose(_run(model, u), x, atol=1e-12)
+
+
+def test_a_lag_is_that_of_the_line_between_rows():
+    """tau y' = u - y, at rest with the input before the first row."""
+    lag, u = catalogue["actuator_lag"].of(0.13, joint=1), _signal()
+    _, y, _ = lsim(([[-1 / 0.13]], [[1 / 0.13]], [[1.0]], [[0.0]]), u, DT * np.arange(ROWS), X0=[u[0]], interp=True)
+    np.testing.assert_allclose(LINES.through(lag, jnp.asarray(u)), y, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.12])
+def test_a_delay_moves_the_line(delay):
+    late, u, t = catalogue["input_delay"].of(delay, joint=1), _signal(), DT * np.arange(ROWS)
+    np.testing.assert_allclose(LINES.through(late, jnp.asarray(u)), np.interp(t - delay, t, u), atol=1e-12)
+
+
+@pytest.mark.parametrize("name, number", [("actuator_lag", 0.13), ("input_delay", 0.12), ("motor_gain", 0.1)])
+def test_row_by_row_is_the_whole(name, number):
+    effect, u = catalogue[name].of(number, joint=1), _signal()
+    system = _model().system
+    stream = hooks.command_stream((effect,), None, system, LINES)
+    step = lambda memory, row: stream.step(memory, row[0], row[1])  # noqa: E731
+    first = jnp.arange(ROWS) == 0
+    _, found = jax.lax.scan(step, stream.memory, (jnp.asarray(u)[:, None], first))
+    np.testing.assert_allclose(found, hooks.reaching((effect,), system, jnp.asarray(u)[:, None], LINES), atol=1e-12)
+
+
+def test_a_late_sensor_reads_the_line_before_its_row():
+    """The position `delay` ago, by the closed form of a mass under a linear force."""
+    delay, u = 0.03, _signal()
+    model = _model((catalogue["sensor_delay"].of(delay, channel="x"),))
+    inputs, x, m = model.inputs(_log(u)), _run(model, u), float(model.system.m)
+    read = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), inputs))[1:, 0]
+    slope = np.diff(u) / DT
+    past = x[1:, 0] - delay * x[1:, 1] + (u[1:] * delay**2 / 2 - slope * delay**3 / 6) / m
+    np.testing.assert_allclose(read, past, atol=1e-12)
+
+
+def test_held_inputs_have_no_course():
+    inputs = _model(linear=False).inputs(_log(_signal()))
+    assert inputs.change is None and inputs.at(0.5) is inputs
+    line = Inputs(jnp.ones(1), jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), None, jnp.asarray([0.5]))
+    np.testing.assert_allclose(line.at(0.5).u, [1.25])
+
+
+def _rig(tmp_path, hold):
+    slide = (
+        'type = "slide"\nm = { mean = 2.0, std = 0.2 }\nfriction = "unknown"\n[input]\ncolumns = ["u"]\njoints = [1]'
+    )
+    (tmp_path / "rig.toml").write_text(rig_text(slide, ["x"], 0.04).replace(HELD, hold))
+    return read_rig(tmp_path / "rig.toml", specs)
+
+
+def test_a_rig_is_read_back_with_its_hold(tmp_path):
+    rig = _rig(tmp_path, LINEAR)
+    write_rig(rig, tmp_path / "again.toml")
+    assert rig.input_hold == LINEAR and read_rig(tmp_path / "again.toml", specs) == rig
+
+
+def _recordings(force, rng, delay=0.0):
+    """Slides of 2.1 kg with dry and viscous friction under a force in time, every 40 ms, by scipy."""
+
+    def one():
+        size, rate, phase = rng.uniform(2, 5, 3), rng.uniform(1, 9, 3), rng.uniform(0, 6, 3)
+        smooth = lambda t: float(np.sum(size * np.sin(rate * t + phase)))  # noqa: E731
+        t = 0.04 * np.arange(300)
+        move = lambda t, x: [x[1], (force(smooth, t - delay) - np.tanh(x[1] / 0.02) - 1.5 * x[1]) / 2.1]  # noqa: E731
+        x = solve_ivp(move, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.04).y[0]
+        return t, np.array([[smooth(at)] for at in t]), (x + 3e-4 * rng.normal(size=x.size))[:, None]
+
+    return pad([one() for _ in range(4)])
+
+
+FORCES = {HELD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), LINEAR: lambda smooth, t: smooth(t)}
+
+
+@pytest.mark.parametrize("true", FORCES)
+@pytest.mark.parametrize("declared", FORCES)
+def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
+    """They differ by half a row; the line to write is the hold of the truth, and nothing where it is declared."""
+    rig = _rig(tmp_path, declared)
+    found = lag(regression(rig, build_system(rig), _recordings(FORCES[true], np.random.default_rng(3))), 0)
+    expected = {(HELD, LINEAR): -0.5, (LINEAR, HELD): 0.5}.get((declared, true), 0.0)
+    assert abs(found.rows - expected) < 0.05 and found.std < 0.03
+    assert found.counts == (true != declared)
+    assert not found.counts or f'input_hold = "{true}"' in late(rig, found)
+
+
+def test_a_late_drive_is_no_hold(tmp_path):
+    rig = _rig(tmp_path, LINEAR)
+    data = _recordings(FORCES[LINEAR], np.random.default_rng(3), delay=0.07)
+    found = lag(regression(rig, build_system(rig), data), 0)
+    assert abs(found.rows - 0.07 / 0.04) < 0.05 and found.counts
+    assert "input_delay" in late(rig, found) and "input_hold =" not in late(rig, found)

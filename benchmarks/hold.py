@@ -106,9 +106,7 @@ def main() -> None:
         f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
         f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
     )
-    print(
-        "| machine | input_hold | inertia within 2 std | friction within 2 std | median error: inertia, friction [std] |"
-    )
+    print("| machine | input_hold | inertia within 2 std | friction within 2 std | median errors [std] |")
     print("|" + 5 * " --- |")
     for name, machine in MACHINES.items():
         for hold in args.hold:

@@ -1,4 +1,4 @@
-"""Inputs that go straight from row to row: closed forms, and scipy's simulation of linear systems (`lsim`)."""
+"""Inputs that go on from row to row: closed forms, and scipy's simulation of linear systems (`lsim`)."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import HELD, LINEAR, read_rig, write_rig
+from nnap_em.data.rig import HELD, SMOOTH, read_rig, write_rig
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build_system
 from nnap_em.fit.check import late
@@ -21,11 +21,11 @@ from nnap_em.model.state_space import Inputs, with_effects
 from nnap_em.systems import specs
 
 DT, ROWS = 0.05, 40
-LINES = hooks.Sampling(DT, linear=True)
+LINES = hooks.Sampling(DT, smooth=True)
 
 
-def _model(effects=(), linear=True):
-    return dataclasses.replace(with_effects(slide()[0], effects), linear=linear)
+def _model(effects=(), smooth=True):
+    return dataclasses.replace(with_effects(slide()[0], effects), smooth=smooth)
 
 
 def _log(u) -> Dataset:
@@ -44,13 +44,36 @@ def _signal(rows=ROWS):
     return np.sin(2.7 * DT * np.arange(rows)) + 0.3 * np.random.default_rng(0).normal(size=rows)
 
 
-@pytest.mark.parametrize("linear", [False, True])
-def test_a_mass_moves_as_its_force_does(linear):
-    """m x'' = u: scipy holds the input, or draws a line between its rows."""
-    model, u = _model(linear=linear), _signal()
-    system = ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1 / float(model.system.m)]], np.eye(2), np.zeros((2, 1)))
-    _, _, x = lsim(system, u, DT * np.arange(ROWS), X0=[0.1, -0.2], interp=linear)
-    np.testing.assert_allclose(_run(model, u), x, atol=1e-12)
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_mass_moves_as_its_force_does(smooth):
+    """m x'' = u: held, as scipy holds it; a parabola between rows, integrated twice."""
+    model, m = _model(smooth=smooth), float(slide()[0].system.m)
+    t, c = DT * np.arange(ROWS), (0.7, -1.3, 2.1)
+    if smooth:
+        u = c[0] + c[1] * t + c[2] * t**2
+        v = -0.2 + (c[0] * t + c[1] * t**2 / 2 + c[2] * t**3 / 3) / m
+        x = np.stack([0.1 - 0.2 * t + (c[0] * t**2 / 2 + c[1] * t**3 / 6 + c[2] * t**4 / 12) / m, v], axis=1)
+    else:
+        u, system = _signal(), ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1 / m]], np.eye(2), np.zeros((2, 1)))
+        x = lsim(system, u, t, X0=[0.1, -0.2], interp=False)[2]
+    np.testing.assert_allclose(_run(model, u), x, rtol=1e-12, atol=1e-12)
+
+
+def test_a_sine_loses_nothing_between_its_rows():
+    """Velocity under sin(w t), w dt = 0.4: lines would be 1.3 % too small, (w dt)^2 / 12."""
+    w, m = 0.4 / DT, float(slide()[0].system.m)
+    v = _run(_model(), np.sin(w * DT * np.arange(400)))[:, 1]
+    exact = -0.2 + (1 - np.cos(w * DT * np.arange(400))) / (w * m)
+    np.testing.assert_allclose(v, exact, atol=2e-3 / (w * m))
+
+
+def test_padding_and_horizons_end_the_course():
+    u, model = _signal(), _model()
+    whole, short = model.inputs(_log(u)), _log(u[:20])
+    padded = _log(np.append(u[:20], np.zeros(5)))._replace(valid=jnp.arange(25) < 20)
+    a, b = model.inputs(short).course, model.inputs(padded).course
+    np.testing.assert_array_equal(a[:19], b[:19])
+    np.testing.assert_array_equal(a[:18], whole.course[:18])
 
 
 def test_a_lag_is_that_of_the_line_between_rows():
@@ -84,15 +107,15 @@ def test_a_late_sensor_reads_the_line_before_its_row():
     inputs, x, m = model.inputs(_log(u)), _run(model, u), float(model.system.m)
     read = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), inputs))[1:, 0]
     slope = np.diff(u) / DT
-    past = x[1:, 0] - delay * x[1:, 1] + (u[1:] * delay**2 / 2 - slope * delay**3 / 6) / m
+    past = x[1:, 0] - delay * x[1:, 1] + (u[1:] * delay**2 / 2 - slope * delay**3 / 6) / m  # by a line
     np.testing.assert_allclose(read, past, atol=1e-12)
 
 
 def test_held_inputs_have_no_course():
-    inputs = _model(linear=False).inputs(_log(_signal()))
-    assert inputs.change is None and inputs.at(0.5) is inputs
-    line = Inputs(jnp.ones(1), jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), None, jnp.asarray([0.5]))
-    np.testing.assert_allclose(line.at(0.5).u, [1.25])
+    inputs = _model(smooth=False).inputs(_log(_signal()))
+    assert inputs.course is None and inputs.at(0.5) is inputs
+    line = Inputs(jnp.ones(1), jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), None, jnp.asarray([[0.5], [0.8]]))
+    np.testing.assert_allclose(line.at(0.5).u, [1.25 - 0.1])
 
 
 def _rig(tmp_path, hold):
@@ -104,9 +127,9 @@ def _rig(tmp_path, hold):
 
 
 def test_a_rig_is_read_back_with_its_hold(tmp_path):
-    rig = _rig(tmp_path, LINEAR)
+    rig = _rig(tmp_path, SMOOTH)
     write_rig(rig, tmp_path / "again.toml")
-    assert rig.input_hold == LINEAR and read_rig(tmp_path / "again.toml", specs) == rig
+    assert rig.input_hold == SMOOTH and read_rig(tmp_path / "again.toml", specs) == rig
 
 
 def _recordings(force, rng, delay=0.0):
@@ -123,7 +146,7 @@ def _recordings(force, rng, delay=0.0):
     return pad([one() for _ in range(4)])
 
 
-FORCES = {HELD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), LINEAR: lambda smooth, t: smooth(t)}
+FORCES = {HELD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOOTH: lambda smooth, t: smooth(t)}
 
 
 @pytest.mark.parametrize("true", FORCES)
@@ -132,15 +155,15 @@ def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
     """They differ by half a row; the line to write is the hold of the truth, and nothing where it is declared."""
     rig = _rig(tmp_path, declared)
     found = lag(regression(rig, build_system(rig), _recordings(FORCES[true], np.random.default_rng(3))), 0)
-    expected = {(HELD, LINEAR): -0.5, (LINEAR, HELD): 0.5}.get((declared, true), 0.0)
+    expected = {(HELD, SMOOTH): -0.5, (SMOOTH, HELD): 0.5}.get((declared, true), 0.0)
     assert abs(found.rows - expected) < 0.05 and found.std < 0.03
     assert found.counts == (true != declared)
     assert not found.counts or f'input_hold = "{true}"' in late(rig, found)
 
 
 def test_a_late_drive_is_no_hold(tmp_path):
-    rig = _rig(tmp_path, LINEAR)
-    data = _recordings(FORCES[LINEAR], np.random.default_rng(3), delay=0.07)
+    rig = _rig(tmp_path, SMOOTH)
+    data = _recordings(FORCES[SMOOTH], np.random.default_rng(3), delay=0.07)
     found = lag(regression(rig, build_system(rig), data), 0)
     assert abs(found.rows - 0.07 / 0.04) < 0.05 and found.counts
     assert "input_delay" in late(rig, found) and "input_hold =" not in late(rig, found)

@@ -75,7 +75,7 @@ LAWS = {
 
 
 def _compare(source, fitted, t, u, y, atol, kind=np.float64):
-    u = u if fitted.model.linear else held(u)
+    u = u if fitted.model.smooth else held(u)
     found, states = play(source, t, u, y, fitted.model.log_q.shape[0], kind), replay(observer(fitted), t, u, y)
     states = jax.tree.map(np.asarray, states)
     std = np.sqrt(np.diagonal(states.cov, axis1=1, axis2=2))
@@ -95,10 +95,10 @@ def test_c_gives_the_numbers_of_python_over_10000_rows_with_gaps(plain):
 
 
 @pytest.mark.parametrize("laws", LAWS)
-@pytest.mark.parametrize("linear", [False, True], ids=["held", "linear"])
-def test_c_has_laws_of_command_and_sensor(laws, linear, tmp_path):
+@pytest.mark.parametrize("smooth", [False, True], ids=["held", "smooth"])
+def test_c_has_laws_of_command_and_sensor(laws, smooth, tmp_path):
     fitted = _fit(*LAWS[laws])
-    fitted = fitted._replace(state=fitted.state._replace(best=dataclasses.replace(fitted.model, linear=linear)))
+    fitted = fitted._replace(state=fitted.state._replace(best=dataclasses.replace(fitted.model, smooth=smooth)))
     write_observer(fitted, tmp_path / "dressed.c")
     _compare(tmp_path / "dressed.c", fitted, *_log(), 1e-9)
 
@@ -171,17 +171,17 @@ def test_stamps_say_which_rows_are_missing(plain):
     assert flags[60] & JUMP and flags[61] & RESTARTED and not flags[62:].any()
 
 
-def test_linear_inputs_go_straight_over_rows_that_never_came(plain, tmp_path):
-    fitted = plain[0]._replace(state=plain[0].state._replace(best=dataclasses.replace(plain[0].model, linear=True)))
-    write_observer(fitted, tmp_path / "linear.c")
+def test_smooth_inputs_go_straight_over_rows_that_never_came(plain, tmp_path):
+    fitted = plain[0]._replace(state=plain[0].state._replace(best=dataclasses.replace(plain[0].model, smooth=True)))
+    write_observer(fitted, tmp_path / "smooth.c")
     t, u, y = _log(100, seed=1)
     y = np.where(np.isnan(y), 0.0, y)
     gone, without, straight = np.delete(np.arange(100), [50, 51]), y.copy(), u.copy()
     without[50:52] = np.nan
     straight[50:52] = u[49] + (u[52] - u[49]) * np.array([[1.0], [2.0]]) / 3
-    whole = play(tmp_path / "linear.c", t, straight, without, 2)
+    whole = play(tmp_path / "smooth.c", t, straight, without, 2)
     np.testing.assert_allclose(
-        play(tmp_path / "linear.c", t[gone], u[gone], y[gone], 2).mean[50:], whole.mean[52:], rtol=1e-12
+        play(tmp_path / "smooth.c", t[gone], u[gone], y[gone], 2).mean[50:], whole.mean[52:], rtol=1e-12
     )
 
 

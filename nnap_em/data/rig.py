@@ -42,15 +42,15 @@ _HINTS = {  # how the line of a key or table should look
     "kind": 'kind = "position" (a servo that is given a position), or kind = "torque"',
     "dt": "a number above 0, dt = 0.01 (s)",
     "g": "g = 9.81 (m/s^2)",
-    "input_hold": 'input_hold = "zero-order" (a command that is held) or "first-order" (a measured signal: linear)',
+    "input_hold": 'input_hold = "zero-order" (a command that is held) or "first-order" (a measured signal)',
     "mean": "both numbers, { mean = 0.2, std = 0.02 }",
     "std": "both numbers, { mean = 0.2, std = 0.02 }",
     "clock": 'clock = "sequence" (time starts at 0 in each file) or clock = "session" (it runs on over all files)',
 }
 
 
-HELD, LINEAR = "zero-order", "first-order"
-"""Holds of inputs: commands stay until the next row; measured signals go straight from row to row."""
+HELD, SMOOTH = "zero-order", "first-order"
+"""Holds of inputs: commands stay until the next row; measured signals go on from row to row."""
 
 
 class RigError(ValueError):
@@ -126,7 +126,7 @@ class Rig:
     equations: str = ""  # of a plant that is written as equations: all of them, as `equations.Text.packed` writes them
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)  # ends of sensors: not read
     horizon: float | None = None  # s; how far predictions are used, of equations; None: by their time constants
-    input_hold: str = HELD  # or LINEAR
+    input_hold: str = HELD  # or SMOOTH
     file: str = dataclasses.field(default="", compare=False)  # MJCF of the machine, with shapes: to be written back
 
     @property
@@ -223,7 +223,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
         clock=sampling.choice("clock", clocks),
-        input_hold=sampling.choice("input_hold", (HELD, LINEAR)),
+        input_hold=sampling.choice("input_hold", (HELD, SMOOTH)),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..data.rig import LINEAR, Rig, RigError
+from ..data.rig import SMOOTH, Rig, RigError
 from ..model.friction import FrictionNetwork, NoFriction
 from ..model.state_space import MOST_STEPS, SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -189,7 +189,7 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         dt=rig.dt,
         substeps=min(max(SUBSTEPS, math.ceil(steps_of_sample(system, servos, data, rig.dt))), MOST_STEPS),
         servos=servos or None,
-        linear=rig.input_hold == LINEAR,
+        smooth=rig.input_hold == SMOOTH,
     )
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
     prior = ParameterPrior(

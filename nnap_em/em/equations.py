@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
-from ..data.rig import LINEAR, Rig
+from ..data.rig import SMOOTH, Rig
 from ..effects.equations import NODES, UnknownTerm
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, Inputs, StateSpaceModel, with_effects
@@ -204,7 +204,7 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
         log_r=jnp.asarray([2 * math.log(n or 2 * s) for n, s in zip(noise, least, strict=True)], float),
         measured=tuple(system.readable.index(name) for name in rig.measured),
         dt=rig.dt,
-        linear=rig.input_hold == LINEAR,
+        smooth=rig.input_hold == SMOOTH,
     )
     seen = motion(model, data)
     size = np.sqrt(np.mean(seen.rate**2, axis=0)) if len(seen.rate) else np.ones(count)

@@ -30,7 +30,7 @@ static void transition(const real *in, const real *p, real x[N][2 * N])
 {
     static const real ahead[4] = {(real)0.5, (real)0.5, 1, 0}, share[4] = {1, 2, 2, 1};
     const real h = (real)(DT / SUBSTEPS);
-#if LINEAR
+#if SMOOTH
     static const real when[4] = {0, (real)0.5, (real)0.5, 1};
     real now[ROW];
     for (int i = 0; i < ROW; i++) now[i] = in[i];
@@ -43,8 +43,9 @@ static void transition(const real *in, const real *p, real x[N][2 * N])
             for (int j = 0; j < 2 * N; j++) at[i][j] = start[i][j] = x[i][j];
         for (int stage = 0; stage < 4; stage++) {
             const real forward = h * ahead[stage], part = h / 6 * share[stage];
-#if LINEAR
-            for (int i = 0; i < D; i++) now[i] = in[i] + (n + when[stage]) / SUBSTEPS * in[CHANGE + i];
+#if SMOOTH
+            const real s = (n + when[stage]) / SUBSTEPS;
+            for (int i = 0; i < D; i++) now[i] = in[i] + s * (in[COURSE + i] - (1 - s) / 2 * in[COURSE + D + i]);
 #endif
             rate((const real (*)[2 * N])at, now, p, slope);
             for (int i = 0; i < N; i++)
@@ -270,15 +271,15 @@ static void report(nnap_state *s, int best)
     for (int k = 0; k < s->live; k++) s->branch[k].log_weight -= top;
 }
 
-/* One row: inputs held since the row before, or where these are linear those of the row; readings. */
+/* One row: inputs held since the row before, or where these go on those of the row; readings. */
 static int row(nnap_state *s, const real *u, const real *y)
 {
     const int first = s->age < -0.5 * DT;
     const real gate = s->rows < SETTLING ? INFINITY : GATE;
-    const int takes = LINEAR || !first;
+    const int takes = SMOOTH || !first;
     real in[ROW] = {0}, out[MEMORY + D + 1], value[M];
     int flags = 0, now[M], before[M], waiting = 0, count = 0, beyond = 0, best;
-#if LINEAR
+#if SMOOTH
     for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
 #endif
     for (int i = 0; i < COLUMNS && takes; i++) {
@@ -296,13 +297,17 @@ static int row(nnap_state *s, const real *u, const real *y)
     }
     for (int i = 0; i < D; i++) in[i] = in[D + i] = s->fed[i];
     if (takes) {
-        const real begins = LINEAR ? first : s->age < 0.5 * DT;
+        const real begins = SMOOTH ? first : s->age < 0.5 * DT;
         commands(s->memory, s->u, &begins, s->parameter, out);
         for (int i = 0; i < MEMORY; i++) s->memory[i] = out[i];
         for (int i = 0; i < D; i++) s->fed[i] = out[MEMORY + i];
     }
-#if LINEAR
-    for (int i = 0; i < D; i++) in[CHANGE + i] = s->fed[i] - in[i];
+#if SMOOTH
+    for (int i = 0; i < D; i++) {
+        in[COURSE + i] = s->fed[i] - in[i];
+        if (s->age > 0.5 * DT) in[COURSE + D + i] = in[COURSE + i] - in[i] + s->past[i];
+        s->past[i] = in[i];
+    }
 #else
     for (int i = 0; i < D; i++) in[i] = s->fed[i];
     for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
@@ -318,7 +323,7 @@ static int row(nnap_state *s, const real *u, const real *y)
     s->time += DT;
     s->age += DT;
     for (int i = 0; i < D; i++) in[D + i] = in[i], in[i] = s->fed[i];
-#if LINEAR
+#if SMOOTH
     for (int i = 0; i < SCALES; i++) in[2 * D + 2 + i] = s->u[D + i];
 #endif
     in[2 * D] = (real)(s->time + 0.5 * DT);
@@ -365,7 +370,7 @@ void nnap_start(nnap_state *s, double time)
     for (int i = 0; i < PARAMETERS; i++) s->parameter[i] = fitted[i];
     for (int i = 0; i < MEMORY; i++) s->memory[i] = 0;
     for (int i = 0; i < COLUMNS; i++) s->u[i] = 0;
-    for (int i = 0; i < D; i++) s->fed[i] = 0;
+    for (int i = 0; i < D; i++) s->fed[i] = s->past[i] = 0;
     for (int i = 0; i < M; i++) s->late[i] = NAN;
     s->stamp = time;
     s->odd = NAN;
@@ -402,7 +407,7 @@ int nnap_step(nnap_state *s, double time, const real *u, const real *y)
     if (rows < 1) return nnap_JUMP;
     if (rows > 1) flags |= nnap_JUMP;
     for (int k = 1; k < (int)rows; k++) {
-#if LINEAR
+#if SMOOTH
         real between[COLUMNS + !COLUMNS];
         for (int i = 0; i < COLUMNS; i++) between[i] = s->u[i] + (u[i] - s->u[i]) / ((real)rows - k + 1);
         flags |= row(s, between, nothing) & nnap_RESTARTED;

@@ -25,7 +25,7 @@ typedef struct {
 typedef struct {
     nnap_real mean[NNAP_STATES], std[NNAP_STATES], innovation[NNAP_READINGS], late[NNAP_READINGS];
     nnap_real parameter[NNAP_PARAMETERS + !NNAP_PARAMETERS], u[NNAP_INPUTS + !NNAP_INPUTS];
-    nnap_real misfit, weight, memory[$memory], fed[$drives];
+    nnap_real misfit, weight, memory[$memory], fed[$drives], past[$drives];
     double stamp, odd, time, age;
     int rows, live;
     nnap_branch branch[NNAP_BRANCHES + 2];

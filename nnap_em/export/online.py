@@ -169,7 +169,7 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
 
     def inputs(row) -> Inputs:
         u, before, time, age = row[:drives], row[drives : 2 * drives], row[2 * drives], row[2 * drives + 1]
-        change = jnp.zeros_like(u) if model.linear else None
+        change = jnp.zeros((2, drives), u.dtype) if model.smooth else None
         return Inputs(u, before, time, age, row[2 * drives + 2 :] if scales else None, change)
 
     def rate(x, row, p, friction=unknown):
@@ -212,7 +212,7 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
     sizes = {
         "N": n, "M": m, "D": drives, "SCALES": scales, "COLUMNS": drives + scales, "MEMORY": memory,
         "PARAMETERS": len(own.names), "NOISE": len(own.names) - n - m, "PROCESS": len(own.names) - n,
-        "CHANGE": 2 * drives + 2 + scales, "ROW": 3 * drives + 2 + scales + 1,
+        "COURSE": 2 * drives + 2 + scales, "ROW": 4 * drives + 2 + scales + 1,
         "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles),
         "LONGEST_GAP": max(10, round(1 / model.dt)), "DEGREE": DEGREE,
         "DIGITS": 23 if dialect.single else 52, "BIAS": 127 if dialect.single else 1023,
@@ -226,7 +226,7 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
         "start_mean[N]": model.start.mean, "start_root[N][N]": root(model.start.cov), "again_mean[N]": again.mean,
         "again_root[N][N]": root(again.cov), "fitted[PARAMETERS]": own.values,
     }  # fmt: skip
-    waits = [int(place >= 2 * dof and not model.linear) for place in model.measured]
+    waits = [int(place >= 2 * dof and not model.smooth) for place in model.measured]
     calls = ("sqrt", "fabs", "exp", "log", "fmax")
     lines = [
         f"/* Observer of {_comment(fitted.rig.name)}: written by nnap_em {__version__}.  Link with -lm. */",
@@ -234,7 +234,7 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
         f"typedef {name}_real real;\ntypedef uint{32 if dialect.single else 64}_t bits;",
         f"enum {{ {', '.join(f'{key} = {value}' for key, value in sizes.items())} }};",
         f"#define DT {model.dt!r}",
-        f"#define LINEAR {int(model.linear)}",
+        f"#define SMOOTH {int(model.smooth)}",
         *(f"#define {key} ({dialect.number(float(value))})" for key, value in reals.items()),
         *(f"#define {call.upper()} {call}{'f' if dialect.single else ''}" for call in calls),
         *(f"static const real {key} = {_braces(np.asarray(value), dialect)};" for key, value in arrays.items()),
@@ -265,7 +265,7 @@ def _header(fitted: Identified, name: str, dialect: Dialect, memory: int) -> str
     }  # fmt: skip
     words = {
         "rig": rig.name, "version": __version__, "dt": f"{rig.dt:g}", "columns": ", ".join(columns) or "none",
-        "held": "of this row, linear between rows" if fitted.model.linear else "held from the row before to this one",
+        "held": "signals read in this row" if fitted.model.smooth else "held from the row before to this one",
         "states": ", ".join(states) + (f", {extra} of laws with memory" if extra else ""),
         "measured": ", ".join(rig.measured), "parameters": ", ".join(own.names), "gate": f"{observing.GATE:g}",
         "sizes": ", ".join(f"{name.upper()}_{key} = {size}" for key, size in sizes.items()), "memory": max(memory, 1),

@@ -22,7 +22,7 @@ from scipy.optimize import lsq_linear
 
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
-from ..data.rig import HELD, LINEAR, Rig
+from ..data.rig import HELD, SMOOTH, Rig
 from ..data.servo import TORQUE
 from ..systems import AbstractSystem
 
@@ -54,9 +54,9 @@ UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
 
 
-TRIANGLE = {HELD: (0.5, 0.5, 0.0), LINEAR: (1 / 6, 2 / 3, 1 / 6)}
+TRIANGLE = {HELD: (0.5, 0.5, 0.0), SMOOTH: (1 / 12, 5 / 6, 1 / 12)}
 """Weights of the row before, a row and the next in the force that a second difference feels, a mean over both intervals
-with a triangle as its weight: of inputs that are held, and of inputs that are linear."""
+with a triangle as its weight: of inputs that are held, and of smooth ones [Numerov 1924]."""
 BLOCKS = 20
 """Blocks of rows whose errors are taken as independent."""
 LATE, SURE_LAG = 0.25, 5.0
@@ -260,34 +260,25 @@ def lag(problem: Regression, i: int) -> Lag:
 
     The best whole number of rows, then one step of Gauss and Newton.
     """
-    joint, motion = problem.system.joints[i] - 1, problem.motion
-    needed, others = problem.plain.sum(axis=0), problem.parts(slopes=True).sum(axis=0)[:, joint] * problem.std
-
-    def beyond(torque: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
-        return problem.beyond(np.repeat(torque[:, None], needed.shape[1], axis=1))[:, joint]
-
-    def torque(shift: int) -> Float[np.ndarray, "piece time"]:
-        return np.pad(motion.torque, ((0, 0), (REACH, REACH), (0, 0)), constant_values=np.nan)[
-            :, REACH - shift : REACH - shift + motion.torque.shape[1], i
-        ]
-
-    def at(torque: Float[np.ndarray, "piece time"]) -> Float[np.ndarray, "piece time"]:
-        return filtered(torque, motion.direct[joint])
-
-    inside = np.isfinite(at(torque(REACH)) + at(torque(-REACH)))[problem.rows]
-    rest = beyond(needed[:, joint] - problem.applied(problem.inputs)[:, joint] + problem.inputs[:, i])
-    free = _directions(np.stack([rest * 0, *map(beyond, others.T)], axis=1)[inside])
-    tried = []
-    for shift in range(1 - REACH, REACH):
-        early, now, late = (np.nan_to_num(at(torque(shift + k)))[problem.rows] for k in (-1, 0, 1))
-        pair = beyond(0.5 * (late - early))[inside], (rest - beyond(now))[inside]
-        moved, error = (a - free @ (free.T @ a) for a in pair)
-        tried.append((float(error @ error), shift, moved, error))
-    _, shift, moved, error = min(tried)
+    joint, motion, torque = problem.system.joints[i] - 1, problem.motion, problem.motion.torque[..., i]
+    others = problem.parts(slopes=True).sum(axis=0)[:, joint] * problem.std
+    rest = problem.plain.sum(axis=0)[:, joint] - (problem.applied(problem.inputs)[:, joint] - problem.inputs[:, i])
+    far = np.pad(torque, ((0, 0), (REACH, REACH)), constant_values=np.nan)
+    shifts = range(-REACH, REACH + 1)
+    late = [filtered(far[:, REACH - k :][:, : torque.shape[1]], motion.direct[joint])[problem.rows] for k in shifts]
+    inside = np.isfinite(late).all(axis=0)
+    if inside.sum() < FILTERED_ROWS:
+        return Lag(0.0, math.inf)
+    late, rest = np.stack(late)[:, inside], rest[inside]
+    free = _directions(np.concatenate([problem.friction[joint], others], axis=1)[inside])
+    misfits = [rest - torque for torque in late]
+    misfits = [error - free @ (free.T @ error) for error in misfits]
+    best = 1 + int(np.argmin([float(error @ error) for error in misfits[1:-1]]))
+    moved = 0.5 * (misfits[best - 1] - misfits[best + 1])
     size = float(moved @ moved) + 1e-300
-    rows = float(moved @ error) / size
-    blocks = np.array_split(moved * (error - rows * moved), BLOCKS)
-    return Lag(shift + rows, math.sqrt(sum(float(block.sum()) ** 2 for block in blocks)) / size)
+    rows = float(moved @ misfits[best]) / size
+    blocks = np.array_split(moved * (misfits[best] - rows * moved), BLOCKS)
+    return Lag(shifts[best] + rows, math.sqrt(sum(float(block.sum()) ** 2 for block in blocks)) / size)
 
 
 def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:

@@ -65,15 +65,16 @@ class Observation(NamedTuple):
 
 class _Memory(NamedTuple):
     """State of the filter between rows: all branches with the log of their weights, 0 for the likeliest and -inf for a
-    free place; memory of what lies between commands and drives, inputs that are held and what they set at the drives;
-    readings that wait for the input of their row, NaN where none does; time on the clock of the logs and since the
-    first row, below 0 before it [s]; rows since the last start, up to `SETTLING`."""
+    free place; memory of what lies between commands and drives, inputs that are held, what they set at the drives, and
+    what those of the row before set; readings that wait for the input of their row, NaN where none does; time on the
+    clock of the logs and since the first row, below 0 before it [s]; rows since the last start, up to `SETTLING`."""
 
     branches: Gaussian
     log_weight: Float[Array, " branch"]
     commands: Any
     u: Float[Array, " column"]
     fed: Float[Array, " input"]
+    past: Float[Array, " input"]
     late: Float[Array, " obs"]
     time: Float[Array, ""]
     age: Float[Array, ""]
@@ -167,9 +168,9 @@ def functions(
         model = dataclasses.replace(model, unknown=model.unknown.by_entry())
     commands = hooks.command_stream(model.effects, model.servos, model.system, model.rows)
     dtype, drives, dof = model.log_q.dtype, len(model.system.joints), len(model.system.coordinates)
-    linear = model.linear
+    smooth = model.smooth
     q, r = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r)
-    waits = np.asarray([place >= 2 * dof and not linear for place in model.measured])
+    waits = np.asarray([place >= 2 * dof and not smooth for place in model.measured])
     columns = drives + len({place for servo in model.servos or () for _, place, _ in servo.scales})
     zero = jnp.zeros((), dtype)
 
@@ -180,7 +181,7 @@ def functions(
     nothing = jnp.zeros(len(waits), dtype)
     blank = _Memory(
         *alone(model.start), commands.memory, jnp.zeros(columns, dtype), jnp.zeros(drives, dtype),
-        late=nothing + jnp.nan, time=zero, age=zero - model.dt, rows=zero,
+        past=jnp.zeros(drives, dtype), late=nothing + jnp.nan, time=zero, age=zero - model.dt, rows=zero,
     )  # fmt: skip
     unpacked = ravel_pytree(blank)[1]
 
@@ -190,22 +191,23 @@ def functions(
 
     def taken(state: _Memory, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
         first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
-        u = jnp.where(first & (not linear), 0.0, jnp.where(sound, u, state.u))
-        memory, fed = commands.step(state.commands, u, first if linear else state.age < 0.5 * model.dt)
-        if not linear:
+        u = jnp.where(first & (not smooth), 0.0, jnp.where(sound, u, state.u))
+        memory, fed = commands.step(state.commands, u, first if smooth else state.age < 0.5 * model.dt)
+        if not smooth:
             memory, fed = jax.tree.map(lambda a, b: jnp.where(first, a, b), (state.commands, state.fed), (memory, fed))
         scale, time, age = u[drives:] if columns > drives else None, state.time + model.dt, state.age + model.dt
         held = Inputs(fed, state.fed, state.time + 0.5 * model.dt, state.age, scale)
         here = Inputs(fed, fed, time + 0.5 * model.dt, age, scale)  # `fed` stands for what is not decided yet
-        if linear:
-            scaled = None if scale is None else state.u[drives:]
-            held = held._replace(u=state.fed, scale=scaled, change=fed - state.fed)
-            here = here._replace(before=state.fed, change=jnp.zeros_like(fed))
+        if smooth:
+            scaled, change = None if scale is None else state.u[drives:], fed - state.fed
+            bend = jnp.where(state.age > 0.5 * model.dt, change - state.fed + state.past, 0.0)
+            held = held._replace(u=state.fed, scale=scaled, course=jnp.stack([change, bend]))
+            here = here._replace(before=state.fed, course=0.0 * held.course)
         return _Row(
             first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
             late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),
             held=held, here=here,
-            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & (linear | ~first)}), time=time, age=age,
+            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & (smooth | ~first)}), time=time, age=age,
         )  # fmt: skip
 
     def filtered(x: Gaussian, row: _Row, late: Float[Array, " obs"]) -> tuple[Gaussian, Array, Array]:
@@ -242,7 +244,7 @@ def functions(
         (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
         outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
         after = _Memory(
-            every, log_weight, row.memory, row.u, row.here.u, row.late, row.time, row.age,
+            every, log_weight, row.memory, row.u, row.here.u, state.fed, row.late, row.time, row.age,
             jnp.where(sane, jnp.minimum(state.rows + 1, SETTLING), 1.0),
         )  # fmt: skip
         return Observation(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.rig import LINEAR, Rig, nearest
+from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
 from .columns import declared_at, resolve
@@ -234,7 +234,7 @@ def _sequence(segment: Segment, rig: Rig, plan: Plan, signals: Mapping[str, Sign
     if segment.why:
         return Stretch(segment.start, segment.rows, {}, segment.why), {}
     at = segment.start + rig.dt * np.arange(segment.rows)
-    value = straight if rig.input_hold == LINEAR else averaged if plan.mean else held
+    value = straight if rig.input_hold == SMOOTH else averaged if plan.mean else held
     columns = {name: value(signals[name], at, rig.dt) for name in rig.logged_inputs}
     for name in rig.measured:
         columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))[0]

@@ -20,23 +20,23 @@ class Sampling(NamedTuple):
 
     dt: float
     """Interval [s]."""
-    linear: bool = False
-    """True where an input goes straight from row to row; False where it is held."""
+    smooth: bool = False
+    """True where an input goes on from row to row; False where it is held."""
 
     def through(self, effect: AbstractEffect, u: Float[Array, " time"]) -> Float[Array, " time"]:
         """An input that was 0 before its first row, after a law that takes time.
 
-        Held: its mean over each interval.  Linear: its values in the rows, by the law of its slopes, which are held; in
-        the first row it stood already.
+        Held: its mean over each interval.  Smooth: its values in the rows, by the law of the slopes of lines between
+        them; it stood before the first row as in it.
         """
-        if not self.linear or type(effect).input is AbstractEffect.input:
+        if not self.smooth or type(effect).input is AbstractEffect.input:
             return effect.input(u, self.dt)
         return jnp.concatenate([u[:1], u[:1] + jnp.cumsum(effect.input(jnp.diff(u), self.dt))])
 
     def stream(self, effect: AbstractEffect) -> Stream | None:
-        """`through` row by row; the memory of a linear one ends in the value before, and in what became of it."""
+        """`through` row by row; the memory of a smooth one ends in the value before, and in what became of it."""
         stream = effect.stream(self.dt)
-        if not self.linear or stream is None:
+        if not self.smooth or stream is None:
             return stream
 
         def step(memory, u):
@@ -129,7 +129,7 @@ def _line(effects: Effects, servo: Servo | None, joint: int, rows: Sampling) -> 
 
         def through(stream, value, base):
             memory = before[len(after)]
-            if rows.linear:  # before the first row the input stood as in it
+            if rows.smooth:  # before the first row the input stood as in it
                 memory = jnp.where(first, memory.at[-2:].set(value - base), memory)
             own, late = stream.step(memory, value - base)
             after.append(own)

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
 from ..effects.base import AbstractEffect, OperatingPoint, Scalar
@@ -37,12 +37,14 @@ class Inputs(NamedTuple):
     """Since the first row [s]."""
     scale: Float[Array, "*time column"] | None = None
     """Columns that numbers of servos are proportional to; None where there are none."""
-    change: Float[Array, "*time input"] | None = None
-    """Change of `u` until the next row, linear in time; None where inputs are held."""
+    course: Float[Array, "*time 2 input"] | None = None
+    """Change of `u` until the next row, and its second difference around the step (`course`); None where it is held."""
 
     def at(self, part: Scalar | float) -> "Inputs":
         """The inputs at some part of the step, 0 in the row and 1 in the next."""
-        return self if self.change is None else self._replace(u=self.u + part * self.change)
+        if self.course is None:
+            return self
+        return self._replace(u=self.u + part * self.course[..., 0, :] - part * (1 - part) / 2 * self.course[..., 1, :])
 
     @classmethod
     def held(cls, u: Float[Array, " input"]) -> "Inputs":
@@ -75,8 +77,8 @@ class StateSpaceModel(AbstractModel):
     """Laws that the declared physics lacks."""
     servos: tuple[Servo, ...] | None = None
     """Law that makes torque of every input; None where the inputs are torques."""
-    linear: bool = eqx.field(static=True, default=False)
-    """True where inputs go straight from row to row (first-order hold); False where they are held."""
+    smooth: bool = eqx.field(static=True, default=False)
+    """True where inputs are signals that go on from row to row; False where they are held."""
     pace: float = eqx.field(static=True, default=1.0)
     """Time in which the horizons of predictions are counted [s]: 1 s for machines with joints."""
 
@@ -106,8 +108,8 @@ class StateSpaceModel(AbstractModel):
             u = hooks.fed(self.effects, self.servos, self.system, u[:, :drives], self.rows, scale)
         else:
             u = hooks.reaching(self.effects, self.system, u, self.rows)
-        change = jnp.diff(u, axis=0, append=u[-1:]) if self.linear else None
-        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale, change)
+        along = course(u, jnp.asarray(seq.valid)) if self.smooth else None
+        return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale, along)
 
     def scene(self, x: Float[Array, " state"], u: Inputs) -> OperatingPoint:
         """State of the machine at one moment, as effects get it."""
@@ -124,8 +126,8 @@ class StateSpaceModel(AbstractModel):
         servos, dof = self.servos, len(self.system.coordinates)
         arrive = partial(hooks.late, effects, servos) if servos else partial(hooks.reaching, effects)
         fed = arrive(self.system, u.u, self.rows)
-        if self.linear:
-            fed = 0.5 * (fed + jnp.concatenate([fed[1:], fed[-1:]]))
+        if u.course is not None:
+            fed = 0.5 * (fed + jnp.concatenate([fed[1:], fed[-1:]])) - u.course[:, 1] / 8
         if not servos:
             return jax.vmap(self.system.drive)(fed)
 
@@ -176,7 +178,7 @@ class StateSpaceModel(AbstractModel):
     @property
     def rows(self) -> hooks.Sampling:
         """Interval of the rows, and the course of the inputs between them."""
-        return hooks.Sampling(self.dt, self.linear)
+        return hooks.Sampling(self.dt, self.smooth)
 
     @property
     def steps(self) -> int:
@@ -207,8 +209,8 @@ class StateSpaceModel(AbstractModel):
 
         def past(delay: Float[Array, ""]) -> Float[Array, " readable"]:
             """The state `delay` [s] ago, under the inputs of the row before, but no earlier than the first row."""
-            change = None if u.change is None else u.u - u.before
-            before, reach = u._replace(u=u.before, change=change), jnp.minimum(delay, u.age)
+            along = None if u.course is None else jnp.stack([u.u - u.before, jnp.zeros_like(u.u)])
+            before, reach = u._replace(u=u.before, course=along), jnp.minimum(delay, u.age)
             still, back = jnp.zeros(len(self.system.ports), x.dtype), reach / self.dt
             at = lambda part: before.at(jnp.maximum(1 - part * back, 0.0))  # noqa: E731
             ago = integrate(lambda x, part: -reach * self.rate(x, at(part), still), x, 1.0, 3)
@@ -229,6 +231,19 @@ class StateSpaceModel(AbstractModel):
         """Mean of the reading at the state x, and at the input that is held from then on."""
         r = self.readable(x, u, force)
         return jnp.stack([r[i] for i in self.measured])
+
+
+def course(u: Float[Array, "time input"], valid: Bool[Array, " time"]) -> Float[Array, "time 2 input"]:
+    """Course of a smooth signal in every step: its change, and the mean of its second differences at both ends.
+
+    u(s) = u_k + s change - s (1 - s) / 2 bend, exact for a parabola.  Lines alone cut the corners of a sine: at 25 Hz a
+    force of 1 Hz would be 0.5 % smaller, ten standard deviations of a mass.
+    """
+    inside = valid[2:, None]
+    second = jnp.pad(jnp.where(inside, jnp.diff(u, n=2, axis=0), 0.0), ((1, 2), (0, 0)))
+    known = jnp.pad(inside.astype(u.dtype), ((1, 2), (0, 0)))
+    bend = (second[:-1] + second[1:]) / jnp.maximum(known[:-1] + known[1:], 1.0)
+    return jnp.stack([jnp.diff(u, axis=0, append=u[-1:]), bend], axis=1)
 
 
 def with_effects(model: StateSpaceModel, effects: tuple[AbstractEffect, ...]) -> StateSpaceModel:

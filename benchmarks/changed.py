@@ -1,9 +1,8 @@
-"""Study of `diagnose --from` on planted, unchanged and simulated recordings, and of `monitor` on a simulated month.
+"""Study of `diagnose --from` on planted, unchanged and simulated recordings.
 
     python benchmarks/changed.py planted --out out/changed dfki_c1-spring2-strong dfki_c0-recorded ...
     python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
     python benchmarks/changed.py real --out out/changed dfki_c1-coulomb dfki_c0-viscous cloudpendulum-mass
-    python benchmarks/changed.py monitor --out out/changed slide-none slide-coulomb
     python benchmarks/changed.py compare --out out/changed dfki_c1-spring2-strong dfki_c0-recorded
     python benchmarks/changed.py loaded --out out/changed kr300-15
     python benchmarks/changed.py table out/changed [--out docs/results/changed_planted.csv]
@@ -12,8 +11,7 @@ planted: a fit of every second recording of a rig as it is, then the others with
 planted in them; of `RIG-recorded` nothing is planted.  real: the same with a number of joint 2 that moved, its Coulomb
 friction by 20 % of the published, its viscous friction by as much torque at the typical speed, or its mass by 5 %.
 moved: 8 simulated recordings of 3 s, then 8 of the machine with a number that moved; `slide-coulomb-2` is seed 2.
-monitor: 16 recordings, then 200 of 1.5 s, of which the Coulomb friction grows by 1 % a recording from number 100 on, or
-which are of the same machine.  loaded: half of the recordings of an arm, then the others with so many kilograms more at
+loaded: half of the recordings of an arm, then the others with so many kilograms more at
 the centre of mass of its last body.  One JSON file a case; a case that has one is not run again.
 """
 
@@ -50,7 +48,6 @@ from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.storage.files import replace_text
 
 COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
-GROWN, LENGTH, FIRST = 0.01, 200, 100
 UNCERTAIN = {"slide": {"m": 0.1}, "pendulum": {"m": 0.05}, "acrobot": {"m2": 0.06}}
 """Numbers that are estimated, with the standard deviation that is declared [kg]."""
 FACTOR = {"coulomb": 1.2, "viscous": 1.2, "mass": 1.05}
@@ -181,11 +178,11 @@ def inverse(model: mujoco.MjModel, path: list[np.ndarray]) -> np.ndarray:
     return np.array(out)
 
 
-def machine(system: str, kind: str, size: float = 1.0):
-    """A machine whose last joint, or mass, moved by `size` times the step of `FACTOR`."""
+def machine(system: str, kind: str):
+    """A machine whose last joint, or mass, moved by the step of `FACTOR`."""
     truth, sweep = examples[system]()
     law, last = truth.unknown, jnp.zeros_like(truth.unknown.coulomb).at[-1].set(1.0)
-    factor = 1 + size * (FACTOR.get(kind, 1.0) - 1) * last
+    factor = 1 + (FACTOR.get(kind, 1.0) - 1) * last
     if kind == "coulomb":
         more = law.coulomb * (factor - 1)
         return eqx.tree_at(
@@ -201,24 +198,20 @@ def machine(system: str, kind: str, size: float = 1.0):
     return truth, sweep
 
 
-def write(folder: Path, system: str, kind: str, count: int, steps: int, seed: int, sizes=None) -> None:
+def write(folder: Path, system: str, kind: str, count: int, steps: int, seed: int) -> None:
     """Simulated recordings of a machine, with rig.toml."""
     truth, sweep = examples[system]()
     rig = declared(system, truth)
     free = {name: Declared(float(getattr(truth.system, name)), std) for name, std in UNCERTAIN[system].items()}
     (folder / "train").mkdir(parents=True, exist_ok=True)
     write_rig(dataclasses.replace(rig, parameters={**rig.parameters, **free}), folder / "rig.toml")
-    sizes = [1.0] * count if sizes is None else sizes
-    for size in dict.fromkeys(sizes):  # a program for every machine
-        places = [i for i, other in enumerate(sizes) if other == size]
-        model, _ = machine(system, kind, size)
-        key = jax.random.fold_in(jax.random.key(seed), places[0])
-        data = sweep_experiment(model, sweep, len(places), steps, key=key).data
-        for i, t, u, y in zip(places, data.t, data.u, np.array(data.y), strict=True):
-            if kind == "bias":
-                y[:, 0] += 3 * math.exp(0.5 * float(truth.log_r[0]))
-            columns = {"time": t, **dict(zip(rig.input_columns, u.T, strict=True))}
-            write_csv(folder / "train" / f"{i:03d}.csv", columns | dict(zip(rig.measured, y.T, strict=True)))
+    model, _ = machine(system, kind)
+    data = sweep_experiment(model, sweep, count, steps, key=jax.random.fold_in(jax.random.key(seed), 0)).data
+    for i, (t, u, y) in enumerate(zip(data.t, data.u, np.array(data.y), strict=True)):
+        if kind == "bias":
+            y[:, 0] += 3 * math.exp(0.5 * float(truth.log_r[0]))
+        columns = {"time": t, **dict(zip(rig.input_columns, u.T, strict=True))}
+        write_csv(folder / "train" / f"{i:03d}.csv", columns | dict(zip(rig.measured, y.T, strict=True)))
 
 
 def moved(name: str, out: Path) -> dict[str, Any]:
@@ -233,21 +226,6 @@ def moved(name: str, out: Path) -> dict[str, Any]:
     status, spent, said = command("diagnose", after, "--from", fit, "--out", found)
     report = json.loads((found / "report.json").read_text()) if status == 0 else None
     return {"case": name, "report": report, "seconds": spent, "said": said}
-
-
-def monitored(name: str, out: Path) -> dict[str, Any]:
-    """Two hundred recordings of a machine, unchanged or with friction that grows."""
-    system, kind = name.split("-")[:2]
-    before, fit = out / "sim" / f"{system}-month", out / "fits" / f"month-{system}"
-    if not (fit / "model.npz").exists():
-        write(before, system, "none", 16, 150, 10)
-        command("identify", before, "--out", fit, "--quiet")
-    after, found = out / "sim" / f"month-{name}", out / "found" / f"month-{name}"
-    grown = [max(0, i - FIRST + 1) * GROWN / (FACTOR["coulomb"] - 1) for i in range(LENGTH)]
-    write(after, system, kind, LENGTH, 150, 11, sizes=grown)
-    status, spent, said = command("monitor", fit, after / "train", "--out", found)
-    report = json.loads((found / "monitor.json").read_text()) if status in (0, 4) else None
-    return {"case": f"month-{name}", "report": report, "status": status, "seconds": spent, "said": said}
 
 
 def row(record: dict[str, Any]) -> list[str]:
@@ -271,8 +249,7 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {"planted": planted, "real": real, "moved": moved, "monitor": monitored, "compare": compared}
-    kinds |= {"loaded": loaded}
+    kinds = {"planted": planted, "real": real, "moved": moved, "compare": compared, "loaded": loaded}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

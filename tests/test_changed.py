@@ -1,8 +1,7 @@
-"""Searches that begin from a fit: its posterior is the prior, a change is found alone, alarms have their rate."""
+"""Searches that begin from a fit: its posterior is the prior, a change is found alone."""
 
 import dataclasses
 import itertools
-import json
 import math
 import re
 
@@ -11,22 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.stats
 
 from nnap_em import compare, diagnose, findings, identify, identify_from
 from nnap_em.commands import cli
 from nnap_em.comparison import cause
-from nnap_em.comparison.monitor import (
-    FALSE,
-    LARGEST_STEP,
-    SHIFT,
-    Judged,
-    Reference,
-    cusum,
-    standardised,
-    threshold,
-    trend,
-)
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
@@ -35,7 +22,6 @@ from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.effects.sensor import SensorBias
-from nnap_em.em.multistep import Grid
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
@@ -228,77 +214,6 @@ def test_the_level_of_a_recording_is_the_log_of_its_rms_and_larger_ones_are_seen
     assert risen(before, now).ratio == pytest.approx(math.exp(np.median(now) - np.median(before)))
 
 
-# --- charts
-
-
-@pytest.mark.parametrize("rate, charts", [(0.01, 1), (0.02, 4)])
-def test_false_alarms_are_as_frequent_as_stated(rate, charts):
-    """Siegmund's formula against simulated runs of standard normal values."""
-    rng, runs = np.random.default_rng(2), 3000
-    total, length, alive = np.zeros((runs, charts)), np.zeros(runs), np.ones(runs, bool)
-    for _ in range(1500):
-        total = np.maximum(0.0, total + rng.standard_normal(total.shape) - SHIFT)
-        length += alive
-        alive &= ~(total > threshold(rate, charts)).any(axis=1)
-    assert not alive.any()
-    assert length.mean() * rate == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_chart_is_the_largest_sum_of_the_last_values():
-    """max(0, max over j of sum_{i > j} (z_i - k)), which the recursion of Page is."""
-    z = np.random.default_rng(3).normal(0.3, 1, 40)
-    sums = [max(0.0, *(float(np.sum(z[j : i + 1] - SHIFT)) for j in range(i + 1))) for i in range(40)]
-    np.testing.assert_allclose(cusum(z), sums, atol=1e-12)
-    np.testing.assert_allclose(cusum(np.array([2.0, np.nan, 2.0])), [1.5, 1.5, 3.0])
-
-
-def test_values_beside_few_are_exactly_normal_whatever_their_scale():
-    rng = np.random.default_rng(4)
-    every = np.stack([standardised(v[:4], v[4:]) for v in rng.normal(size=(4000, 10))])
-    assert scipy.stats.kstest(every[:, 0][np.abs(every[:, 0]) < LARGEST_STEP], "norm").pvalue > 1e-3
-    assert np.mean(np.abs(every) > 1.96) == pytest.approx(0.05, abs=4 * math.sqrt(0.05 / every.size))
-    np.testing.assert_allclose(np.corrcoef(every.T), np.eye(6), atol=4 / math.sqrt(4000))
-    v = rng.normal(size=12)
-    np.testing.assert_allclose(standardised(7 + 3 * v[:4], 7 + 3 * v[4:]), standardised(v[:4], v[4:]), rtol=1e-9)
-
-
-def _reference(rng, names: int = 2, own: int = 20) -> Reference:
-    each = tuple(
-        Judged(x, e, np.eye(names)) for x, e in zip(rng.normal(size=own), rng.normal(size=(own, names)), strict=True)
-    )
-    return Reference(tuple("ab")[:names], ("N",) * names, np.ones((1, 1)), Grid(1, (1,)), 10, each)
-
-
-def test_a_number_that_drifts_is_charted_and_filtered():
-    """By 0.3 of its standard deviation a recording from number 30 on: seen within 15, and its beginning near there."""
-    rng = np.random.default_rng(5)
-    drift = 0.3 * np.maximum(0, np.arange(60) - 29)
-    judged = [
-        Judged(x, e + np.array([d, 0.0]), np.eye(2))
-        for x, e, d in zip(rng.normal(size=60), rng.normal(size=(60, 2)), drift, strict=True)
-    ]
-    seen = trend(_reference(rng), judged)
-    assert seen.alarm.chart == "a up" and 30 <= seen.alarm.at <= 45 and 25 <= seen.alarm.since <= 36
-    assert abs(seen.value[-1, 0] - drift[-1]) < 3  # of a memory of ten recordings
-    assert abs(seen.value[-1, 1]) < 3 * seen.std[-1, 1]
-    quiet = trend(_reference(rng), judged[:30])
-    assert quiet.alarm is None and quiet.threshold == threshold(FALSE, 5)
-
-
-def test_a_number_that_does_not_move_is_the_weighted_mean(monkeypatch):
-    """Without a memory that ends the filter is the sum of information."""
-    monkeypatch.setattr("nnap_em.comparison.monitor.MEMORY", 1.0)
-    rng = np.random.default_rng(6)
-    beside, judged = _reference(rng), [Judged(0.0, e, 4 * np.eye(2)) for e in rng.normal(size=(7, 2))]
-    own = np.stack([one.estimate for one in beside.own])
-    scatter = np.maximum(np.var(own, axis=0) - 1, 0)
-    seen = trend(beside, judged)
-    information = 20 / (1 + scatter) + 7 / (4 + scatter)
-    mean = np.sum([one.estimate for one in judged], axis=0) / (4 + scatter) / information
-    np.testing.assert_allclose(seen.value[-1], mean, rtol=1e-9)
-    np.testing.assert_allclose(seen.std[-1], information**-0.5, rtol=1e-9)
-
-
 # --- the command
 
 
@@ -307,34 +222,6 @@ def _write(folder, data, rig, names):
     write_rig(rig, folder / "rig.toml")
     for name, t, u, y in zip(names, data.t, data.u, data.y, strict=True):
         write_csv(folder / "train" / f"{name}.csv", {"time": t, "u": u[:, 0], "x": y[:, 0]})
-
-
-def test_recordings_are_judged_once_and_a_broken_sensor_is_no_change(tmp_path, capsys):
-    names = [f"{i:02d}" for i in range(8)]
-    _write(tmp_path / "own", _logs(0), _rig(), names)
-    _write(tmp_path / "later", _logs(1, sequences=3), _rig(), names[:3])
-    fit, out = tmp_path / "fit", tmp_path / "out"
-    assert cli.main(["identify", str(tmp_path / "own"), "--out", str(fit), "--epochs", "9", "--quiet"]) == 0
-    command = ["monitor", str(fit), str(tmp_path / "later/train"), "--out", str(out)]
-    stuck = (tmp_path / "later/train/02.csv").read_text().splitlines()
-    broken = [stuck[0], *(f"{line.rpartition(',')[0]},0.125" for line in stuck[1:])]
-    (tmp_path / "later/train/02.csv").write_text("\n".join(broken) + "\n")
-    assert cli.main(command) == 0
-    first = json.loads((out / "monitor.json").read_text())
-    reasons = [row["reason"] for row in first["recordings"]]
-    assert reasons[:2] == [None, None] and reasons[2] and not first["changed"]
-    assert first["verdict"] == "No change in 2 recordings; 1 not judged."
-    page = (out / "monitor.html").read_text()
-    assert first["verdict"] in page and "02.csv: " in page
-    _write(tmp_path / "later", _logs(7, sequences=1), _rig(), ["03"])
-    capsys.readouterr()
-    assert cli.main([*command, "--resume"]) == 0
-    said, second = capsys.readouterr().err, json.loads((out / "monitor.json").read_text())
-    assert "03.csv: errors" in said and "00.csv" not in said
-    assert second["recordings"][:3] == first["recordings"] and len(second["recordings"]) == 4
-    assert cli.main(command) == 0
-    anew = json.loads((out / "monitor.json").read_text())
-    assert anew["recordings"] == second["recordings"] and anew["charts"] == second["charts"]
 
 
 def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, fit):
@@ -351,5 +238,3 @@ def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, fit):
     assert cli.main(arguments) == 2
     assert "is not that of the fit: friction is True in the fit and False here" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    assert cli.main(["monitor", str(tmp_path / "model.npz"), str(tmp_path / "logs/train"), "--out", "x"]) == 2
-    assert "give their folder with --logs FOLDER" in capsys.readouterr().err

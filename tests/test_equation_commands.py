@@ -81,7 +81,6 @@ REFUSED = {
     "mjcf": ("export", "monday", "--mjcf", "out.xml"),
     "urdf": ("export", "monday", "--urdf", "out.urdf"),
     "design": ("design", "monday", "--out", "out"),
-    "monitor": ("monitor", "monday", "monday_logs/test", "--out", "out"),
     "diagnose from": ("diagnose", "friday_logs", "--from", "monday", "--out", "out"),
 }
 

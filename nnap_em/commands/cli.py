@@ -31,7 +31,6 @@ examples:
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
   nnap-em design found --out next                   the inputs to play next, so that what is open is answered
   nnap-em compare monday friday --out changed       what changed between fits of one machine, and what did not
-  nnap-em monitor fit logs --out trend              an alarm where a machine changes, recording by recording
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
   nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
@@ -130,14 +129,6 @@ def parser() -> argparse.ArgumentParser:
     _file(compare, "fits", "FIT", "model.npz, or the folder that holds it", nargs="+")
     _file(compare, "--out", "OUT", "folder for the page and the numbers")
 
-    monitor = command("monitor")
-    _file(monitor, "model", "FIT", "model.npz, or the folder that holds it")
-    _file(monitor, "folder", "FOLDER", "the recordings")
-    _file(monitor, "--out", "OUT", "folder for the page and the numbers", required=True)
-    monitor.add_argument("--rate", type=_rate, default=1e-3, metavar="P", help="false alarms a recording (0.001)")
-    monitor.add_argument("--resume", action="store_true", help="keep what OUT/monitor.json says of recordings")
-    _file(monitor, "--logs", "FOLDER", "of the fit, where they were moved", **several)
-
     predict = command("predict")
     smooth = command("smooth")
     for use in (predict, smooth):
@@ -149,7 +140,7 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 
     text = "use spikes and what a stuck, late or saturated sensor reads"
-    for reads in (check, identify, diagnose, design, monitor, predict, smooth):
+    for reads in (check, identify, diagnose, design, predict, smooth):
         reads.add_argument("--trust-readings", action="store_true", help=text)
 
     export = command("export")
@@ -169,7 +160,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command: 0 is done, 1 a check with an error, 2 refused with one line on stderr, 3 a fit that does not
-    describe the motion, 4 a machine that changed, 130 Ctrl-C.
+    describe the motion, 130 Ctrl-C.
     """
     arguments = parser()
     args = arguments.parse_args(argv)
@@ -271,9 +262,9 @@ def _file(command: argparse._ActionsContainer, name: str, metavar: str, text: st
 _N = TypeVar("_N", int, float)
 
 
-def _number(text: str, kind: type[_N], low: int | float, form: str, below: float = math.inf) -> _N:
+def _number(text: str, kind: type[_N], low: int | float, form: str) -> _N:
     try:
-        if low <= (value := kind(text)) < below:
+        if low <= (value := kind(text)) < math.inf:
             return value
     except ValueError:
         pass
@@ -285,9 +276,6 @@ _natural = functools.partial(_number, kind=int, low=0, form="a whole number of 0
 _positive = functools.partial(_number, kind=float, low=math.ulp(0.0), form="a number above 0")
 _time = functools.partial(_number, kind=float, low=0.0, form="seconds, 0 or more")
 _minutes = functools.partial(_number, kind=float, low=math.ulp(0.0), form="minutes, more than 0")
-_rate = functools.partial(
-    _number, kind=float, low=1e-12, below=0.2, form="false alarms a recording, above 0 and below 0.2"
-)
 
 
 def _part(text: str) -> float:

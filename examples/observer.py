@@ -4,7 +4,7 @@ The plant is that of `plant.py`, which shares no code with the library. Logs of 
 Then the elbow is to follow the swing of the shoulder, theta2 = atan(dtheta1), which adds energy in every swing [Spong
 1995, IEEE Control Systems 15(1)]; it starts half a radian off in the mean, and is pushed after five seconds. The same
 controller runs without the observer, theta2 from the model and the torque alone. Written into `out/observer/`: the rig,
-the fit, the observer as C99 and as an FMU, and observer.png.
+the fit, the observer as C99, and observer.png.
 
     python examples/observer.py                     # a minute or two
     python examples/observer.py --seconds 20 --seed 3
@@ -101,7 +101,6 @@ def main() -> int:
     fitted = nnap_em.identify(rig, nnap_em.read_logs(args.out / "rig" / "train", rig).data, key=jax.random.key(0))
     nnap_em.save(args.out / "fit" / "model.npz", fitted)
     nnap_em.export.write_observer(fitted, args.out / "arm.c")
-    nnap_em.export.write_fmu(fitted, args.out / "arm.fmu")
     online = nnap_em.observer(fitted)
     runs = {
         name: closed_loop(case, online, args.seconds, args.seed, reads)

@@ -77,7 +77,6 @@ def place(tmp_path_factory):
 
 REFUSED = {
     "observer": ("export", "monday", "--observer", "out.c"),
-    "fmu": ("export", "monday", "--fmu", "out.fmu"),
     "mjcf": ("export", "monday", "--mjcf", "out.xml"),
     "urdf": ("export", "monday", "--urdf", "out.urdf"),
     "design": ("design", "monday", "--out", "out"),

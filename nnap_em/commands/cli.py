@@ -151,8 +151,7 @@ def parser() -> argparse.ArgumentParser:
     _file(export, "--urdf", "FILE", "write such a machine as URDF")
     _file(export, "--c", "FILE", "friction and feed-forward torque, or equations, as C99")
     _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
-    _file(export, "--fmu", "FILE", "write that estimator as an FMU (FMI 3.0)")
-    export.add_argument("--float", action="store_true", help="numbers of 32 bits in these two")
+    export.add_argument("--float", action="store_true", help="numbers of 32 bits in that estimator")
     export.add_argument("--draws", type=_count, metavar="N", help="write N draws of the posterior to OUT instead")
     export.add_argument("--seed", type=_natural, default=0, help="of the draws (0)")
     return top
@@ -166,10 +165,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = arguments.parse_args(argv)
     if args.command == "identify" and args.particles and args.smoother != "particle":
         arguments.error("--particles goes with --smoother particle")
-    if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c, args.observer, args.fmu)):
-        arguments.error("say where to: --out OUT, --mjcf, --urdf, --c, --observer or --fmu FILE")
-    if args.command == "export" and args.float and not (args.observer or args.fmu):
-        arguments.error("--float goes with --observer or --fmu")
+    if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c, args.observer)):
+        arguments.error("say where to: --out OUT, --mjcf, --urdf, --c or --observer FILE")
+    if args.command == "export" and args.float and not args.observer:
+        arguments.error("--float goes with --observer")
     if args.command == "export" and args.draws and args.out is None:
         arguments.error("--draws goes with --out OUT, the folder for the files")
     try:

@@ -5,7 +5,7 @@ examples:
   nnap-em export found/after.npz --out exported
   nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
   nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
-  nnap-em export fit --observer arm.c --fmu arm.fmu  states of the running machine, as C99 and for Simulink
+  nnap-em export fit --observer arm.c               states of the running machine, as C99
   nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
 
 OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
@@ -19,7 +19,6 @@ import jax
 
 from ..export.c99 import write_c
 from ..export.draws import TABLE, write_draws
-from ..export.fmu import write_fmu
 from ..export.mjcf import write_mjcf
 from ..export.model import write_model
 from ..export.online import write_observer
@@ -33,7 +32,7 @@ from .common import require_joints
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
-    for option in ("mjcf", "urdf", "observer", "fmu"):
+    for option in ("mjcf", "urdf", "observer"):
         if getattr(args, option) is not None:
             require_joints(fitted.rig, f"--{option}")
     for path, write, problem in (
@@ -48,9 +47,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
     if args.observer is not None:
         write_observer(fitted, args.observer, single=args.float)
         log(f"wrote {args.observer} and {args.observer.with_suffix('.h').name}")
-    if args.fmu is not None:
-        binary = write_fmu(fitted, args.fmu, single=args.float)
-        log(f"wrote {args.fmu}" + ("" if binary else ", with sources alone: there is no compiler `cc` here"))
     if args.draws is not None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
         log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")

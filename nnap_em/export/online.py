@@ -107,19 +107,19 @@ class Numbers(NamedTuple):
 
     names: tuple[str, ...]
     values: tuple[float, ...]
-    units: tuple[str, ...]
 
 
 def numbers(fitted: Identified) -> Numbers:
     """Estimated numbers of the machine, standard deviations of the readings, and those of the kicks of a row."""
-    model, system = fitted.model, fitted.model.system
-    own = _estimated(fitted)
-    states, kicks = system.states, states_of(model)
+    model, own = fitted.model, _estimated(fitted)
     values = [*(float(own.read(model)[i]) for i in range(own.size))]
     values += [float(x) for x in np.exp(0.5 * np.concatenate([model.log_r, model.log_q]))]
-    names = (*own.names, *(f"noise.{name}" for name in fitted.rig.measured), *(f"kick.{name}" for name in kicks))
-    units = [fitted.rig.unit(name) for name in own.names] + [system.unit(name) for name in fitted.rig.measured]
-    return Numbers(names, tuple(values), (*units, *map(system.unit, states), *("" for _ in kicks[len(states) :])))
+    names = (
+        *own.names,
+        *(f"noise.{name}" for name in fitted.rig.measured),
+        *(f"kick.{name}" for name in states_of(model)),
+    )
+    return Numbers(names, tuple(values))
 
 
 def _estimated(fitted: Identified) -> ParameterPrior:

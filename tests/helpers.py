@@ -16,22 +16,12 @@ from nnap_em.diagnosis.residual import Residual
 from nnap_em.effects.base import SearchScales
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
-from nnap_em.fit.identify import Identified, phi_samples
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.state_space import StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs, systems
 from nnap_em.systems.slide import Slide
-
-
-def draws(fitted: Identified, samples: int, rows: int, key: jax.Array) -> tuple[np.ndarray, ...]:
-    """The random numbers of `predict` with this key for one sequence, as an exported predictor takes them."""
-    key_draw, key_roll = jax.random.split(key)  # as `predict` and `_roll` split it
-    key_start, key_noise = jax.random.split(jax.random.split(key_roll, 1)[0])
-    n = fitted.model.log_q.shape[0]
-    drawn = jax.random.normal(key_start, (samples, n)), jax.random.normal(key_noise, (rows, samples, n))
-    return tuple(map(np.asarray, (phi_samples(fitted, samples, key=key_draw), *drawn)))
 
 
 @contextlib.contextmanager

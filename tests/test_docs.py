@@ -26,7 +26,7 @@ from nnap_em.systems import register, specs, systems
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FOLDERS = sorted(path.parent for path in (ROOT / "nnap_em").glob("*/__init__.py"))
-GENERATED = {"predictor.py", "arm_identified_actuator.py"}
+GENERATED = {"arm_identified_actuator.py"}
 """Programs that the package writes."""
 _BLOCK = re.compile(r"(?:^<!-- not run:(?P<reason>.*?)-->\n)?^```(?P<kind>.*)\n(?P<text>(?:.*\n)*?)```$", re.MULTILINE)
 

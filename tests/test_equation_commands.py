@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import chain_rig, csv_text, draws
+from helpers import chain_rig, csv_text
 
 import nnap_em
 from nnap_em.commands.cli import main
@@ -20,9 +20,8 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.export.c99 import write_c
-from nnap_em.export.model import PREDICTOR_FILE, STABLEHLO_FILE, write_model
+from nnap_em.export.model import write_model
 from nnap_em.fit.identify import begin
-from nnap_em.fit.predict import predict
 from nnap_em.fit.store import fingerprint, save
 from nnap_em.model.state_space import Inputs
 from nnap_em.systems import specs
@@ -162,33 +161,12 @@ def test_a_simulation_of_a_fit_is_that_of_its_transition(place):
         x = model.transition(x, Inputs.held(u[0, k]))
 
 
-def test_the_numpy_predictor_agrees_with_predict(place, tmp_path):
-    """With a law of two states and a bent reading, and the same random numbers."""
-    fitted, logs = _fit(place / "monday_logs", LAWS[:2])
-    assert write_model(fitted, tmp_path) == ""
-    space: dict = {"__name__": "predictor"}
-    exec((tmp_path / PREDICTOR_FILE).read_text(), space)
-    key = jax.random.key(3)
-    wanted = predict(fitted, logs.data, GIVEN, key=key, samples=SAMPLES)
-    t, u, y = (np.asarray(a)[0] for a in (logs.data.t, logs.data.u, logs.data.y))
-    found = space["predict"](space["MODEL"], t, u, y, GIVEN, draws=draws(fitted, SAMPLES, ROWS, key))
-    assert found.mean.shape == (ROWS, 3)
-    np.testing.assert_allclose(found.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found.std, wanted.std[0], rtol=1e-6, atol=1e-6)
+def test_the_numbers_of_equations_are_exported_with_their_units(place, tmp_path):
+    fitted, _ = _fit(place / "monday_logs", LAWS[:2])
+    write_model(fitted, tmp_path)
     document = json.loads((tmp_path / "parameters.json").read_text())
     assert document["inputs"] == [{"name": "u", "joint": None, "unit": "V"}]
     assert [effect["channel"] for effect in document["effects"]] == ["a", "y"]
-
-
-def test_one_step_through_stablehlo_is_the_transition(place, tmp_path):
-    fitted, _ = _fit(place / "monday_logs")
-    write_model(fitted, tmp_path)
-    step = jax.export.deserialize(bytearray((tmp_path / STABLEHLO_FILE).read_bytes())).call
-    x, u = jnp.asarray([[0.5, 0.2], [1.0, 2.0]]), jnp.asarray([[0.3], [1.5]])
-    ahead, reading = step(x, u)
-    for i in range(2):
-        np.testing.assert_allclose(ahead[i], fitted.model.transition(x[i], Inputs.held(u[i])), rtol=1e-12)
-        np.testing.assert_allclose(reading[i], fitted.model.emission(x[i], Inputs.held(u[i])), rtol=1e-12)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from arm import JOINTS, declared, friction, machine, recorded
-from helpers import csv_text, draws, file_rig, optimised, rig_text, written_again
+from helpers import csv_text, file_rig, optimised, rig_text, written_again
 from machine_files import errors
 from machines import arm
 
@@ -28,7 +28,7 @@ from nnap_em.em.mstep import _noise_floor
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import quadratic
 from nnap_em.export.mjcf import write_mjcf
-from nnap_em.export.model import parameters, predictor
+from nnap_em.export.model import parameters
 from nnap_em.fit.identify import begin
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
@@ -307,18 +307,8 @@ def test_a_joint_that_only_its_sensors_tell_is_followed_and_predicted(swung):
     assert [errors[name][0] < bound for name, bound in zip(SEEN, (0.1, 0.3, 0.5, 0.01), strict=True)] == [True] * 4
 
 
-def test_the_exported_predictor_agrees_with_predict(swung):
-    fitted, data = swung
-    key = jax.random.key(3)
-    wanted = predict(fitted, data, 0.5, key=key, samples=20)
-    space: dict = {"__name__": "predictor"}
-    exec(predictor(fitted), space)
-    one = (np.asarray(part[0]) for part in data[:3])
-    prediction = space["predict"](space["MODEL"], *one, 0.5, draws=draws(fitted, 20, 90, key))
-    np.testing.assert_allclose(prediction.mean, wanted.mean[0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(prediction.std, wanted.std[0], rtol=1e-6, atol=1e-6)
-    assert space["MODEL"].sensors == SEEN
-    assert parameters(fitted)["sensors"][1] == {"name": "shake.y", "unit": "m/s^2"}
+def test_sensors_are_in_the_exported_numbers(swung):
+    assert parameters(swung[0])["sensors"][1] == {"name": "shake.y", "unit": "m/s^2"}
 
 
 def test_a_saved_model_reads_the_same(swung, tmp_path):

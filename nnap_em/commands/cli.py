@@ -33,7 +33,7 @@ examples:
   nnap-em compare monday friday --out changed       what changed between fits of one machine, and what did not
   nnap-em predict fit bench/test --given 1 --out prediction
   nnap-em smooth fit bench/test --out smoothed
-  nnap-em export fit --out exported                 the model as JSON, as a NumPy program and as StableHLO
+  nnap-em export fit --out exported                 all numbers of the model as JSON, with units
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """

@@ -8,8 +8,7 @@ examples:
   nnap-em export fit --observer arm.c               states of the running machine, as C99
   nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
 
-OUT gets parameters.json (all numbers with units), predictor.py (smooths and predicts with NumPy alone:
-python predictor.py LOG.csv --given 1.0 --out prediction.csv) and model.stablehlo (one sample step, for jax.export).
+OUT gets parameters.json: all numbers with their units.
 """
 
 import argparse
@@ -30,7 +29,7 @@ from .common import require_joints
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
-    """Write it as JSON, NumPy and StableHLO, for a simulator, a controller, as an observer, or as draws."""
+    """Write its numbers, and it for a simulator, a controller, as an observer, or as draws."""
     fitted = load(model_file(args.model))
     for option in ("mjcf", "urdf", "observer"):
         if getattr(args, option) is not None:
@@ -51,6 +50,5 @@ def run(args: argparse.Namespace, log: Log) -> None:
         write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
         log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")
     elif args.out is not None:
-        reason = write_model(fitted, args.out)
-        log(f"no predictor.py: {reason}" if reason else f"wrote predictor.py to {args.out}")
-        log(f"wrote parameters.json and model.stablehlo to {args.out}")
+        write_model(fitted, args.out)
+        log(f"wrote parameters.json to {args.out}")

@@ -1,6 +1,5 @@
-"""A fitted model for other programs: its numbers as JSON, a predictor in plain NumPy, one sample step as StableHLO."""
+"""A fitted model for other programs: its numbers as JSON, and functions of it in plain NumPy."""
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,61 +8,38 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .. import __version__
 from ..effects import AbstractEffect
 from ..fit.identify import Identified, friction_table, parameter_table
 from ..model.friction import FrictionNetwork
-from ..model.state_space import Inputs, StateSpaceModel
+from ..model.state_space import StateSpaceModel
 from ..report.tables import write_json
-from ..storage.files import replace_bytes, replace_text
 from ..systems import AbstractPlant
-from . import program as portable
-from .placement import of_command
 from .unroll import Source, UnrollError, unroll
-
-PREDICTOR_FILE, STABLEHLO_FILE = "predictor.py", "model.stablehlo"
 
 
 class ExportError(ValueError):
-    """A model that has no plain NumPy form; the message names the reason."""
+    """A model that has no form outside JAX; the message names the reason."""
 
 
-def write_model(fitted: Identified, out: Path | str) -> str:
-    """Write parameters.json, predictor.py and model.stablehlo to a folder, each whole or not at all.
+def write_model(fitted: Identified, out: Path | str) -> None:
+    """Write parameters.json, all numbers of the model with their units, to a folder.
 
     Args:
         fitted: the model.
         out: the folder.
-
-    Returns:
-        The reason why there is no predictor.py, as for a law of the command; empty where there is one.
 
     Raises:
         ExportError: its inputs are commands of servos; nothing is written.
 
     Example:
         >>> nnap_em.export.write_model(fit, f"{folder}/plain")
-        ''
     """
-    out = Path(out)
     if fitted.model.servos:
-        raise ExportError(
-            "its inputs are commands of servos, which have no exported form yet; use nnap-em predict, --urdf or --c"
-        )
-    try:
-        code, reason = predictor(fitted), ""
-    except ExportError as error:
-        code, reason = "", str(error)
-    step = stablehlo(fitted.model)
-    write_json(out / "parameters.json", parameters(fitted))
-    replace_bytes(out / STABLEHLO_FILE, step)
-    if code:
-        replace_text(out / PREDICTOR_FILE, code)
-    else:
-        (out / PREDICTOR_FILE).unlink(missing_ok=True)  # of another fit
-    return reason
+        raise ExportError("its inputs are commands of servos, of which parameters.json has none; use --urdf or --c")
+    write_json(Path(out) / "parameters.json", parameters(fitted))
 
 
 def parameters(fitted: Identified) -> dict[str, Any]:
@@ -101,92 +77,6 @@ def parameters(fitted: Identified) -> dict[str, Any]:
     }
 
 
-def stablehlo(model: StateSpaceModel) -> bytes:
-    """(state, input) to (state one sample later, reading) for any number of rows, for `jax.export.deserialize`.
-
-    With effects the input has the columns of `_row`.
-    """
-
-    def one(x: Float[Array, " state"], u: Float[Array, " input"]):
-        return model.transition(x, _row(model, u)), model.emission(x, _row(model, u))
-
-    step = jax.vmap(one)
-
-    (rows,) = jax.export.symbolic_shape("rows")
-    shapes = [jax.ShapeDtypeStruct((rows, n), model.log_q.dtype) for n in (len(states_of(model)), _width(model))]
-    return bytes(jax.export.export(jax.jit(step), platforms=("cpu", "cuda"))(*shapes).serialize())
-
-
-def predictor(fitted: Identified) -> str:
-    """Source of a program that smooths and predicts as `nnap_em.predict` does, with NumPy alone.
-
-    It smooths by cubature, whatever the smoother of the fit.
-
-    Raises ExportError where the model has an effect that NumPy cannot follow.
-    """
-    rig, model, prior = fitted.rig, fitted.model, fitted.m_step.prior
-    for effect in model.effects:
-        if of_command(effect):
-            raise ExportError(
-                f"{effect.name!r} acts on the command; use {STABLEHLO_FILE}, whose inputs are what reaches the joints"
-            )
-    x, u, z = jnp.zeros(len(states_of(model))), jnp.zeros(_width(model)), prior.read(model)
-    force = jnp.zeros(len(model.system.coordinates))
-
-    def rate(x, u, force, z):
-        return (prior.write(model, z).rate(x, _row(model, u), model.system.at_ports(force)),)
-
-    def reading(x, u, z):
-        read = prior.write(model, z).emission
-        return read(x, _row(model, u)), jax.jacfwd(read)(x, _row(model, u))
-
-    def shown(x, u, force, z):
-        show, push = prior.write(model, z).shown, model.system.at_ports(force)
-        return show(x, _row(model, u), push), jax.jacfwd(show)(x, _row(model, u), push)
-
-    functions = [
-        unrolled("rate", rate, x=x, u=u, force=force, z=z),
-        unrolled("reading", reading, x=x, u=u, z=z),
-        unrolled("shown", shown, x=x, u=u, force=force, z=z),
-    ]
-    weights, bank = fitted.m_step.weights(model), fitted.bank.padded(len(states_of(model)))
-    numbers = {
-        "states": states_of(model),
-        "measured": rig.measured,
-        "inputs": rig.input_columns,
-        "sensors": tuple(model.system.sensors),
-        "dt": model.dt,
-        "substeps": model.steps,
-        "dressed": bool(model.effects),
-        "log_q": model.log_q,
-        "log_r": model.log_r,
-        "mean": model.start.mean,
-        "cov": model.start.cov,
-        "offsets": bank.offsets,
-        "shrink": bank.shrink,
-        "nodes": weights.nodes,
-        "spread": _spread(fitted),
-        "parameters": z,
-        "nominal": model.system.simulated,
-    }
-    fields = "\n".join(f"    {name}={literal(value)}," for name, value in numbers.items())
-    body = Path(portable.__file__).read_text(encoding="utf-8").partition('"""\n')[2]
-    title = f'"""Predictor of {json.dumps(rig.name)[1:-1]} ({rig.system}), written by nnap_em {__version__}.'.replace(
-        "\\", "/"
-    )
-    usage = "\n\nIt needs NumPy only: python predictor.py LOG.csv --given 1.0 --out prediction.csv\n"
-    states = described({n: model.system.unit(n) for n in model.system.states})
-    inputs = described(inputs_of(fitted)) or "none"
-    sensors = described(model.system.sensors)
-    inputs += f".  Sensors: {sensors}" if sensors else ""
-    units = f'States: {states}.  Inputs: {inputs}.\n"""\n'
-    model_ = f"MODEL = Model(\n{fields}\n    rate=rate,\n    reading=reading,\n    shown=shown,\n)\n"
-    tail = 'if __name__ == "__main__":\n    main(MODEL)\n'
-    return "\n\n".join(
-        [title + usage + units + body.rstrip(), *(f"\n{f}".rstrip() for f in functions), "", model_, tail]
-    )
-
-
 def unrolled(
     name: str,
     function: Callable[..., tuple[Array, ...]],
@@ -202,7 +92,7 @@ def unrolled(
     try:
         source = unroll(name, function, **arguments)
     except UnrollError as error:
-        raise ExportError(f"{error}; use {STABLEHLO_FILE}") from None
+        raise ExportError(str(error)) from None
     rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
@@ -215,7 +105,7 @@ def unrolled(
         computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1) if mine else flat
         bound = math.sqrt(jnp.finfo(theirs.dtype).eps)
         if not np.allclose(computed, flat, rtol=bound, atol=bound, equal_nan=True):
-            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX; use {STABLEHLO_FILE}")
+            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX")
     return source
 
 
@@ -234,30 +124,6 @@ def states_of(model: StateSpaceModel) -> tuple[str, ...]:
     """States of the plant, and a name for each state of memory."""
     names = model.system.states
     return names + tuple(f"memory{i + 1}" for i in range(model.log_q.shape[0] - len(names)))
-
-
-def _width(model: StateSpaceModel) -> int:
-    """Columns of an exported row of inputs."""
-    drives = len(model.system.drives)
-    return 2 * drives + 2 if model.effects else drives
-
-
-def _row(model: StateSpaceModel, columns: Float[Array, " input"]) -> Inputs:
-    """An exported row: what reaches the joints; with effects the clock in the middle of the step [s], what reached
-    the joints one row before, and the time since the first row [s].
-    """
-    if not model.effects:
-        return Inputs.held(columns)
-    drives = len(model.system.drives)
-    return Inputs(columns[:drives], columns[drives + 1 : -1], columns[drives], columns[-1])
-
-
-def _spread(fitted: Identified) -> Float[np.ndarray, "phi rank"]:
-    """Factor of the covariance that `phi_samples` draws from, without directions that are rounding."""
-    half = np.linalg.inv(np.linalg.cholesky(np.asarray(fitted.state.hessian))).T
-    left, size, _ = np.linalg.svd(half, full_matrices=False)
-    large = size > 1e-6 * np.max(size, initial=1e-300)
-    return left[:, large] * size[large]
 
 
 def literal(value: Any) -> str:

@@ -20,7 +20,6 @@ from nnap_em.effects import catalogue
 from nnap_em.effects.function import Axis, InputAxis, UnknownFunction
 from nnap_em.effects.periodic import PeriodicForce
 from nnap_em.export.c99 import torques, write_c
-from nnap_em.export.draws import write_draws
 from nnap_em.export.mjcf import beside, write_mjcf
 from nnap_em.export.model import ExportError
 from nnap_em.export.placement import NO_PLACE, PLACES
@@ -241,14 +240,3 @@ def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file, servo):
         mujoco.mj_fullM(model, data, mass)
         armature = np.diag([joint.armature for joint in machine.joints])
         np.testing.assert_allclose(mass, fitted.model.system.mass(a(q)) - armature, atol=1e-9)
-
-
-def test_draws_have_the_spread_of_the_posterior(tmp_path):
-    fitted, _ = _fit(tmp_path, more="[model.uncertain]\npole.mass = { std = 0.02 }\n")
-    write_draws(fitted, tmp_path / "ranges", 64, key=jax.random.key(0))
-    mass = np.genfromtxt(tmp_path / "ranges" / "draws.csv", delimiter=",", names=True, deletechars="")["pole.mass"]
-    assert abs(mass.mean() - 0.5) < 4 * 0.02 / 8  # the curvature is that of the prior
-    assert abs(mass.std() / 0.02 - 1) < 4 / np.sqrt(128)
-    for i in (0, 63):
-        model = mujoco.MjModel.from_xml_path(str(tmp_path / "ranges" / f"draw_{i:02d}.xml"))
-        assert model.body("pole").mass[0] == pytest.approx(mass[i], rel=1e-6)

@@ -152,8 +152,6 @@ def parser() -> argparse.ArgumentParser:
     _file(export, "--c", "FILE", "friction and feed-forward torque, or equations, as C99")
     _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
     export.add_argument("--float", action="store_true", help="numbers of 32 bits in that estimator")
-    export.add_argument("--draws", type=_count, metavar="N", help="write N draws of the posterior to OUT instead")
-    export.add_argument("--seed", type=_natural, default=0, help="of the draws (0)")
     return top
 
 
@@ -169,8 +167,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.error("say where to: --out OUT, --mjcf, --urdf, --c or --observer FILE")
     if args.command == "export" and args.float and not args.observer:
         arguments.error("--float goes with --observer")
-    if args.command == "export" and args.draws and args.out is None:
-        arguments.error("--draws goes with --out OUT, the folder for the files")
     try:
         # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

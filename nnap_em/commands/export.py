@@ -6,7 +6,6 @@ examples:
   nnap-em export fit --mjcf arm_identified.xml      back to the machine's file: bodies, friction, laws
   nnap-em export fit --urdf arm.urdf --c arm.c      masses and friction for ROS, feed-forward torque as C99
   nnap-em export fit --observer arm.c               states of the running machine, as C99
-  nnap-em export fit --draws 64 --out ranges        draws of the posterior, for domain randomisation
 
 OUT gets parameters.json: all numbers with their units.
 """
@@ -14,22 +13,18 @@ OUT gets parameters.json: all numbers with their units.
 import argparse
 from functools import partial
 
-import jax
-
 from ..export.c99 import write_c
-from ..export.draws import TABLE, write_draws
 from ..export.mjcf import write_mjcf
 from ..export.model import write_model
 from ..export.online import write_observer
 from ..export.urdf import write_urdf
 from ..fit.store import load, model_file
-from ..numerics.digits import counted
 from ..storage.log import Log
 from .common import require_joints
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
-    """Write its numbers, and it for a simulator, a controller, as an observer, or as draws."""
+    """Write its numbers, and it for a simulator, a controller, or as an observer."""
     fitted = load(model_file(args.model))
     for option in ("mjcf", "urdf", "observer"):
         if getattr(args, option) is not None:
@@ -46,9 +41,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
     if args.observer is not None:
         write_observer(fitted, args.observer, single=args.float)
         log(f"wrote {args.observer} and {args.observer.with_suffix('.h').name}")
-    if args.draws is not None:
-        write_draws(fitted, args.out, args.draws, key=jax.random.key(args.seed))
-        log(f"wrote {counted(args.draws, 'draw')} of the posterior to {args.out}: {TABLE}")
-    elif args.out is not None:
+    if args.out is not None:
         write_model(fitted, args.out)
         log(f"wrote parameters.json to {args.out}")

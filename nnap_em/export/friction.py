@@ -60,11 +60,8 @@ def friction_form(
     return next(fits[kind] for kind in order if fits[kind].missed <= least + bar)
 
 
-def friction_forms(fitted: Identified, deviation: Float[np.ndarray, "dof node"] | None = None) -> list[FrictionForm]:
-    """Friction of every joint: learned, or that of the file where none is learned.
-
-    `deviation` of a learned curve is that at the nodes of the fit, which crowd about rest [N m].
-    """
+def friction_forms(fitted: Identified) -> list[FrictionForm]:
+    """Friction of every joint: learned, or that of the file where none is learned."""
     system = fitted.model.system
     if not fitted.rig.friction:
         joints = system.machine.joints if isinstance(system, Tree) else ()
@@ -74,10 +71,7 @@ def friction_forms(fitted: Identified, deviation: Float[np.ndarray, "dof node"] 
     curve_velocities = 160  # velocities at which a learned curve is read
     velocity = np.linspace(-1.0, 1.0, curve_velocities)[None] * np.max(np.abs(nodes), axis=1)[:, None]
     table = friction_table(fitted, jnp.asarray(velocity))
-    torque = np.asarray(table.torque)
-    if deviation is not None:
-        torque = torque + [np.interp(*joint) for joint in zip(velocity, nodes, deviation, strict=True)]
-    return [friction_form(*joint) for joint in zip(velocity, torque, np.asarray(table.std), strict=True)]
+    return [friction_form(*joint) for joint in zip(velocity, *map(np.asarray, (table.torque, table.std)), strict=True)]
 
 
 def _form(

@@ -64,16 +64,8 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
         ExportError: the machine did not come from a file; with `alone`, a law has no place in MuJoCo. Nothing is
             written.
     """
-    out = Path(out)
-    as_it_is(fitted, fitted.model)
-    return write_variant(fitted, fitted.model, friction_forms(fitted), out, alone=alone)
-
-
-def write_variant(
-    fitted: Identified, model: StateSpaceModel, forms: Sequence[FrictionForm], out: Path, *, alone: bool = False
-) -> list[str]:
-    """`write_mjcf` for a model and friction near those of a fit."""
-    system = as_it_is(fitted, model)
+    out, model = Path(out), fitted.model
+    system, forms = as_it_is(fitted, model), friction_forms(fitted)
     if model.servos:
         raise ExportError(
             "its inputs are commands of servos, which MJCF here has no form for; write --urdf or --c instead"

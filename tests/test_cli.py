@@ -178,7 +178,7 @@ def test_a_folder_with_something_in_it_is_left_alone(bench, capsys):
 
 
 def test_identify_writes_whole_results(bench, fit):
-    wanted = ["figures.html", "friction.csv", "friction.png", "model.npz", "report.html", "report.json"]
+    wanted = ["friction.csv", "friction.png", "model.npz", "report.html", "report.json"]
     assert _files(fit) == wanted
     assert (fit / "friction.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((fit / "report.json").read_text(), parse_constant=pytest.fail)

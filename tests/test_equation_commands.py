@@ -104,7 +104,7 @@ def test_identify_reports_its_unknown_terms(place, monkeypatch):
         ("f", "a", "V/s"), ("g", "b", "V/s"),
     ]  # fmt: skip
     assert report["contacts"] == []
-    page = (place / "unknown" / "report.html").read_text() + (place / "unknown" / "figures.html").read_text()
+    page = (place / "unknown" / "report.html").read_text()
     assert "Unknown term f" in page and "Unknown term g" in page
 
 

@@ -210,7 +210,7 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
 
 def remove_reports(out: Path) -> None:
     """Remove reports that are not of the models which are written now."""
-    for name in ("report.json", "report.html", "figures.html"):
+    for name in ("report.json", "report.html"):
         (out / name).unlink(missing_ok=True)
 
 

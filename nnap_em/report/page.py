@@ -91,8 +91,7 @@ def write_report(
 def write_page(
     out: Path, document: Mapping[str, Any], pictures: Sequence[Picture], named: Callable[[str], str] = str
 ) -> None:
-    """Write report.json, report.html, and figures.html with the same figures to zoom into."""
-    replace_text(out / "figures.html", named(rendered("figures.html.j2", title=document["rig"], pictures=pictures)))
+    """Write report.json and report.html."""
     write_report(out, "report", document, page(document, pictures), named)
 
 

@@ -3,7 +3,6 @@
     python benchmarks/changed.py planted --out out/changed dfki_c1-spring2-strong dfki_c0-recorded ...
     python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
     python benchmarks/changed.py real --out out/changed dfki_c1-coulomb dfki_c0-viscous cloudpendulum-mass
-    python benchmarks/changed.py compare --out out/changed dfki_c1-spring2-strong dfki_c0-recorded
     python benchmarks/changed.py loaded --out out/changed kr300-15
     python benchmarks/changed.py table out/changed [--out docs/results/changed_planted.csv]
 
@@ -101,19 +100,6 @@ def planted(name: str, out: Path) -> dict[str, Any]:
         report = json.loads((found / "report.json").read_text()) if status == 0 else None
     record = {"case": name, "truth": truth, "seconds": spent, "processor_seconds": spent, "said": said}
     return record | ({"report": report} if report else {"failed": said})
-
-
-def compared(name: str, out: Path) -> dict[str, Any]:
-    """`compare` of the fit of one half as it is, and of a fit of the other half with the effect of a case."""
-    with tempfile.TemporaryDirectory() as folder:
-        case, half, second, found = (Path(folder, part) for part in ("case", "half", "second", "found"))
-        make(name, case)
-        first = fit_of(case_of(name).rig, out)
-        halves(case, case / "rig.toml", half, True)
-        command("identify", half, "--out", second, "--quiet")
-        status, spent, said = command("compare", first, second, "--out", found)
-        report = json.loads((found / "compare.json").read_text()) if status == 0 else {}
-    return {"case": f"compare {name}", "report": report, "seconds": spent, "said": said}
 
 
 def real(name: str, out: Path) -> dict[str, Any]:
@@ -249,7 +235,7 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {"planted": planted, "real": real, "moved": moved, "compare": compared, "loaded": loaded}
+    kinds = {"planted": planted, "real": real, "moved": moved, "loaded": loaded}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

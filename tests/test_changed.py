@@ -1,19 +1,15 @@
 """Searches that begin from a fit: its posterior is the prior, a change is found alone."""
 
 import dataclasses
-import itertools
 import math
-import re
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em import compare, diagnose, findings, identify, identify_from
+from nnap_em import diagnose, findings, identify, identify_from
 from nnap_em.commands import cli
-from nnap_em.comparison import cause
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
@@ -21,7 +17,6 @@ from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
-from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
@@ -126,42 +121,6 @@ def test_a_law_that_was_missing_before_is_no_change():
     closed = diagnose(_rig(), second, key=jax.random.key(0), start=before, own=first, log=said.append)
     assert not findings(closed), said
     assert any("spring" in line and "missing there, and no change" in line for line in said), said
-
-
-def test_two_fits_are_put_on_the_recordings_of_each_other(fit, closed, monkeypatch):
-    """The errors of each rise on those of the other, and the search goes from the first to the second."""
-    second = identify(_rig(), _logs(1, GROWN), key=jax.random.key(0))
-    searched = []
-    monkeypatch.setattr(cause, "diagnose", lambda rig, data, **options: searched.append((data, options)) or closed)
-    recorded = [cause.Recorded(_rig(), logs) for logs in (_logs(0), _logs(1, GROWN))]
-    outcome = cause.explained(compare(fit, second, names=("may", "june")), *recorded)
-    ((data, options),) = searched
-    assert data is recorded[1].data and options["own"] is recorded[0].data and options["start"] is fit
-    assert not outcome.cause.bent
-    biased = findings(closed)[0]._replace(effect=SensorBias(jnp.asarray(0.1), channel="pos"))
-    with monkeypatch.context() as patch:
-        patch.setattr(cause, "findings", lambda _: [biased])
-        assert "seen through friction" in cause.explained(compare(fit, second), *recorded).cause.bent
-    assert outcome.verdict.startswith("Changed since may: the Coulomb friction of joint 1 by")
-    ratios = [float(re.search(r"are ([0-9.]+) times", text)[1]) for text in outcome.cause.judged]
-    assert min(ratios) > 1.5 and outcome.cause.judged[0].startswith("On the recordings of june the errors of may")
-    spring, mass = ("torsional_spring", 1, None, ()), ("payload", 1, None, ())
-    differ = compare(fit, second).curves[0].test
-    for p_value, rivals in itertools.product((RISEN, RISEN / 2), ((), (spring, mass))):
-        last = closed.steps[-1]._replace(rivals=rivals, suspects=())
-        none = closed._replace(after=closed.before, evidence=(), risen=closed.risen._replace(p_value=p_value))
-        none = none._replace(steps=(last,))
-        monkeypatch.setattr(cause, "diagnose", lambda *_, none=none, **__: none)
-        seen = cause.explained(compare(fit, second), *recorded)
-        tied = "Torsional spring at joint 1 and payload at joint 1 explain the same; none is added." in seen.verdict
-        assert tied == bool(rivals)
-        if p_value < RISEN:
-            assert seen.changed and not seen.widened and "Something changed" in seen.verdict
-            assert seen.curves[0].test == differ and "which is this change seen through friction" in seen.cause.bent
-        else:
-            assert not seen.changed and "now widened by that: the recordings do not confirm it" in seen.verdict
-            ratio = math.sqrt(differ.statistic / differ.freedom)
-            assert seen.widened["friction of joint 1"] == pytest.approx(ratio)
 
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():

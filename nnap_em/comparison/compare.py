@@ -1,38 +1,31 @@
-"""Two or more fits of one machine side by side: the numbers that changed, those that did not, and one pooled answer."""
+"""Two or more fits of one machine side by side: every number with its difference, its test and one pooled value."""
 
 import itertools
-import json
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..data.machine import unpacked
 from ..diagnosis.findings import Estimate, estimates
 from ..diagnosis.hypothesis import covariances
-from ..diagnosis.keys import Key, key_of, listed, words
+from ..diagnosis.keys import key_of, listed, words
 from ..diagnosis.statistics import holm
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import model_file, read
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, LAW_UNITS, fit_law
 from ..numerics.digits import counted
-from .pooling import JointTest, Pooled, joint_test, pool
+from .pooling import JointTest, Pooled, apart, joint_test, pool
 
 CHANGED = 0.01
 """Corrected p-value below which a quantity counts as changed [probability of naming any change where there is none].
 
 A hundred comparisons of machines that did not change give one false alarm, whatever the number of quantities; a change
 by five of its standard deviations still counts among ten thousand quantities."""
-LEAST_SHARED = 0.5
-"""Smallest share of the range that two fits visited together which both visited [1]; below it the page warns.
-
-Friction depends on velocity and on load: where most of a range was visited by one fit only, the curves can differ
-there by what the other had to guess."""
 
 
 class CompareError(ValueError):
@@ -44,22 +37,21 @@ class Fit(NamedTuple):
 
     name: str
     fitted: Identified
-    velocity: Float[np.ndarray, "dof 2"]
-    """Lowest and highest velocity that it visited [rad/s]."""
-    load: Float[np.ndarray, "dof 2"]
-    """Lowest and highest torque of the drive [N m]; NaN where it is not known or nothing drives the joint."""
     fingerprint: str = ""
     """Fingerprint of its logs; empty where it is not known."""
 
 
-class Number(NamedTuple):
-    """An estimated number in every fit."""
+class Quantity(NamedTuple):
+    """An estimated number in every fit, or the numbers of a friction curve, which are tested as one."""
 
     name: str
-    unit: str
-    value: Float[np.ndarray, " fit"]
+    rows: tuple[tuple[str, str], ...]
+    """Name and unit of each number."""
+    value: Float[np.ndarray, "fit number"]
     """NaN in a fit that does not estimate it."""
-    std: Float[np.ndarray, " fit"]
+    std: Float[np.ndarray, "fit number"]
+    difference: Float[np.ndarray, " number"]
+    """Difference between the fits [standard deviations]."""
     pooled: Pooled
     test: JointTest | None
     """None where fewer than two fits estimate it."""
@@ -70,82 +62,12 @@ class Number(NamedTuple):
         return self.test is not None and self.test.p_value < CHANGED
 
 
-class Curve(NamedTuple):
-    """The friction of a joint in every fit that learned it."""
-
-    joint: int
-    """Counted from 1."""
-    fits: tuple[int, ...]
-    """Places of these fits."""
-    velocity: Float[np.ndarray, " node"]
-    """Velocities that all of them visited [rad/s]."""
-    torque: Float[np.ndarray, "fit node"]
-    """[N m]"""
-    cov: Float[np.ndarray, "fit node node"]
-    """[N^2 m^2]"""
-    units: tuple[str, str]
-    """Units of velocity and torque."""
-    pooled: Pooled
-    test: JointTest
-    law: tuple[Number, ...]
-    """The Stribeck numbers; their tests locate the change of a curve, and are no quantities of their own."""
-
-    @property
-    def std(self) -> Float[np.ndarray, "fit node"]:
-        """Standard deviation of the torque [N m]."""
-        return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
-
-    @property
-    def name(self) -> str:
-        """Name for a reader."""
-        return f"friction of joint {self.joint}"
-
-    @property
-    def changed(self) -> bool:
-        """True where it differs by more than the stated errors explain."""
-        return self.test.p_value < CHANGED
-
-    @property
-    def impossible(self) -> str:
-        """Change of a Stribeck number that friction cannot have, in words; empty where there is none."""
-        numbers = dict(zip(CALLED, self.law, strict=False))
-        if self.changed and numbers["constant"].changed:
-            return f"joint {self.joint} by a constant"
-        far = numbers["viscous"].value / np.where(numbers["viscous"].std > 0, numbers["viscous"].std, np.inf)
-        # standard deviations from 0 in one fit, and in the other, from which on it cannot have gone so
-        gone = self.changed and np.nanmax(far) > 5.0 and np.nanmin(far) < 2.0
-        return f"joint {self.joint} to a viscous friction of 0" if gone and numbers["viscous"].changed else ""
-
-    @property
-    def parts(self) -> tuple[Number, ...]:
-        """The Stribeck numbers that changed, of a curve that did."""
-        return tuple(number for number in self.law if self.changed and number.changed)
-
-
-class Cause(NamedTuple):
-    """A change from one fit to the other, by their recordings (`cause.explained`)."""
-
-    text: str
-    bent: str
-    """Reason for which friction curves differ with it; empty where it is friction that changed."""
-    judged: tuple[str, ...]
-    """Sentences on the errors of each fit on the recordings of the other."""
-
-
 class Comparison(NamedTuple):
     """Fits of one machine side by side."""
 
     fits: tuple[Fit, ...]
-    curves: tuple[Curve, ...]
-    numbers: tuple[Number, ...]
-    """Parameters of the machine and of effects."""
-    differences: tuple[str, ...]
-    """Effects and parameters that some fits have and others lack."""
+    quantities: tuple[Quantity, ...]
     warnings: tuple[str, ...]
-    cause: Cause | None = None
-    """None where the recordings are not at hand, or no quantity differs."""
-    widened: Mapping[str, float] = {}
-    """Multiple of the stated errors to which those of a quantity are widened, as recordings show no change."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -155,55 +77,15 @@ class Comparison(NamedTuple):
     @property
     def changed(self) -> tuple[str, ...]:
         """Quantities that changed."""
-        return tuple(quantity.name for quantity in (*self.curves, *self.numbers) if quantity.changed)
+        return tuple(quantity.name for quantity in self.quantities if quantity.changed)
 
     @property
     def verdict(self) -> str:
-        """The outcome: the quantities that changed, then the effects and parameters that some fits lack."""
-        cause = [] if self.cause is None else [self.cause.text]
-        return " ".join([*cause, self._tested, *(f"{text[0].upper()}{text[1:]}." for text in self.differences)])
-
-    @property
-    def other(self) -> str:
-        """Reason for which something other than friction changed; empty where there is none, or recordings decide."""
-        bent = [curve for curve in self.curves if curve.changed]
-        if self.cause is not None:
-            return self.cause.bent if bent else ""
-        # joints wear one by one; a load, a sensor or the supply bends every curve
-        reasons = ["several at once"] if len(bent) >= 2 else []
-        reasons += [curve.impossible for curve in bent if curve.impossible]
-        other = "something other than friction changed, such as a load or a sensor"
-        return f"{listed(reasons)}: {other}" if reasons else ""
-
-    @property
-    def _tested(self) -> str:
         """The outcome of the tests in one sentence."""
-        tests = sum(number.test is not None for number in self.numbers) + len(self.curves)
-        between = f"between {listed(self.names)}"
-        if self.widened:
-            verb = "differs" if len(self.widened) == 1 else "differ"
-            times = listed([f"{ratio:.1f}" for ratio in self.widened.values()])
-            text = f"{listed([*self.widened])} {verb} {between} by {times} times the stated errors, now widened by that"
-            return f"{text[0].upper()}{text[1:]}: the recordings do not confirm it."
-        if not self.changed:
-            nothing = "No tested quantity" if self.differences else "Nothing"
-            tested = counted(tests, "quantity", "quantities")
-            return f"{nothing} changed {between} beyond the stated errors: {tested} tested at {CHANGED:.0%}."
-        changed = []
-        bent = [f"joint {curve.joint}" for curve in self.curves if curve.changed]
-        moved = [number.name for number in self.numbers if number.changed]
-        if self.other:
-            also = f" Different as well: {listed(moved)}." if moved else ""
-            return f"The friction curves of {listed(bent)} differ {between}, {self.other}.{also}"
-        for curve in self.curves:
-            parts = f" ({listed([part.name for part in curve.parts])})" if curve.parts else ""
-            changed += [f"the {curve.name}{parts}"] * curve.changed
-        unchanged = tests - len(changed) - len(moved)
-        others = counted(unchanged, "other quantity", "other quantities")
-        others = f"{others} did not" if unchanged else "no other quantity was tested"
-        verb = "differed" if self.cause and self.cause.bent else "changed"
-        text = f"{listed([*changed, *moved])} {verb} {between}; {others}."
-        return text[0].upper() + text[1:]
+        tested = counted(sum(q.test is not None for q in self.quantities), "tested quantity", "tested quantities")
+        several = f"{len(self.changed) or 'None'} of {tested} changed between {listed(self.names)}"
+        which = f": {listed(self.changed)}; `diagnose --from` names the reason" if self.changed else ""
+        return f"{several} beyond the stated errors (at {CHANGED:.0%}){which}."
 
     def __str__(self) -> str:
         return "\n  ".join(["Comparison", self.verdict, *self.warnings])
@@ -221,7 +103,7 @@ def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Compar
         names: a name for each, for the reader; without them those of the files.
 
     Returns:
-        Curves, parameters and effects with their changes and p-values; `print` shows a table.
+        Parameters and friction curves with their values, differences and p-values; `print` shows the outcome.
 
     Raises:
         CompareError: the fits are fewer than two, the same, or of different machines.
@@ -238,34 +120,22 @@ def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Compar
     if len(set(labels)) != len(opened):
         raise CompareError(f"names {', '.join(labels)} for {len(opened)} fits; give each fit a name of its own")
     together = tuple(fit._replace(name=label) for fit, label in zip(opened, labels, strict=True))
-    for one, two in itertools.combinations(together, 2):
+    pairs = list(itertools.combinations(together, 2))
+    for one, two in pairs:
         _check(one, two)
-    return _beside(together, {})
+    quantities = corrected([*_curves(together), *_numbers(together)])
+    warnings = tuple(
+        f"{one.name} and {two.name} are of the same logs: their errors are not independent"
+        for one, two in pairs
+        if one.fingerprint and one.fingerprint == two.fingerprint
+    )
+    return Comparison(together, quantities, warnings)
 
 
-def _beside(fits: tuple[Fit, ...], widened: Mapping[str, float]) -> Comparison:
-    """All quantities with their tests, and their p-values corrected for the number of quantities."""
-    curves, numbers = tuple(_curves(fits, widened)), tuple(_numbers(fits, widened))
-    tests = [quantity.test for quantity in (*curves, *numbers)]
-    corrected = iter(corrected_tests([test for test in tests if test is not None]))
-    curves = tuple(curve._replace(test=next(corrected)) for curve in curves)
-    numbers = tuple(n if n.test is None else n._replace(test=next(corrected)) for n in numbers)
-    return Comparison(fits, curves, numbers, tuple(_differences(fits)), tuple(_warnings(fits)), widened=widened)
-
-
-def unconfirmed(comparison: Comparison) -> Comparison:
-    """The same where recordings show no change: fits that differ by more than they state show what their errors are.
-
-    Of each quantity that differs they are widened by (Q / degrees of freedom)^1/2 [Birge 1932, Phys. Rev. 40, 207].
-    """
-    tests = {each.name: each.test for each in (*comparison.curves, *comparison.numbers) if each.changed and each.test}
-    return _beside(comparison.fits, {name: math.sqrt(test.statistic / test.freedom) for name, test in tests.items()})
-
-
-def corrected_tests(tests: Sequence[JointTest]) -> list[JointTest]:
-    """The tests with corrected p-values."""
-    p = holm([test.p_alone for test in tests])
-    return [test._replace(p_value=float(value)) for test, value in zip(tests, p, strict=True)]
+def corrected(quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    """The quantities with p-values that are corrected for their number."""
+    p = iter(holm([q.test.p_alone for q in quantities if q.test is not None]))
+    return tuple(q if q.test is None else q._replace(test=q.test._replace(p_value=float(next(p)))) for q in quantities)
 
 
 # --- the fits
@@ -274,10 +144,9 @@ def corrected_tests(tests: Sequence[JointTest]) -> list[JointTest]:
 def _opened(fit: Path | str | Identified) -> Fit:
     """A fit with all that is known of its logs."""
     if isinstance(fit, Identified):
-        return Fit("", fit, *_visited(fit, None))
-    file = model_file(Path(fit))
-    stored = read(file)
-    return Fit("", stored.fitted, *_visited(stored.fitted, file), stored.fingerprint)
+        return Fit("", fit)
+    stored = read(model_file(Path(fit)))
+    return Fit("", stored.fitted, stored.fingerprint)
 
 
 def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> tuple[str, ...]:
@@ -290,22 +159,6 @@ def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -
     full = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, sources, strict=True)]
     numbered = [f"fit {i}" for i in range(1, len(short) + 1)]
     return tuple(next(labels for labels in (short, full, numbered) if len(set(labels)) == len(labels)))
-
-
-def _visited(fitted: Identified, file: Path | None) -> tuple[Float[np.ndarray, "dof 2"], Float[np.ndarray, "dof 2"]]:
-    """Ranges of velocity and load: of the report beside the model, else of the network."""
-    dof = len(fitted.model.system.coordinates)
-    unknown = np.full((dof, 2), np.nan)
-    if file is not None and (report := file.with_name("report.json")).exists():
-        rows = json.loads(report.read_text()).get("visited") or []
-        if len(rows) == dof:
-            load = [row["load"] or [np.nan, np.nan] for row in rows]
-            return np.asarray([row["velocity"] for row in rows], float), np.asarray(load, float)
-    network = fitted.model.unknown
-    if not isinstance(network, FrictionNetwork):
-        return unknown, unknown
-    speed = np.asarray(network.speed)
-    return np.stack([-speed, speed], axis=1), unknown
 
 
 def _check(one: Fit, two: Fit) -> None:
@@ -347,43 +200,27 @@ def _identity(fitted: Identified) -> tuple:
 # --- the quantities
 
 
-def _curves(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Curve]:
-    """The friction of every joint of which all fits visited a common range of velocities."""
-    places = tuple(i for i, fit in enumerate(fits) if fit.fitted.rig.friction)
-    if len(places) < 2:
+def _curves(fits: Sequence[Fit]) -> Iterator[Quantity]:
+    """The friction of every joint: a test of the curves on the velocities that all fits know, and Stribeck numbers."""
+    networks = {i: fit.fitted.model.unknown for i, fit in enumerate(fits)}
+    places = [i for i, network in networks.items() if isinstance(network, FrictionNetwork)]
+    if not places:
         return
-    ranges = np.stack([fits[i].velocity for i in places])
-    low, high = ranges[:, :, 0].max(axis=0), ranges[:, :, 1].min(axis=0)
-    common = low < high
+    reach = np.min([np.asarray(networks[i].speed) for i in places], axis=0)  # type: ignore[attr-defined]
     compared_velocities = 41  # velocities of a friction curve: as many as the M-step has
-    nodes = nodes_between(np.where(common, low, -1.0), np.where(common, high, 1.0), compared_velocities)
+    nodes = nodes_between(-reach, reach, compared_velocities)
     tables = [friction_table(fits[i].fitted, jnp.asarray(nodes)) for i in places]
-    for j in np.flatnonzero(common):
-        torque, cov = (
-            np.stack([np.asarray(getattr(table, part)[j]) for table in tables]) for part in ("torque", "cov")
-        )
-        cov = widened.get(f"friction of joint {j + 1}", 1.0) ** 2 * cov
-        std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-        angle = fits[0].fitted.model.system.angles[j]
-        pooled, test = pool(torque, std), joint_test(torque, cov)
-        law = _law(np.stack([nodes[j]] * len(places)), torque, cov, angle, places, len(fits))
-        yield Curve(int(j) + 1, places, nodes[j], torque, cov, tables[0].units[j], pooled, test, law)
+    for j, angle in enumerate(fits[0].fitted.model.system.angles[: len(nodes)]):
+        torque, cov = np.stack([table.torque[j] for table in tables]), np.stack([table.cov[j] for table in tables])
+        law = fit_law(np.stack([nodes[j]] * len(places)), torque, cov)
+        value, std = np.full((2, len(fits), len(CALLED)), np.nan)
+        value[places], std[places] = law.value, law.std
+        test = joint_test(torque, cov) if len(places) > 1 else None
+        rows = tuple(zip(CALLED, LAW_UNITS[angle], strict=True))
+        yield quantity(f"friction of joint {j + 1}", rows, value, std, test)
 
 
-def _law(velocity, torque, cov, angle: bool, places: Sequence[int], count: int) -> tuple[Number, ...]:
-    """Stribeck numbers of one joint, their p-values corrected among each other."""
-    law_fit = fit_law(velocity, torque, cov)
-    value, std = np.full((2, count, len(CALLED)), np.nan)
-    value[list(places)], std[list(places)] = law_fit.value, law_fit.std
-    rows = [
-        number(name, unit, value[:, i], std[:, i])
-        for i, (name, unit) in enumerate(zip(CALLED, LAW_UNITS[angle], strict=True))
-    ]
-    tests = corrected_tests([row.test for row in rows if row.test is not None])
-    return tuple(row._replace(test=test) for row, test in zip(rows, tests, strict=True))
-
-
-def _numbers(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Number]:
+def _numbers(fits: Sequence[Fit]) -> Iterator[Quantity]:
     """The estimated parameters of the machine and of effects."""
     tables = [_estimates(fit.fitted) for fit in fits]
     periodic = "phase of"  # beginning of parameters of effects that are the same after a whole turn [rad]
@@ -395,8 +232,7 @@ def _numbers(fits: Sequence[Fit], widened: Mapping[str, float]) -> Iterator[Numb
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
         priors = (fit.fitted.rig.parameters[name].std for fit in fits if name in fit.fitted.rig.parameters)
         prior = min((prior for prior in priors if prior > 0), default=np.inf)
-        unit, by = next(entry.unit for entry in entries if entry is not None), widened.get(name, 1.0)
-        yield number(name, unit, value, by * std, by * prior)
+        yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
 
 
 def _estimates(fitted: Identified) -> dict[str, Estimate]:
@@ -412,61 +248,26 @@ def _estimates(fitted: Identified) -> dict[str, Estimate]:
 
 def number(
     name: str, unit: str, value: Float[np.ndarray, " fit"], std: Float[np.ndarray, " fit"], prior_std: float = np.inf
-) -> Number:
+) -> Quantity:
     """A number, tested and pooled over the fits that estimate it."""
     has = np.isfinite(value) & np.isfinite(std) & (std > 0)
     test = joint_test(value[has, None], std[has, None, None] ** 2) if has.sum() > 1 else None
-    stds = std[has, None]
-    return Number(name, unit, value, std, pool(value[has, None], stds, max(prior_std, stds.max(initial=0.0))), test)
+    return quantity(name, ((name, unit),), value[:, None], std[:, None], test, prior_std)
 
 
-# --- the rest that a reader should know
+def quantity(
+    name: str,
+    rows: tuple[tuple[str, str], ...],
+    value: Float[np.ndarray, "fit number"],
+    std: Float[np.ndarray, "fit number"],
+    test: JointTest | None,
+    prior_std: float = np.inf,
+) -> Quantity:
+    """Numbers with their differences, pooled over the fits that estimate them, the errors widened as the test has it.
 
-
-def _differences(fits: Sequence[Fit]) -> Iterator[str]:
-    """Effects, learned friction and estimated parameters that some fits have and others lack."""
-
-    def lines(name: str, has: Bool[np.ndarray, " fit"], lacking: str) -> Iterator[str]:
-        if has.any() and not has.all():
-            inside, outside = (
-                [fit.name for fit, h in zip(fits, has, strict=True) if h == side] for side in (True, False)
-            )
-            yield f"{name} in {listed(inside)}, {lacking} in {listed(outside)}"
-
-    keys: list[list[Key]] = [[key_of(effect) for effect in fit.fitted.model.effects] for fit in fits]
-    for key in dict.fromkeys(itertools.chain(*keys)):
-        yield from lines(f"{words(key)} is", np.asarray([key in held for held in keys]), "not")
-    yield from lines("friction is learned", np.asarray([fit.fitted.rig.friction for fit in fits]), "not")
-    tables = [parameter_table(fit.fitted) for fit in fits]
-    for name in dict.fromkeys(itertools.chain(*tables)):
-        yield from lines(f"{name} is estimated", np.asarray([name in table for table in tables]), "kept as declared")
-
-
-def _warnings(fits: Sequence[Fit]) -> Iterator[str]:
-    """Reasons for which a change would mean nothing."""
-    for one, two in itertools.combinations(fits, 2):
-        if one.fingerprint and one.fingerprint == two.fingerprint:
-            yield f"{one.name} and {two.name} are of the same logs: their errors are not independent"
-    if sum(fit.fitted.rig.friction for fit in fits) < 2:
-        return
-    system = fits[0].fitted.model.system
-    units = {"velocity": [system.unit(rate) for rate in system.rates]}
-    units["load"] = [system.force_unit(j + 1) for j in range(len(system.rates))]
-    meaningless = "a change of its friction may be one of the motion, not of the machine"
-    for kind, j in itertools.product(units, range(len(system.rates))):
-        pairs = [(shared(getattr(a, kind)[j], getattr(b, kind)[j]), a, b) for a, b in itertools.combinations(fits, 2)]
-        share, one, two = min(pairs, key=lambda pair: pair[0])
-        if share < LEAST_SHARED:
-            ranges = " and ".join(
-                f"{fit.name} {getattr(fit, kind)[j][0]:.3g} to {getattr(fit, kind)[j][1]:.3g}" for fit in (one, two)
-            )
-            unmeasured = kind == "velocity" and share == 0
-            means = "its friction is not compared" if unmeasured else meaningless
-            yield f"joint {j + 1}: the {kind} ranges of {ranges} {units[kind][j]} share {share:.0%}; {means}"
-
-
-def shared(one: Float[np.ndarray, " 2"], two: Float[np.ndarray, " 2"]) -> float:
-    """Share of the range that two visited together which both visited; 1 where either is not known."""
-    inside = min(one[1], two[1]) - max(one[0], two[0])
-    union = max(one[1], two[1]) - min(one[0], two[0])
-    return float(np.clip(inside / union, 0.0, 1.0)) if np.isfinite(union) and union > 0 else 1.0
+    A prior of standard deviation `prior_std` is in all of them.
+    """
+    has = (np.isfinite(value) & np.isfinite(std) & (std > 0)).all(axis=1)
+    values, stds = value[has], std[has]
+    pooled = pool(values, stds, max(prior_std, stds.max(initial=0.0)), 1.0 if test is None else test.widened)
+    return Quantity(name, rows, value, std, apart(values, stds), pooled, test)

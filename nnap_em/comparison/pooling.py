@@ -1,5 +1,6 @@
 """One quantity from several fits: a joint test that it is the same in all of them, and one pooled answer."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,14 +26,20 @@ class JointTest(NamedTuple):
     p_value: float
     """The same, corrected for the number of quantities."""
 
+    @property
+    def widened(self) -> float:
+        """Multiple of the stated errors that the differences show, 1 at least: (Q / freedom)^1/2.
+
+        [Birge 1932, Phys. Rev. 40, 207]
+        """
+        return max(1.0, math.sqrt(self.statistic / max(self.freedom, 1)))
+
 
 class Pooled(NamedTuple):
     """One answer from several fits."""
 
     value: Float[np.ndarray, " number"]
     std: Float[np.ndarray, " number"]
-    between: Float[np.ndarray, " number"]
-    """Standard deviation between fits beyond the standard deviations that they state."""
 
 
 def joint_test(value: Float[np.ndarray, "fit number"], cov: Float[np.ndarray, "fit number number"]) -> JointTest:
@@ -59,22 +66,27 @@ def joint_test(value: Float[np.ndarray, "fit number"], cov: Float[np.ndarray, "f
     return JointTest(statistic, freedom, p, p)
 
 
+def apart(value: Float[np.ndarray, "fit number"], std: Float[np.ndarray, "fit number"]) -> Float[np.ndarray, " number"]:
+    """Difference of each number between fits, of two |a - b| / (s_a^2 + s_b^2)^1/2 [standard deviations].
+
+    sqrt(sum_i w_i (x_i - x)^2),   w = 1 / s^2,   x the mean weighted by w     [Cochran 1954, Biometrics 10, 101]
+    """
+    weight = 1 / std**2
+    return np.sqrt(np.sum(weight * (value - np.sum(weight * value, axis=0) / weight.sum(axis=0)) ** 2, axis=0))
+
+
 def pool(
-    value: Float[np.ndarray, "fit number"], std: Float[np.ndarray, "fit number"], prior_std: float = np.inf
+    value: Float[np.ndarray, "fit number"],
+    std: Float[np.ndarray, "fit number"],
+    prior_std: float = np.inf,
+    widened: float = 1.0,
 ) -> Pooled:
-    """Mean of a random-effects model for each number by itself, by the method of moments.
+    """Mean of each number by itself, weighted by 1 / s^2, with `widened` times its standard deviation.
 
-        x_i ~ N(x, s_i^2 + tau^2),   tau^2 = max(0, (Q - k + 1) / (sum w - sum w^2 / sum w)),   w = 1 / s^2
-
-    [DerSimonian & Laird 1986, Controlled Clinical Trials 7, 177]  A prior of standard deviation `prior_std`, which
-    every fit has in its posterior, is taken out of each s_i and counts once in the result.
+    A prior of standard deviation `prior_std`, which every fit has in its posterior, is taken out of each and counts
+    once in the result.
     """
     shared = 1 / prior_std**2
     weight = np.maximum(1 / std**2 - shared, 1e-9 / std**2)
-    mean = np.sum(weight * value, axis=0) / weight.sum(axis=0)
-    misfit = np.sum(weight * (value - mean) ** 2, axis=0) - (len(value) - 1)
-    lever = weight.sum(axis=0) - np.sum(weight**2, axis=0) / weight.sum(axis=0)
-    between = np.maximum(0.0, misfit / lever) if len(value) > 1 else np.zeros_like(mean)
-    weight = 1 / (1 / weight + between)
     total = weight.sum(axis=0)
-    return Pooled(np.sum(weight * value, axis=0) / total, 1 / np.sqrt(total + shared), np.sqrt(between))
+    return Pooled(np.sum(weight * value, axis=0) / total, widened / np.sqrt(total + shared))

@@ -120,21 +120,6 @@ def touch(figure: Figure, d: Arrays, ink: Ink) -> None:
     ax.legend(loc="upper left", ncols=2)
 
 
-def apart(figure: Figure, d: Arrays, ink: Ink) -> None:
-    """Old input above, designed input below."""
-    axes = figure.subplots(2, 1, sharex=True, sharey=True)
-    rows = (("old", ink.before, "an input of the first logs"), ("new", ink.learned, "a designed input"))
-    for ax, (side, colour, label) in zip(axes, rows, strict=True):
-        ax.step(d[f"t_{side}"] - d[f"t_{side}"][0], d[f"u_{side}"], where="post", color=colour, lw=1.2)
-        ax.set_title(f"{label}: the wrong law {_odds(float(d[f'wrong_{side}']))}")
-        ax.set_ylabel("torque [N m]")
-    axes[1].set_xlabel("time [s]")
-
-
-def _odds(chance: float) -> str:
-    return f"once in {1 / chance:.0f} times" if chance > 1e-4 else "less than once in 10,000 times"
-
-
 def arm(figure: Figure, d: Arrays, ink: Ink) -> None:
     """A small panel for each joint, and the legend in the eighth."""
     axes = figure.subplots(2, 4).ravel()
@@ -172,7 +157,6 @@ PICTURES = {
     "law": Picture(runs.law, law),
     "errors": Picture(runs.errors, errors),
     "touch": Picture(runs.touch, touch),
-    "apart": Picture(runs.apart, apart),
     "arm": Picture(runs.arm, arm),
     "throughput": Picture(runs.throughput, throughput),
 }

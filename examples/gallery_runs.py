@@ -4,7 +4,6 @@ What simulates is seeded.  Real recordings are those of `measured_loop.py` and o
 whose recordings are not there raises FileNotFoundError.
 """
 
-import json
 import re
 import subprocess
 import sys
@@ -15,9 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import measured_loop
-import next_experiment
 import numpy as np
-import plant
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
@@ -117,19 +114,6 @@ def touch(out: Path) -> Arrays:
     mean = averaged(force, round(WINDOWS[0] / rig.dt))[number]
     torques = {"true": true[f"hidden{joint}"], "torque": mean[:, joint - 1]}
     return {"t": true["time"], "spans": np.asarray(spans), "joint": joint} | torques
-
-
-def apart(out: Path) -> Arrays:
-    """Inputs that hardly discriminate a delay and a lag, and one that does; how often each would name the wrong law."""
-    rig, first, plan, effect = out / "rig", out / "first", out / "plan", "input_delay"
-    plant.write(next_experiment.rig_of(effect, 1), rig)
-    _command(*next_experiment.diagnosis(rig, first))
-    _command(*next_experiment.design(first, plan, effect))
-    design = json.loads((plan / "design.json").read_text())
-    old, new = _read(rig / "train" / "01.csv"), _read(plan / design["inputs"][0])
-    wrong = design["discrimination"][0]["misleading"]
-    rates = {"wrong_old": wrong["same_time_of_old_inputs"], "wrong_new": wrong["expected"]}
-    return {"t_old": old["time"], "u_old": old["u"], "t_new": new["time"], "u_new": new["u"]} | rates
 
 
 def arm(out: Path) -> Arrays:

@@ -19,12 +19,11 @@ from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig
 from nnap_em.diagnosis.residual import names_of
 from nnap_em.em.weights import Weights
-from nnap_em.experiment.criteria import Discrimination, Friction, Information, Several, after, share
+from nnap_em.experiment.criteria import Friction, Several, after, share
 from nnap_em.experiment.experiment import design
-from nnap_em.experiment.information import Contrast, Fit, columns_of, contrast, information, known, linearised
+from nnap_em.experiment.information import Fit, columns_of, information, known, linearised
 from nnap_em.experiment.limits import DesignError, Limits, limits_of
 from nnap_em.experiment.play import Motions, allowed, motions
-from nnap_em.experiment.rivals import Law, open_pairs, rivals
 from nnap_em.experiment.search import Effort
 from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
 from nnap_em.fit.identify import identify, parameter_table
@@ -84,22 +83,12 @@ def test_new_logs_tell_the_share_that_the_old_ones_told():
     assert share(fit(after(prior, 2.0 * expected)), expected) == 1.0
 
 
-def test_distance_of_two_models_is_that_of_their_readings_with_all_that_can_be_adapted():
-    """d^2 = r'(I + J C J')^-1 r, the quadratic form of a Gaussian whose mean is known up to J delta."""
-    rng = np.random.default_rng(2)
-    half, jac, r = rng.standard_normal((4, 4)), rng.standard_normal((9, 4)), rng.standard_normal(9)
-    cov = half @ half.T
-    expected = Information(np.zeros((4, 4)), (Contrast(jac.T @ jac, jac.T @ r, np.asarray(r @ r)),))
-    direct = np.sqrt(r @ np.linalg.solve(np.eye(9) + jac @ cov @ jac.T, r))
-    np.testing.assert_allclose(Discrimination((cov,)).distance(expected), [direct], rtol=1e-10)
-
-
 def test_friction_near_rest_counts_as_much_as_all_the_rest():
     """Torques of a joint at rest and at speed, in units of its friction: each bandwidth to the power of a half."""
     std, weight = np.asarray([0.4, 0.1]), np.asarray([[[0.0, 1.0]], [[1.0, 0.0]]])
     fit = Fit(None, None, np.asarray([[0.0, 9.0]]), np.diag(std**2), np.eye(2))  # type: ignore[arg-type]
     cost = Friction(fit, np.asarray([2.0]), weight).cost
-    nothing, slow = (Information(np.diag([expected, 0.0]) / std**2) for expected in (0.0, 8.0))
+    nothing, slow = (np.diag([expected, 0.0]) / std**2 for expected in (0.0, 8.0))
     np.testing.assert_allclose(np.exp(cost(nothing)), np.sqrt(0.2 * 0.05), rtol=1e-9)
     np.testing.assert_allclose(cost(nothing) - cost(slow), 0.5 * np.log(3.0), rtol=1e-9)  # eightfold more information
 
@@ -142,17 +131,6 @@ def test_information_is_the_mean_square_of_the_score(fit):
     assert expected[0, place, place] > 0
 
 
-def test_a_model_is_no_distance_from_itself_and_some_from_another(fit):
-    known_fit, data, path = fit
-    model = known_fit.model
-    some = jax.tree.map(lambda a: jnp.asarray(a)[:2], data)
-    start = path[:2, 0]
-    same = contrast(known_fit, model, some, start)
-    assert np.all(same.square < 1e-6)  # innovations of a noise-free log of the model itself, up to linearisation
-    heavier = dataclasses.replace(model, system=dataclasses.replace(model.system, m2=1.2 * model.system.m2))
-    assert np.all(contrast(known_fit, heavier, some, start).square > 100 * np.maximum(same.square, 1e-6))
-
-
 # --- on a slide
 
 
@@ -190,7 +168,7 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
     value, stated = parameter_table(identify(rig, both, key=jax.random.key(0)))["m"]
-    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(designed.fit.cov), expected.information)[-1, -1])  # noqa: E731
+    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(designed.fit.cov), expected)[-1, -1])  # noqa: E731
     assert 1 / 1.5 < std(designed.expected) / stated < 1.5
     assert abs(value - 1.0) < 4 * stated
     assert max(std(designed.expected), std(designed.old)) < std(designed.nothing)
@@ -227,17 +205,6 @@ def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_sprea
     assert not allowed(lost, limits)[0]
 
 
-def test_a_search_that_tells_laws_apart_needs_no_information_and_its_design_says_it(slide):
-    _, _, data, fitted = slide
-    pairs = rivals(fitted, data, [(None, Law("motor_gain", 1))])
-    plan = {"seconds": 4.0, "sequences": 2, "effort": SMALL}
-    designed = design(fitted, data, key=jax.random.key(2), question="discriminate", rivals=pairs, **plan)
-    assert designed.discrimination is not None
-    assert np.all(designed.discrimination.distance(designed.expected) > 0)
-    std = lambda expected: np.sqrt(after(np.asarray(designed.fit.cov), expected.information)[-1, -1])  # noqa: E731
-    assert std(designed.expected) < 0.99 * std(designed.nothing)  # of the mass
-
-
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     _, rig, data, fitted = slide
     path, used, system = np.zeros((12, 151, 2)), np.ones(12, bool), fitted.model.system
@@ -263,7 +230,6 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
 @pytest.mark.parametrize(
     "question, reason",
     {
-        "discriminate": "--rival",
         "spring": "possible here: friction, parameters, m, all",
         "friction ": "not a question",
     }.items(),
@@ -272,27 +238,6 @@ def test_a_question_that_the_fit_cannot_answer_is_told(slide, question, reason):
     _, _, data, fitted = slide
     with pytest.raises(DesignError, match=re.escape(reason)):
         design(fitted, data, key=jax.random.key(0), question=question)
-
-
-def test_rivals_are_fitted_in_the_place_of_a_law(slide):
-    _, _, data, fitted = slide
-    (pair,) = rivals(fitted, data, [(None, Law("motor_gain", 1))])
-    assert pair.names == ("nothing", "motor gain at joint 1")
-    assert not pair.one.model.effects and pair.other.model.effects[0].name == "motor_gain"
-    (other,) = rivals(pair.other, data, [(Law("motor_gain", 1), Law("input_delay"))])
-    assert [effect.name for effect in other.other.model.effects] == ["input_delay"]
-    with pytest.raises(DesignError, match="the fit holds no payload; it holds no effect"):
-        rivals(fitted, data, [(Law("payload"), Law("input_delay"))])
-    with pytest.raises(DesignError, match=r"cannot have base tilt; possible here: .*motor_gain:1"):
-        rivals(fitted, data, [(None, Law("base_tilt"))])
-
-
-def test_what_a_report_leaves_open_becomes_pairs():
-    lag = {"name": "actuator_lag", "joint": 2, "channel": None}
-    report = {"effects": [{"name": "input_delay", "joint": 2, "equivalent": [lag]}], "undecided": [lag]}
-    pairs = [(None, Law("actuator_lag", 2)), (Law("input_delay", 2), Law("actuator_lag", 2))]
-    assert open_pairs(report) == pairs
-    assert open_pairs({}) == []
 
 
 # --- the command

@@ -51,7 +51,7 @@ MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError
 WARNINGS = (RigWarning, DataWarning)
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
-OPTIONS = ("start", "smoother", "particles", "for", "rival", "seconds", "sequences", "seed")
+OPTIONS = ("start", "smoother", "particles", "for", "seconds", "sequences", "seed")
 """Those that decide the numbers."""
 
 

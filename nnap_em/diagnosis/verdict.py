@@ -4,7 +4,7 @@ The search measures; this file decides, in the same way for every loss.  A share
 candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
 Elsewhere: READINGS (`em/noise.py`) and WHITE (`innovations.py`, `statistics.py`), which choose the loss; the bars of
 external disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve (`shapes.py`); and counts of
-parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py rivals.py equations.py`).
+parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py equations.py`).
 """
 
 import math

@@ -2,7 +2,6 @@
 
 import math
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,25 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import root_scalar
 
-from .information import Contrast, Fit
+from .information import Fit
 
-
-class Information(NamedTuple):
-    """Information of some sequences together, or of each; leading axes are proposals."""
-
-    information: Float[np.ndarray, "*proposal phi phi"]
-    contrasts: tuple[Contrast, ...] = ()
-
-    def __add__(self, other: "Information") -> "Information":  # type: ignore[override]
-        return jax.tree.map(np.add, self, other)
-
-    def times(self, amount: float) -> "Information":
-        """The information `times` as large."""
-        return jax.tree.map(lambda a: amount * a, self)
-
-    def sum(self) -> "Information":
-        """All together."""
-        return jax.tree.map(lambda a: a.sum(axis=0), self)
+Information = Float[np.ndarray, "*proposal phi phi"]
+"""Information of some sequences together, or of each; leading axes are proposals."""
 
 
 def some(tree, which):
@@ -60,9 +44,6 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
 class AbstractCriterion(eqx.Module):
     """A design criterion."""
 
-    least: ClassVar[float] = -math.inf
-    """The cost of a whole answer."""
-
     @abstractmethod
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """The smaller, the better it is answered; one less is a factor e in a standard deviation."""
@@ -79,7 +60,7 @@ class Friction(AbstractCriterion):
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         shape = self.weight.shape[1:]
-        variance = np.diagonal(after(np.asarray(self.fit.cov), expected.information), axis1=-2, axis2=-1)
+        variance = np.diagonal(after(np.asarray(self.fit.cov), expected), axis1=-2, axis2=-1)
         variance = variance[..., : math.prod(shape)].reshape(*variance.shape[:-1], *shape)
         relative = variance / self.scale[:, None] ** 2
         mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
@@ -97,37 +78,9 @@ class Parameters(AbstractCriterion):
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         where = np.asarray(self.places) + self.fit.nodes.size
-        cov = after(np.asarray(self.fit.cov), expected.information)
+        cov = after(np.asarray(self.fit.cov), expected)
         variance = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1)[..., where], 1e-30)
         return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
-
-
-class Discrimination(AbstractCriterion):
-    """Discrimination between laws: the pair that is hardest to discriminate counts.
-
-    A log-likelihood ratio is normal with mean d^2 / 2 and variance d^2, d the distance after everything that the rival
-    can adapt: d^2 = r'(I + J C J')^-1 r.  [Atkinson & Fedorov 1975, Biometrika 62, 57, for the criterion]
-    """
-
-    least: ClassVar[float] = 0.0
-    covs: tuple[Float[np.ndarray, "_ _"], ...]
-    """Covariances of every rival."""
-
-    def distance(self, expected: Information) -> Float[np.ndarray, "*proposal pair"]:
-        """Distance of every pair [standard deviations]."""
-        out = []
-        for cov, (information, pull, square) in zip(self.covs, expected.contrasts, strict=True):
-            adapted = np.einsum("...i,...ij,...j->...", pull, after(cov, information), pull)
-            out.append(np.sqrt(np.maximum(square - adapted, 0.0)))
-        return np.stack(out, axis=-1)
-
-    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        """Half the distance still to go."""
-        # Distance of two models [standard deviations of their log-likelihood ratio] beyond which more adds nothing. At
-        # 6 one in 700 is decided wrong, but logs then add about half of the expected ratio (docs/design.md).
-        enough = 9.0
-        far = np.minimum(self.distance(expected), enough)
-        return np.asarray(0.5 * np.mean(enough - far, axis=-1) + 0.5 * np.max(enough - far, axis=-1))
 
 
 class Several(AbstractCriterion):

@@ -1,6 +1,5 @@
 """The next experiment: which inputs, played on the machine, determine best what a fit leaves open."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -14,12 +13,11 @@ from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
-from .criteria import AbstractCriterion, Discrimination, Friction, Information, Parameters, Several, share, some
-from .information import Fit, known
+from .criteria import AbstractCriterion, Friction, Information, Parameters, Several, share, some
+from .information import Fit, information, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
-from .rivals import Rivals
-from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, expected_information, search
+from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, search
 from .signals import Proposal, played, starts
 
 CHECKED, DRAWN_IN = 500, 200
@@ -47,8 +45,6 @@ class Design(NamedTuple):
     old: Information
     """Information of as much time of the old inputs."""
     question: AbstractCriterion
-    rivals: tuple[Rivals, ...]
-    discrimination: Discrimination | None
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
@@ -57,7 +53,7 @@ class Design(NamedTuple):
     @property
     def nothing(self) -> Information:
         """Information without an experiment."""
-        return jax.tree.map(np.zeros_like, self.expected)
+        return np.zeros_like(self.expected)
 
 
 def design(
@@ -66,8 +62,7 @@ def design(
     *,
     key: PRNGKeyArray,
     question: str = "all",
-    rivals: Sequence[Rivals] = (),
-    seconds: float = 30.0,
+    seconds: float = 60.0,
     sequences: int = 6,
     effort: Effort = DESIGN_EFFORT,
     log: Log = silent,
@@ -81,8 +76,7 @@ def design(
         fitted: the model.
         data: the logs that it was fitted to.
         key: random key of the search.
-        question: "friction", "parameters", the name of one, "discriminate" (each of `rivals`) or "all" of these.
-        rivals: pairs of laws to be discriminated.
+        question: "friction", "parameters", the name of one, or "all" of these.
         seconds: length of all sequences together [s].
         sequences: their number.
         effort: size of the search.
@@ -99,15 +93,12 @@ def design(
     posterior = posterior_of(fitted, data)
     path, used = np.asarray(posterior.state.mean), np.asarray(not_diverged(posterior, data))
     limits, fit = limits_of(fitted.rig, fitted.model.system, data, path, used), known(fitted)
-    fits = [(known(pair.one), known(pair.other)) for pair in rivals]
-    pairs = tuple(both for a, b in fits for both in ((b, a), (a, b)))  # either may be the true one
-    discrimination = Discrimination(tuple(np.asarray(rival.cov) for rival, _ in pairs)) if pairs else None
     dof, followed = fit.nodes.shape[0], np.asarray(data.valid) & used[:, None] & np.isfinite(path).all(axis=-1)
     visited = path[followed][:, dof : 2 * dof]
     slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
     slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
     friction = _friction(fit, visited, slow)
-    criterion = _criterion(question, fitted, fit, friction, discrimination)
+    criterion = _criterion(question, fitted, fit, friction)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(
@@ -115,13 +106,12 @@ def design(
         )
     t = fitted.rig.dt * np.arange(rows + 1)
     trial_models = 32  # models from the posterior by which every proposal is tried
-    setup = Setup(fit, pairs, drawn_paths(fitted, trial_models, key=key_paths), limits, t, key_noise)
+    setup = Setup(fit, drawn_paths(fitted, trial_models, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
     count = float(np.sum(np.asarray(data.valid)[used]))
-    setup = setup._replace(share=share(fit, count * row.information))
+    setup = setup._replace(share=share(fit, count * row))
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_search)))
-    quick = setup._replace(informed=not isinstance(criterion, Discrimination))
-    plan = search(quick, criterion, sequences, rng=rng, effort=effort, log=log)
+    plan = search(setup, criterion, sequences, rng=rng, effort=effort, log=log)
     checked = setup._replace(paths=drawn_paths(fitted, CHECKED, key=key_check), key=key_check)
     plan, trials = _checked(setup, checked, plan, effort, log)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
@@ -136,46 +126,39 @@ def design(
         middle,
         high,
         fit,
-        plan.expected.sum(),
-        row.times(setup.share * sequences * t.size),
+        plan.expected.sum(axis=0),
+        setup.share * sequences * t.size * row,
         criterion,
-        tuple(rivals),
-        discrimination,
         slow,
         friction.weight[0],
     )
 
 
-def check_question(name: str, fitted: Identified, rivals: bool) -> None:
-    """Raise DesignError where a fit, with or without rivals, has no criterion of that name."""
+def check_question(name: str, fitted: Identified) -> None:
+    """Raise DesignError where a fit has no criterion of that name."""
     prior = fitted.m_step.prior
-    several = {"friction": fitted.rig.friction, "parameters": prior.size, "discriminate": rivals}
+    several = {"friction": fitted.rig.friction, "parameters": prior.size}
     known = [kind for kind, there in several.items() if there]
     if known:
         known += [*prior.declared, "all"]
     if name not in known:
         why = {
-            "discriminate": "the fit has no effect that another law explains as well; name a law with --rival",
             "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
             "friction": "the rig is declared free of friction",
         }.get(name, "not a question of this fit")
-        names = ", ".join(known) or "none: the fit has no friction map, no parameter and no rival"
+        names = ", ".join(known) or "none: the fit has no friction map and no parameter"
         raise DesignError(f"--for {name}: {why}; possible here: {names}")
 
 
-def _criterion(
-    name: str, fitted: Identified, fit: Fit, friction: Friction, discrimination: Discrimination | None
-) -> AbstractCriterion:
+def _criterion(name: str, fitted: Identified, fit: Fit, friction: Friction) -> AbstractCriterion:
     """The criterion of that name, or all of those that there are."""
-    check_question(name, fitted, discrimination is not None)
+    check_question(name, fitted)
     prior, criteria = fitted.m_step.prior, {}
     if fitted.rig.friction:
         criteria["friction"] = friction
     if prior.size:
         criteria["parameters"] = Parameters(fit, tuple(range(prior.size)))
     singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
-    if discrimination is not None:
-        criteria["discriminate"] = discrimination
     return Several(tuple(criteria.values())) if name == "all" else (criteria | singles)[name]
 
 
@@ -215,12 +198,12 @@ def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log)
 
 def _row_of_logs(setup: Setup, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:
     """Information of a row of the logs, the mean along their smoothed motions, as far as a new sequence is long."""
-    rows, free = setup.t.size, 2 * setup.fit.nodes.shape[0]
+    rows = setup.t.size
     cut = jax.tree.map(lambda a: np.asarray(a)[used, :rows], data)
     short = rows - cut.t.shape[1]
     grow = lambda a, **how: np.pad(a, [(0, 0), (0, max(short, 0))] + [(0, 0)] * (a.ndim - 2), **how)  # noqa: E731
     t, u, y = (grow(a, mode="edge") for a in cut[:3])
     cut = Dataset(t, u, y, grow(cut.valid))
     x = grow(path[used, :rows], mode="edge")
-    each = expected_information(setup, cut, jnp.asarray(x[:, None]), x[:, 0, :free])
-    return each.sum().times(1.0 / max(float(cut.valid.sum()), 1.0))
+    each = information(setup.fit, cut, jnp.asarray(x[:, None]))
+    return each.sum(axis=0) / max(float(cut.valid.sum()), 1.0)

@@ -17,7 +17,7 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..smoother.kalman import CUBATURE, TANGENT, Filtered, ekf, kalman_filter, linear_reading, rts
+from ..smoother.kalman import CUBATURE, TANGENT, Filtered, kalman_filter, linear_reading, rts
 
 
 class Fit(NamedTuple):
@@ -94,45 +94,3 @@ def _sensitivities(fit: Fit, linear: Local, filtered: Filtered, path: Gaussian) 
     readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), linear)
     jac = whitened_sensitivities(filtered, columns, readings, linear.seq.observed)
     return jac.reshape(-1, jac.shape[-1])
-
-
-class Contrast(NamedTuple):
-    """Readings of a true model beside those that a rival expects, in its whitened innovations r = J delta."""
-
-    information: Float[np.ndarray, "*proposal phi phi"]
-    """J' J, of the rival's own phi."""
-    pull: Float[np.ndarray, "*proposal phi"]
-    """J' r"""
-    square: Float[np.ndarray, "*proposal"]
-    """r' r"""
-
-
-def contrast(
-    rival: Fit, truth: StateSpaceModel, seq: Dataset, start: Float[np.ndarray, "proposal readable"]
-) -> Contrast:
-    """Innovations of a rival on the readings that `truth` gives from `start` on, without noise."""
-    return Contrast(*map(np.asarray, each(_contrast, (rival, truth), (seq, jnp.asarray(start)))))
-
-
-def _contrast(common, one):
-    (rival, truth), (seq, start) = common, one
-    inputs = truth.inputs(seq)
-
-    def step(x, u):
-        return truth.transition(x, u), truth.emission(x, u)
-
-    _, y = jax.lax.scan(step, _with_memory(truth, start), inputs)
-    prepared = prepare(rival.model, seq._replace(y=jnp.where(jnp.isnan(seq.y), jnp.nan, y)))
-    model, begin = rival.model, Gaussian(_with_memory(rival.model, start), rival.model.start.cov)
-    about = ekf(model, begin, prepared).state.mean
-    path = Gaussian(about, jnp.zeros((*about.shape, about.shape[-1])))
-    linear = local(model, rival.prior, path, seq, TANGENT)
-    filtered = kalman_filter(model.log_q, model.log_r, begin, linear.affine, linear.reading, prepared)
-    linear = linear._replace(seq=prepared)
-    jac, r = _sensitivities(rival, linear, filtered, path), filtered.innovation.ravel()
-    return jac.T @ jac, jac.T @ r, r @ r
-
-
-def _with_memory(model: StateSpaceModel, start: Float[Array, " readable"]) -> Float[Array, " state"]:
-    """A first state, with the memory of the effects at rest."""
-    return jnp.concatenate([start, model.start.mean[start.shape[0] :]])

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
 
 from ..data.formats import write_csv
 from ..diagnosis.keys import key_of, listed, words
@@ -89,7 +88,6 @@ def describe(design: Design) -> dict[str, Any]:
         },
         "friction": friction_entries(design) if fitted.rig.friction else [],
         "parameters": parameter_entries(design),
-        "discrimination": pair_entries(design),
     }
     return document | {"verdict": _verdict(document)}
 
@@ -104,7 +102,7 @@ def friction_entries(design: Design) -> list[dict[str, Any]]:
     nodes, cov = np.asarray(design.fit.nodes), np.asarray(design.fit.cov)
     weight = design.friction_weight
     stds = {
-        side: np.sqrt(np.diagonal(after(cov, info.information))[: nodes.size]).reshape(nodes.shape)
+        side: np.sqrt(np.diagonal(after(cov, info))[: nodes.size]).reshape(nodes.shape)
         for side, info in _sides(design).items()
     }
     out = []
@@ -125,9 +123,7 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
     cov, cut = np.asarray(design.fit.cov), design.fit.nodes.size
     std = np.asarray(prior.std)
     value = np.asarray(prior.mean + prior.std * prior.read(model))
-    stds = {
-        side: std * np.sqrt(np.diagonal(after(cov, info.information))[cut:]) for side, info in _sides(design).items()
-    }
+    stds = {side: std * np.sqrt(np.diagonal(after(cov, info))[cut:]) for side, info in _sides(design).items()}
     labels, units = [], []
     for name, place in zip(prior.names, prior.places(model), strict=True):
         whose, unit = name, design.fitted.rig.unit(name)
@@ -141,19 +137,6 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
         label: {"value": float(value[i]), "unit": units[i]} | {s: float(v[i]) for s, v in stds.items()}
         for i, label in enumerate(labels)
     }
-
-
-def pair_entries(design: Design) -> list[dict[str, Any]]:
-    """Distance of every pair of rivals, and the probability that the wrong one is likelier."""
-    if design.discrimination is None:
-        return []
-    far = {side: design.discrimination.distance(info) for side, info in _sides(design).items()}
-    out = []
-    for i, pair in enumerate(design.rivals):
-        both = {side: float(np.min(d[2 * i : 2 * i + 2])) for side, d in far.items() if side != "now"}
-        wrong = {side: float(stats.norm.cdf(-0.5 * d)) for side, d in both.items()}
-        out.append({"laws": list(pair.names), "distance": both, "misleading": wrong})
-    return out
 
 
 def _verdict(document: dict[str, Any]) -> str:
@@ -176,19 +159,9 @@ def _verdict(document: dict[str, Any]) -> str:
     noted = 1.1  # factor of certainty from which on a parameter is named
     told_most = sorted((name for name, times in surer.items() if times > noted), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
-    for pair in document["discrimination"]:
-        wrong, old = pair["misleading"]["expected"], pair["misleading"]["same_time_of_old_inputs"]
-        gains.append(
-            f"{pair['laws'][0]} taken for {pair['laws'][1]}, or the reverse, {_odds(wrong)} (old inputs: {_odds(old)})"
-        )
     gains = gains or ["hardly anything surer: widen [limits], or give more --seconds"]
     what = f"{counted(document['sequences'], 'sequence')} of {number(document['seconds_each'])} s"
     return f"{what} should make {listed(gains)}."
-
-
-def _odds(p: float) -> str:
-    """A small chance in words."""
-    return f"once in {round(1 / p)} times" if p > 1e-4 else "less than once in 10000 times"
 
 
 # --- in figures

@@ -17,6 +17,7 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig
+from nnap_em.storage.files import StoreError
 from nnap_em.systems import specs
 
 RIG = Rig("bench", "acrobot", {}, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
@@ -179,6 +180,6 @@ def test_states_never_replace_a_log(tmp_path):
     logs = read_logs(tmp_path, RIG)
     (tmp_path / "01.csv").unlink()
     log = (tmp_path / "02.csv").read_text()
-    with pytest.raises(DataError, match=r"02\.csv: is there already with other columns, as a log; give another --out"):
+    with pytest.raises(StoreError, match=r"02\.csv: is there already, and nnap_em did not write it; move it away"):
         write_states(tmp_path, logs, specs["acrobot"].states, np.zeros((2, 50, 4)), np.zeros((2, 50, 4)))
     assert [path.read_text() for path in tmp_path.iterdir()] == [log]

@@ -12,7 +12,7 @@ from nnap_em.diagnosis.residual import Names, Residual
 from nnap_em.diagnosis.undisturbed import without
 from nnap_em.report.diagnosis import _disturbance
 from nnap_em.report.page import page
-from nnap_em.report.tables import write_json
+from nnap_em.report.tables import json_text
 from nnap_em.systems import specs
 
 DT = 0.01
@@ -100,7 +100,7 @@ def test_a_recording_is_cut_at_a_touch(restart):
 
 def test_report_and_page_name_the_file(tmp_path):
     entry = _disturbance(TOUCH, ("a.csv", "b.csv"))
-    write_json(tmp_path / "report.json", {"interventions": [entry]})
+    (tmp_path / "report.json").write_text(json_text({"interventions": [entry]}))
     (read,) = json.loads((tmp_path / "report.json").read_text())["interventions"]
     expected = {"file": "b.csv", "joint": 1, "from": 1.2, "to": 1.5, "size": -0.6, "std": 0.1, "unit": "N m"}
     assert read == expected

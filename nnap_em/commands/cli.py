@@ -160,12 +160,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = parser()
     args = arguments.parse_args(argv)
-    if args.command == "identify" and args.particles and args.smoother != "particle":
-        arguments.error("--particles goes with --smoother particle")
+    for command, option, needed, what in (
+        ("identify", "particles", lambda: args.smoother == "particle", "--smoother particle"),
+        ("diagnose", "logs", lambda: args.start, "--from FIT"),
+        ("export", "alone", lambda: args.mjcf, "--mjcf FILE"),
+        ("export", "float", lambda: args.observer, "--observer FILE"),
+    ):
+        if args.command == command and getattr(args, option) and not needed():
+            arguments.error(f"--{option} goes with {what}")
     if args.command == "export" and not any((args.out, args.mjcf, args.urdf, args.c, args.observer)):
         arguments.error("say where to: --out OUT, --mjcf, --urdf, --c or --observer FILE")
-    if args.command == "export" and args.float and not args.observer:
-        arguments.error("--float goes with --observer")
     try:
         # The matrices are small: more threads only wait for each other, and for long where the cores are busy.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

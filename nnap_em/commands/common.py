@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from ..comparison.compare import CompareError
-from ..data.dataset import DataError
+from ..data.dataset import DataError, Dataset
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
@@ -30,14 +30,15 @@ from ..fit.check import ERROR, torques
 from ..fit.identify import Identified
 from ..fit.known import differences
 from ..fit.predict import GIVEN
-from ..fit.store import Stored, fingerprint, model_file, read
+from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read
 from ..import_.mcap_writer import Channel
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
 from ..numerics.traced import use_cache
+from ..report.tables import FRICTION
 from ..storage.cache import Cache
-from ..storage.files import StoreError, cores, sweep
+from ..storage.files import StoreError, check_own, cores, sweep
 from ..storage.journal import Journal, keeping
 from ..storage.log import Log
 from ..systems import specs
@@ -49,6 +50,7 @@ class Halted(RuntimeError):
 
 MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
+REPORTS = ("report.json", "report.html")
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
 OPTIONS = ("start", "smoother", "particles", "for", "seconds", "sequences", "seed")
@@ -158,21 +160,26 @@ def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) ->
     return rig, train
 
 
-def origin(args: argparse.Namespace, bench: Bench, log: Log) -> tuple[Identified | None, Logs | None]:
-    """The fit of --from, and its own logs where they are at hand; logs what differs between the rigs."""
+def origin(args: argparse.Namespace, bench: Bench, log: Log) -> Stored | None:
+    """The fit of --from; logs what differs between the rigs."""
     if args.start is None:
-        return None, None
+        return None
     file = model_file(args.start)
     stored = read(file)
     for line in differences(stored.fitted.rig, bench.rig):
         log(f"{line}; that of the fit is used")
     if stored.fingerprint and stored.fingerprint == fingerprint(bench.train.data):
         raise DataError(f"{args.folder}: the logs of the fit in {file}; give others")
+    return stored
+
+
+def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | None:
+    """The logs of the fit of --from, where they are at hand."""
     try:
-        return stored.fitted, logs_of(file, stored, args.logs, args.trust_readings)[1]
+        return logs_of(model_file(args.start), stored, args.logs, args.trust_readings)[1].data
     except (DataError, RigError) as error:
         log(f"{error}: what these show as well is not left out")
-        return stored.fitted, None
+        return None
 
 
 def warn_of_torques(folder: Path, bench: Bench) -> None:
@@ -191,13 +198,11 @@ def warn_of_torques(folder: Path, bench: Bench) -> None:
 def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:
     """One file per sequence; a value that is no number becomes an empty field, with a message.
 
-    Raises DataError, before anything is written, where a file with other columns, as a log is, would be replaced.
+    Raises StoreError, before anything is written, where a file with other columns, as a log is, would be replaced.
     """
     names = ("time", *states, *(f"{name}_std" for name in states))
     paths = [(folder / file).with_suffix(".csv") for file in logs.files]
-    for path in paths:
-        if path.exists() and path.read_text(errors="replace").partition("\n")[0].strip() != ",".join(names):
-            raise DataError(f"{path}: is there already with other columns, as a log; give another --out")
+    check_own(paths, ",".join(names))
     for i, (file, path) in enumerate(zip(logs.files, paths, strict=True)):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)
@@ -208,9 +213,15 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
         write_csv(path, dict(zip(names, columns, strict=True)))
 
 
+def check_out(out: Path) -> None:
+    """Raise StoreError where a report would replace a file of somebody else."""
+    check_own(out / name for name in (MODEL_FILE, "before.npz", AFTER_FILE, *REPORTS, "friction.png"))
+    check_own(out.glob("friction*.csv"), FRICTION)
+
+
 def remove_reports(out: Path) -> None:
     """Remove reports that are not of the models which are written now."""
-    for name in ("report.json", "report.html"):
+    for name in REPORTS:
         (out / name).unlink(missing_ok=True)
 
 

@@ -19,7 +19,7 @@ import jax
 from ..experiment.experiment import check_question, design
 from ..fit.identify import Identified
 from ..fit.store import Stored, model_file, read
-from ..report.design import write_design
+from ..report.design import check_places, write_design
 from ..storage.log import Log
 from .common import Bench, logs_of, require_joints, resumable
 
@@ -32,6 +32,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     fitted, bench = _logs(args, stored)
     question = vars(args)["for"]
     check_question(question, fitted)
+    check_places(args.out, args.sequences)
     with resumable(args, bench, log):
         designed = design(
             fitted, bench.train.data, key=jax.random.key(args.seed), question=question,

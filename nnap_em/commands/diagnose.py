@@ -22,7 +22,7 @@ from ..diagnosis.search import diagnose
 from ..fit.store import AFTER_FILE, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import go_on, origin, read_bench, remove_reports, resumable, warn_of_torques
+from .common import check_out, go_on, origin, own_logs, read_bench, remove_reports, resumable, warn_of_torques
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
@@ -34,7 +34,9 @@ def run(args: argparse.Namespace, log: Log) -> None:
     seconds = search_share * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
-    start, own = origin(args, bench, log)
+    check_out(args.out)
+    start = origin(args, bench, log)
+    own = start and own_logs(args, start, log)
     if (args.out / AFTER_FILE).exists():
         log(f"the diagnosis in {args.out} will be replaced")
     with resumable(args, bench, log) as journal:
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
         spent = time.perf_counter() - began
         key = jax.random.key(args.seed)
-        began_from = {"start": start, "own": None if own is None else own.data}
+        began_from = {"start": start and start.fitted, "own": own}
         seconds -= spent
         diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds, **began_from)
         journal.open = not diagnosis.complete

@@ -31,7 +31,7 @@ from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import origin, read_bench, remove_reports, resumable, warn_of_torques
+from .common import check_out, origin, read_bench, remove_reports, resumable, warn_of_torques
 
 MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
@@ -42,15 +42,17 @@ def run(args: argparse.Namespace, log: Log) -> int:
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_torques(args.folder, bench)
+    check_out(args.out)
     if (args.out / MODEL_FILE).exists():
         log(f"the fit in {args.out} will be replaced")
     data, epochs = bench.train.data, []
-    fit, _ = origin(args, bench, log)
+    start = origin(args, bench, log)
     with resumable(args, bench, log):
         watch, key = _watch(bench.rig, args.epochs, epochs, log), jax.random.key(args.seed)
         options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
-        fitted = identify(bench.rig, data, **options) if fit is None else identify_from(fit, bench.rig, data, **options)
-        if bench.rig.memory and fit is None:
+        begin = identify if start is None else functools.partial(identify_from, start.fitted)
+        fitted = begin(bench.rig, data, **options)
+        if bench.rig.memory and start is None:
             fitted = with_memory(fitted, data, log)
         remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}

@@ -3,9 +3,9 @@
 examples:
   nnap-em init log.csv --system acrobot --out mine  writes mine/rig.toml
   nnap-em init mine/train/01.csv                    the same: rig.toml stands beside train/
-  nnap-em init run.mcap --system acrobot --out mine with a table [import] of what was found where
+  nnap-em init run.mcap --system acrobot --out mine  with a table [import] of what was found where
   nnap-em init run.mcap --model arm.xml --out mine  joints, motors and sensors by the names of the file
-  nnap-em init log.csv --model equations --out mine states, inputs and rates to be written as formulas
+  nnap-em init log.csv --model equations --out mine  states, inputs and rates to be written as formulas
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
 filled in.  Names the columns to rename or to convert.  A rig.toml that is there is never overwritten.

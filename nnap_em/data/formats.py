@@ -51,17 +51,24 @@ def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) ->
     Raises DataError that names the row and the column.
     """
     check_size(path)
-    return _readers[path.suffix.lower()](path, required, gaps)
+    return _of(path, _readers)(path, required, gaps)
 
 
 def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Table:
     """The same of a log of any size, whose times may be dates [s since 1970]."""
-    return _readers[path.suffix.lower()](path, required, gaps, True)
+    return _of(path, _readers)(path, required, gaps, True)
 
 
 def column_names(path: Path) -> list[str]:
     """The names of the columns of a log, in the order of the file."""
-    return _namers[path.suffix.lower()](path)
+    return _of(path, _namers)(path)
+
+
+def _of(path: Path, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
+    """The function for the kind of a file; DataError where there is none."""
+    if path.suffix.lower() not in functions:
+        raise DataError(f"{path}: no log (*.csv, *.parquet or *.mat); `nnap-em import` converts those of other kinds")
+    return functions[path.suffix.lower()]
 
 
 def place(path: Path, column: str, row: int | None = None) -> str:

@@ -14,7 +14,7 @@ from ..effects.base import OperatingPoint
 from ..fit.identify import Identified
 from ..model import hooks
 from ..model.state_space import Inputs
-from ..storage.files import replace_text
+from ..storage.files import replace_own
 from .model import ExportError, described, inputs_of, states_of, unrolled
 from .placement import of_command
 from .unroll import Source
@@ -93,7 +93,7 @@ def write_c(fitted: Identified, out: Path | str) -> list[str]:
 {WHOLE}
 enum {{ {sizes} }};
 """
-    replace_text(out, head + "\n" + "\n".join(functions))
+    replace_own({out: head + "\n" + "\n".join(functions)})
     return absent
 
 
@@ -241,4 +241,4 @@ def _c(node: ast.AST, dialect: Dialect) -> str:
             return f"{name}({', '.join(_c(a, dialect) for a in args)})"
         case ast.Call(func=ast.Attribute(value=inner, attr="astype")):
             return f"whole({_c(inner, dialect)})".replace("(trunc(", "((").replace("(truncf(", "((")
-    raise ExportError(f"{ast.unparse(node)!r} has no plain C form; use nnap-em export --out for NumPy")
+    raise ExportError(f"{ast.unparse(node)!r} has no plain C form")

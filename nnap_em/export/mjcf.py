@@ -17,7 +17,7 @@ from ..fit.identify import Identified
 from ..machines.spec import compiled, mujoco, written
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
-from ..storage.files import replace_text
+from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .actuator import actuator
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
@@ -101,9 +101,8 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
     comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
     file.spec.comment = f"{file.spec.comment}\n {comment.replace('--', '- -')}"
     file.spec.compile()
-    if acting and acting.plays:
-        replace_text(beside(out), acting.text)
-    replace_text(out, written(file.spec, out.parent))
+    module = {beside(out): acting.text} if acting and acting.plays else {}
+    replace_own({**module, out: written(file.spec, out.parent)})
     return left
 
 

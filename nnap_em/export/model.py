@@ -15,7 +15,8 @@ from ..effects import AbstractEffect
 from ..fit.identify import Identified, friction_table, parameter_table
 from ..model.friction import FrictionNetwork
 from ..model.state_space import StateSpaceModel
-from ..report.tables import write_json
+from ..report.tables import json_text
+from ..storage.files import replace_own
 from ..systems import AbstractPlant
 from .unroll import Source, UnrollError, unroll
 
@@ -39,7 +40,7 @@ def write_model(fitted: Identified, out: Path | str) -> None:
     """
     if fitted.model.servos:
         raise ExportError("its inputs are commands of servos, of which parameters.json has none; use --urdf or --c")
-    write_json(Path(out) / "parameters.json", parameters(fitted))
+    replace_own({Path(out) / "parameters.json": json_text(parameters(fitted))})
 
 
 def parameters(fitted: Identified) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def parameters(fitted: Identified) -> dict[str, Any]:
     values = {name: (pair.mean, pair.std) for name, pair in rig.parameters.items()} | estimated
     return {
         "format": 1,
-        "version": __version__,
+        "versions": {"nnap_em": __version__},
         "rig": rig.name,
         "system": rig.system,
         "states": [{"name": n, "unit": system.unit(n)} for n in system.states],

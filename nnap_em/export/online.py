@@ -21,7 +21,7 @@ from ..model import hooks
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
-from ..storage.files import replace_text
+from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
 from .model import ExportError, states_of, unrolled
 from .unroll import named
@@ -98,8 +98,7 @@ def write_observer(fitted: Identified, out: Path | str, *, single: bool = False)
     if out.suffix != ".c":
         raise ExportError(f"{out}: name a file that ends in .c; its declarations go beside it")
     source, header = observer_c(fitted, out.stem, single=single)
-    replace_text(out.with_suffix(".h"), header)
-    replace_text(out, source)
+    replace_own({out.with_suffix(".h"): header, out: source})
 
 
 class Numbers(NamedTuple):
@@ -137,7 +136,7 @@ def observer_c(fitted: Identified, stem: str, *, single: bool = False) -> tuple[
     with jax.enable_x64(not single):
         model, prior = jax.tree.map(_cast, (fitted.model, _estimated(fitted)))
         functions, memory = _functions(model, prior, dialect)
-    return _source(fitted, name, dialect, functions, memory), _header(fitted, name, dialect, memory)
+    return _source(fitted, stem, dialect, functions, memory), _header(fitted, name, dialect, memory)
 
 
 def _cast(a: Any) -> Any:
@@ -204,8 +203,9 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
     return [*texts, *(function(source, dialect) for source in sources[1:])], flat.size
 
 
-def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str], memory: int) -> str:
+def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str], memory: int) -> str:
     """The C file: numbers, the functions of the model, the filter."""
+    name = identifier(stem)
     model, drives, angles = fitted.model, len(fitted.model.system.joints), fitted.bank.angles
     own, again, dof = numbers(fitted), observing.restart_prior(model), len(model.system.coordinates)
     n, m, scales = model.log_q.shape[0], len(fitted.rig.measured), len(fitted.rig.scale_columns)
@@ -230,7 +230,7 @@ def _source(fitted: Identified, name: str, dialect: Dialect, functions: list[str
     calls = ("sqrt", "fabs", "exp", "log", "fmax")
     lines = [
         f"/* Observer of {_comment(fitted.rig.name)}: written by nnap_em {__version__}.  Link with -lm. */",
-        f'#include "{name}.h"\n\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n',
+        f'#include "{stem}.h"\n\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n',
         f"typedef {name}_real real;\ntypedef uint{32 if dialect.single else 64}_t bits;",
         f"enum {{ {', '.join(f'{key} = {value}' for key, value in sizes.items())} }};",
         f"#define DT {model.dt!r}",

@@ -9,7 +9,7 @@ import numpy as np
 from .. import __version__
 from ..data.machine import Joint
 from ..fit.identify import Identified
-from ..storage.files import replace_text
+from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .mjcf import as_it_is, named
@@ -58,7 +58,7 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
         parent, pose = frames[body.parent] if body.parent >= 0 else (_base(system), np.eye(4))
         frames.append(_body(root, system, numbers, i, parent, pose @ _pose(body.turn, body.place)))
     ET.indent(root)
-    replace_text(out, ET.tostring(root, encoding="unicode") + "\n")
+    replace_own({out: ET.tostring(root, encoding="unicode") + "\n"})
     return left
 
 

@@ -1,5 +1,7 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
+import json
+import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +17,7 @@ from ..diagnosis.residual import Names, names_of
 from ..experiment.criteria import Information, after
 from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
+from ..storage.files import check_own
 from ..storage.log import Log
 from .document import versions
 from .page import Picture, picture, rendered, write_report
@@ -43,14 +46,27 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
     log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUT_DIR}")
 
 
+def check_places(out: Path, count: int) -> list[Path]:
+    """Files of the design that is in `out`; StoreError where another would be replaced by one of `count` sequences."""
+    check_own(out / f"design.{kind}" for kind in ("json", "html"))
+    file = out / "design.json"
+    document = json.loads(file.read_text()) if file.exists() else {}
+    names = [*document.get("inputs", []), *document.get("motion", [])]
+    mine = [out / name for name in names if re.fullmatch(rf"({INPUT_DIR}|{MOTION_DIR})/\d+\.csv", name)]
+    check_own({out / folder / file for folder in (INPUT_DIR, MOTION_DIR) for file in _names(count)} - {*mine})
+    return mine
+
+
+def _names(count: int) -> list[str]:
+    return [f"{i + 1:0{len(str(count))}d}.csv" for i in range(count)]
+
+
 def _write_sequences(out: Path, design: Design) -> list[str]:
-    """The files of all sequences; older ones that are not of this design go."""
+    """The files of all sequences; those of an older design go."""
     fitted, states = design.fitted, design.fitted.model.system.coordinates + design.fitted.model.system.rates
-    count = len(design.u)
-    files = [f"{i + 1:0{len(str(count))}d}.csv" for i in range(count)]
-    for folder in (INPUT_DIR, MOTION_DIR):
-        for old in (out / folder).glob("*.csv"):
-            old.unlink()
+    files = _names(len(design.u))
+    for old in check_places(out, len(files)):
+        old.unlink(missing_ok=True)
     for i, file in enumerate(files):
         write_csv(
             out / INPUT_DIR / file, {"time": design.t} | dict(zip(fitted.rig.input_columns, design.u[i].T, strict=True))

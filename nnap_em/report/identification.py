@@ -163,6 +163,6 @@ def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[n
     """The learned maps as a file of their own, and for the page."""
     figure = friction_figure({"learned": table}, names_of(fitted), list(visited.T))
     image = io.BytesIO()
-    figure.savefig(image, format="png")
+    figure.savefig(image, format="png", metadata={"Software": "written by nnap_em"})
     replace_bytes(path, image.getvalue())
     return picture("found", "Learned friction", "With its 90 % band; below: where the data were.", figure)

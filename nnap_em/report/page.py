@@ -19,9 +19,9 @@ from ..diagnosis.findings import growth
 from ..diagnosis.statistics import FAILS
 from ..effects import catalogue
 from ..numerics.digits import finite, number
-from ..storage.files import replace_text
+from ..storage.files import replace_own
 from . import wording
-from .tables import write_json
+from .tables import json_text
 from .wording import ratio, reached
 
 Section = Literal["found", "error", "residual", "details"]
@@ -84,8 +84,7 @@ def write_report(
     out: Path, kind: str, document: Mapping[str, Any], text: str, named: Callable[[str], str] = str
 ) -> None:
     """Write KIND.json and the page `text` as KIND.html into the folder `out`, in the names of the user's file."""
-    write_json(out / f"{kind}.json", document, named)
-    replace_text(out / f"{kind}.html", named(text))
+    replace_own({out / f"{kind}.json": json_text(document, named), out / f"{kind}.html": named(text)})
 
 
 def write_page(

@@ -12,15 +12,16 @@ from jaxtyping import Float
 
 from ..data.formats import write_csv
 from ..fit.identify import nodes_between
-from ..storage.files import replace_text
 
+FRICTION = "joint,velocity,torque,torque_std"
+"""First line of a friction table."""
 INNER = (0.5, 99.5)
 """Percentiles of the rows between which a range counts as visited."""
 
 
-def write_json(path: Path, document: Mapping[str, Any], naming: Callable[[str], str] = str) -> None:
-    """Write JSON whole or not at all, texts as `naming` returns them."""
-    replace_text(path, json.dumps(plain(document, naming), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+def json_text(document: Mapping[str, Any], naming: Callable[[str], str] = str) -> str:
+    """A document as JSON, texts as `naming` returns them."""
+    return json.dumps(plain(document, naming), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def plain(value: Any, naming: Callable[[str], str] = str) -> Any:

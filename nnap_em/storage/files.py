@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -66,6 +66,31 @@ def replace_bytes(path: Path, content: bytes) -> None:
 def replace_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all (through a temporary file in its folder, which is made if need be)."""
     replace_bytes(path, text.encode())
+
+
+_MARKS = (b"ritten by nnap_em", b'"nnap_em": "', b'"kind": "nnap_em ')
+"""Texts of which one stands in each file that the package writes: sources and pages, JSON, arrays."""
+
+
+def check_own(paths: Iterable[Path], header: str = "") -> None:
+    """Raise StoreError where a file is there that the package did not write: nobody else's is ever replaced.
+
+    A table is the package's own where its first line is `header`.
+    """
+    for path in paths:
+        if not path.exists():
+            continue
+        content = b"" if path.is_dir() else path.read_bytes()
+        first = content.partition(b"\n")[0].strip().decode(errors="replace")
+        if not any(mark in content for mark in _MARKS) and (not header or first != header):
+            refuse(path, "is there already, and nnap_em did not write it", "move it away, or name another place")
+
+
+def replace_own(files: Mapping[Path, str]) -> None:
+    """Write text files, each whole or not at all, and none where one of somebody else would be replaced."""
+    check_own(files)
+    for path, text in files.items():
+        replace_text(path, text)
 
 
 @contextmanager

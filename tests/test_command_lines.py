@@ -1,0 +1,422 @@
+"""Every command line that the documentation, the help and messages show is parsed and run, in its cheapest form.
+
+A line is known by its command and its set of options: each such set, and each option of the parser that no line shows,
+runs once on a small slide, with values of `VALUES`.  The engines that need minutes are replaced by what a fit already
+gave; their own tests run them.
+"""
+
+import argparse
+import ast
+import dataclasses
+import functools
+import inspect
+import re
+import shlex
+import shutil
+import subprocess
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rod
+from helpers import file_rig, nnap
+from shell import ROOT
+
+import nnap_em
+from nnap_em import load
+from nnap_em.commands import cli, compare, design, diagnose, identify
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import read_rig
+from nnap_em.diagnosis.outcome import Diagnosis
+from nnap_em.experiment import experiment
+from nnap_em.experiment.search import Effort
+from nnap_em.fit.identify import begin
+from nnap_em.fit.store import save
+from nnap_em.systems import specs
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SOURCES = [path for kind in ("*.py", "*.j2") for path in sorted((ROOT / "nnap_em").rglob(kind))]
+LAUNCH = "python -m nnap_em.launch"
+
+PLACES = {
+    "simulate": ["new"],
+    "init": ["log.csv"],
+    "import": ["one.h5", "two.h5"],
+    "check": ["bench"],
+    "identify": ["bench"],
+    "diagnose": ["bench"],
+    "design": ["fit"],
+    "compare": ["fit", "other"],
+    "predict": ["fit", "bench/test"],
+    "smooth": ["fit", "bench/test"],
+    "export": ["fit"],
+}
+"""Places that a command is given, in the folder of the fits."""
+VALUES: dict[str, list[str]] = {
+    "--system": ["slide"],
+    "--sequences": ["2"],
+    "--test": ["1"],
+    "--steps": ["60"],
+    "--seed": ["1"],
+    "--measured": ["x"],
+    "--process-noise": ["0.001", "0.01"],
+    "--measurement-noise": ["0.001", "0.01"],
+    "--model": ["equations"],
+    "--rig": ["bench/rig.toml"],
+    "--shift": ["/drive=0.0"],
+    "--unwrap": ["x"],
+    "--more": ["february"],
+    "--from": ["january"],
+    "--smoother": ["particle"],
+    "--particles": ["9"],
+    "--epochs": ["3"],
+    "--minutes": ["1"],
+    "--logs": ["bench"],
+    "--for": ["friction"],
+    "--seconds": ["1.2"],
+    "--given": ["0.1"],
+    "--mjcf": ["{out}.xml"],
+    "--urdf": ["{out}.urdf"],
+    "--c": ["{out}.c"],
+    "--observer": ["{out}.c"],
+    "--mcap": ["{out}.mcap"],
+    "--out": ["{out}"],
+}
+"""Cheap values of options; `{out}` is a name that is new in each run."""
+GOES_WITH = {
+    ("identify", "--particles"): "--smoother",
+    ("diagnose", "--logs"): "--from",
+    ("export", "--alone"): "--mjcf",
+    ("export", "--float"): "--observer",
+}
+"""Options that are refused without another."""
+INSTEAD = {("init", "--system"): "--model", ("init", "--model"): "--system"}
+"""Options of which a run may have one."""
+
+
+PARSER = cli.parser()
+
+
+def _parsers() -> dict[str, argparse.ArgumentParser]:
+    return next(a for a in PARSER._actions if isinstance(a, argparse._SubParsersAction)).choices
+
+
+@functools.cache
+def _options(command: str) -> dict[str, argparse.Action]:
+    actions = _parsers()[command]._actions
+    return {a.option_strings[-1]: a for a in actions if a.option_strings and a.dest != "help"}
+
+
+def _required(command: str) -> frozenset[str]:
+    return frozenset(name for name, action in _options(command).items() if action.required)
+
+
+def _lines() -> list[tuple[str, list[str]]]:
+    """Whole command lines: in fenced blocks of pages and under the examples of a help text; where, and the words."""
+    out = []
+    for page in PAGES:
+        for number, line in enumerate(page.read_text().splitlines(), 1):
+            if line.startswith(("nnap-em ", LAUNCH)):
+                out.append((f"{page.name}:{number}", shlex.split(line, comments=True)))
+    for name, parser in {"nnap-em": PARSER, **_parsers()}.items():
+        for line in (parser.epilog or "").splitlines():
+            if line.startswith("  nnap-em "):
+                out.append((f"{name} --help", shlex.split(re.split(r"\s{2,}", line.strip())[0])))
+    return out
+
+
+def _texts() -> list[tuple[str, str]]:
+    """Texts of the package and in-line code of pages, which may name a command and some of its options."""
+    out = []
+    for page in PAGES:
+        prose = re.sub(r"(?ms)^```.*?^```", "", page.read_text())
+        out += [(page.name, " ".join(code.split())) for code in re.findall(r"`([^`]+)`", prose)]
+    for path in SOURCES:
+        text = path.read_text()
+        if path.suffix != ".py":
+            out.append((path.name, text))
+            continue
+        nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+        out += [(f"{path.name}:{n.lineno}", n.value) for n in nodes]
+    return out
+
+
+def _command(words: list[str]) -> list[str]:
+    """The words after `nnap-em`, also of a line of `launch`."""
+    if words[0] == "nnap-em":
+        return words[1:]
+    return words[next(i for i, word in enumerate(words) if word in PLACES) :]
+
+
+SHOWN = [(where, _command(words)) for where, words in _lines()]
+
+
+def _given(words: list[str]) -> tuple[str, frozenset[str]]:
+    return words[0], frozenset(word for word in words[1:] if word.startswith("--"))
+
+
+def _sets() -> dict[tuple[str, frozenset[str]], str]:
+    """Each distinct command with its options, and where it is shown; options that no line shows, together."""
+    out = {_given(words): where for where, words in reversed(SHOWN)}
+    for command in _parsers():
+        shown = frozenset().union(*(options for name, options in out if name == command))
+        rest = {option for option in _options(command) if option not in shown}
+        rest |= {GOES_WITH[command, option] for option in rest if (command, option) in GOES_WITH}
+        others = {option for option in rest if INSTEAD.get((command, option)) in rest}
+        for option in sorted(others)[1:]:  # by itself
+            out[command, _required(command) | {option}] = "the parser"
+            rest.discard(option)
+        if rest:
+            out[command, _required(command) | rest] = "the parser"
+    return out
+
+
+SETS = _sets()
+
+
+def test_every_line_that_is_shown_is_accepted_by_the_parser(capsys):
+    assert len(SHOWN) > 50
+    for where, words in SHOWN:
+        try:
+            PARSER.parse_args(words)
+        except SystemExit:
+            pytest.fail(f"{where}: {shlex.join(words)}: {capsys.readouterr().err}")
+
+
+def test_every_option_that_a_text_names_is_there():
+    wrong, commands = [], "|".join(PLACES)
+    for where, text in _texts():
+        for command, rest in re.findall(rf"nnap-em ({commands})\b((?:[ ]+[^\s`;:]+)*)", text):
+            options = re.findall(r"(?<!\S)--[a-z]+(?:-[a-z]+)*", rest)
+            wrong += [f"{where}: {command} {option}" for option in options if option not in _options(command)]
+    assert not wrong
+
+
+def test_every_option_of_the_parser_runs():
+    for command in _parsers():
+        run = frozenset().union(*(options for name, options in SETS if name == command))
+        assert run == {*_options(command)}, command
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Two data sets and fits of them that no epoch has changed; logs to be imported; a machine from a file."""
+    root = tmp_path_factory.mktemp("lines")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        for seed, name in enumerate(("bench", "february")):
+            size = ("--sequences", 2, "--test", 1, "--steps", 60, "--seed", seed)
+            assert nnap("simulate", name, "--system", "slide", *size) == 0
+        (root / "log.csv").write_text((root / "bench/train/000.csv").read_text())
+        for i, name in enumerate(("one", "two")):
+            table = np.genfromtxt(root / f"bench/train/00{i}.csv", delimiter=",", names=True)
+            with h5py.File(root / f"{name}.h5", "w") as file:
+                for column in table.dtype.names:
+                    file[f"drive/{column}"] = table[column]
+        rig = read_rig(root / "bench/rig.toml", specs)
+        fitted = begin(rig, read_logs(root / "bench/train", rig).data, key=jax.random.key(0))
+        information = 1e3 * jnp.eye(fitted.state.hessian.shape[0])
+        for name, logs, more in (("fit", "bench", 0.0), ("other", "february", 1.0), ("january", "february", 0.5)):
+            best = dataclasses.replace(fitted.model, log_r=fitted.model.log_r + more)
+            state = fitted.state._replace(best=best, hessian=information, loglik=jnp.zeros(1))
+            save(root / name / "model.npz", fitted._replace(state=state), notes={"logs": [str(root / logs)]})
+        (root / "rod.xml").write_text(rod.FILE)
+        (root / "rod.toml").write_text(file_rig("rod.xml", ("hinge", "dhinge"), friction="none", dt=rod.DT))
+        machine = begin(read_rig(root / "rod.toml", specs), rod.logs(0), key=jax.random.key(0))
+        save(root / "rod" / "model.npz", machine)
+    return root
+
+
+@pytest.fixture(scope="module")
+def beside(place):
+    """`compare`, once for the same fits: it fits laws to the curves."""
+    return functools.cache(nnap_em.compare)
+
+
+@pytest.fixture(scope="module")
+def designed(place):
+    """A small design, tried with few models."""
+    fit = load(place / "fit/model.npz")
+    data = read_logs(place / "bench/train", fit.rig).data
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "CHECKED", 8)
+        patch.setattr(experiment, "DRAWN_IN", 4)
+        small = Effort(pool=6, batch=12, rounds=1, tries=4, few=1)
+        return experiment.design(fit, data, key=jax.random.key(0), seconds=1.8, sequences=6, effort=small)
+
+
+def _first(designed: experiment.Design, count: int) -> experiment.Design:
+    """Some of its sequences."""
+    parts = ("u", "start", "low", "middle", "high")
+    return designed._replace(**{name: getattr(designed, name)[:count] for name in parts})
+
+
+@pytest.fixture
+def light(place, beside, designed, monkeypatch):
+    """The commands without the engines that need minutes: these give what `place` has, and refuse other arguments."""
+    fit = load(place / "fit/model.npz")
+
+    def bound(function, result):
+        signature = inspect.signature(function)
+
+        def called(*args, **options):
+            signature.bind(*args, **options)
+            return result(options)
+
+        return called
+
+    def fitted(options):
+        options["smoother"](fit.bank)
+        options["watch"](fit.state, 40, np.ones(2, bool))
+        return fit
+
+    for name in ("identify", "identify_from"):
+        monkeypatch.setattr(identify, name, bound(getattr(identify, name), fitted))
+    monkeypatch.setattr(identify, "write_identification", bound(identify.write_identification, lambda _: True))
+    monkeypatch.setattr(diagnose, "diagnose", bound(diagnose.diagnose, lambda _: Diagnosis(fit, fit, (), ())))
+    monkeypatch.setattr(diagnose, "write_diagnosis", bound(diagnose.write_diagnosis, lambda _: None))
+    monkeypatch.setattr(compare, "compare", beside)
+    monkeypatch.setattr(design, "design", bound(experiment.design, lambda o: _first(designed, o["sequences"])))
+    monkeypatch.chdir(place)
+    return place
+
+
+def _argv(command: str, options: frozenset[str], out: str) -> list[str]:
+    argv = [command, *PLACES[command]]
+    if command == "export" and options & {"--mjcf", "--urdf"}:
+        argv[1] = "rod"
+    for option in sorted(options):
+        action = _options(command)[option]
+        flag = action.nargs == 0
+        assert flag or option in VALUES, f"{command} {option}: give it a cheap value in VALUES"
+        argv += [option, *([] if flag else [value.format(out=f"{out}{option}") for value in VALUES[option]])]
+    if command == "simulate":
+        argv[1] = out
+        argv += [word for name in ("--system", "--sequences", "--test", "--steps") if name not in options
+                 for word in (name, *VALUES[name])]  # fmt: skip
+    if command == "init" and "--out" not in options:
+        argv += ["--out", f"{out}--out"]  # that of the log is filled in once
+    if command == "design":
+        argv += [word for name in ("--seconds", "--sequences") if name not in options for word in (name, *VALUES[name])]
+    return argv
+
+
+@pytest.mark.parametrize("given", SETS, ids=[f"{name} {' '.join(sorted(options))}".strip() for name, options in SETS])
+def test_it_runs(given, light, capsys):
+    command, options = given
+    out = f"out{list(SETS).index(given)}"
+    argv = _argv(command, options, out)
+    assert cli.main(argv) == 0, (SETS[given], capsys.readouterr().err)
+
+
+# --- what was wrong in such lines
+
+
+def _said(capsys) -> str:
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.mark.parametrize("line", ["predict fit rod.xml --given 0.1 --out x", "smooth fit fit/model.npz --out x"])
+def test_a_file_that_is_no_log_is_refused_in_one_line(line, light, capsys):
+    assert cli.main(line.split()) == 2
+    said = _said(capsys)
+    assert said.startswith("nnap-em: error: ") and "no log (*.csv, *.parquet or *.mat); `nnap-em import` conv" in said
+
+
+@pytest.mark.parametrize("name", ["my-arm"])
+def test_the_source_of_an_observer_includes_the_header_that_is_written(name, light, tmp_path):
+    assert nnap("export", "fit", "--observer", tmp_path / f"{name}.c") == 0
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.c", f"{name}.h"}
+    subprocess.run(["gcc", "-std=c99", "-fsyntax-only", f"{name}.c"], cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize(
+    "line, reason",
+    {
+        "export fit --out x --alone": "--alone goes with --mjcf FILE",
+        "export fit --out x --float": "--float goes with --observer FILE",
+        "diagnose bench --out x --logs bench": "--logs goes with --from FIT",
+        "identify bench --out x --particles 3": "--particles goes with --smoother particle",
+    }.items(),
+)
+def test_an_option_that_would_do_nothing_is_refused(line, reason, light, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(line.split())
+    assert reason in capsys.readouterr().err and not (light / "x").exists()
+
+
+def test_a_design_is_as_long_in_python_as_by_the_command():
+    parameters = inspect.signature(experiment.design).parameters
+    for option, name in (("--seconds", "seconds"), ("--sequences", "sequences"), ("--for", "question")):
+        assert _options("design")[option].default == parameters[name].default
+
+
+# --- files of others
+
+PLACED = {
+    "identify bench --out DIR": ("model.npz", "report.json", "report.html", "friction.csv", "friction.png"),
+    "diagnose bench --out DIR": ("before.npz", "after.npz", "report.json", "friction_before.csv"),
+    "design fit --out DIR": ("design.json", "design.html", "inputs/1.csv", "motion/6.csv"),
+    "compare fit other --out DIR": ("compare.json", "compare.html"),
+    "predict fit bench/test --given 0.1 --out DIR": ("000.csv",),
+    "smooth fit bench/test --out DIR": ("000.csv",),
+    "export fit --out DIR": ("parameters.json",),
+    "export fit --c DIR/arm.c": ("arm.c",),
+    "export fit --observer DIR/arm.c": ("arm.c", "arm.h"),
+    "export rod --mjcf DIR/rod.xml": ("rod.xml",),
+    "export rod --urdf DIR/rod.urdf": ("rod.urdf",),
+}
+
+
+@pytest.mark.parametrize("line, file", [(line, file) for line, files in PLACED.items() for file in files])
+def test_a_file_of_somebody_else_is_never_replaced(line, file, light, tmp_path, capsys):
+    """Refused before anything else is written."""
+    mine = tmp_path / file
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("time,u\n0.0,1.0\n")
+    assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 2
+    assert f"{mine}: is there already, and nnap_em did not write it" in capsys.readouterr().err
+    assert mine.read_text() == "time,u\n0.0,1.0\n"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare fit other --out DIR",
+        "predict fit bench/test --given 0.1 --out DIR",
+        "export fit --out DIR",
+        "export rod --urdf DIR/rod.urdf",
+        "export rod --mjcf DIR/rod.xml",
+    ],
+)
+def test_files_of_its_own_are_replaced(line, light, tmp_path):
+    for _ in range(2):
+        assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 0
+
+
+def test_a_fit_is_replaced_by_another(light, tmp_path):
+    shutil.copytree(light / "other", tmp_path / "fit")
+    before = (tmp_path / "fit/model.npz").read_bytes()
+    assert nnap("identify", "bench", "--out", tmp_path / "fit", "--quiet") == 0
+    assert (tmp_path / "fit/model.npz").read_bytes() != before
+
+
+def test_a_design_replaces_the_older_one_and_no_other_table(light, tmp_path):
+    plan = ("design", "fit", "--out", tmp_path, "--quiet")
+    others = [tmp_path / name for name in ("inputs/mine.csv", "motion/12.csv", "inputs/notes.txt")]
+    for path in others:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    for count in (3, 2):
+        assert nnap(*plan, "--sequences", count) == 0
+        names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.csv")} - {
+            "inputs/mine.csv",
+            "motion/12.csv",
+        }
+        assert names == {f"{folder}/{i + 1}.csv" for folder in ("inputs", "motion") for i in range(count)}
+    assert [path.read_text() for path in others] == ["mine"] * 3

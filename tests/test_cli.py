@@ -245,7 +245,7 @@ def test_the_learned_friction_is_the_true_one(bench, fit):
     sliding = np.abs(learned["velocity"]) > 0.1  # at rest it takes more data than this
     exact = _slide_law(learned["velocity"])[sliding]
     miss = learned["torque"][sliding] - exact
-    assert np.sqrt(np.mean((miss / learned["torque_std"][sliding]) ** 2)) < 3.0
+    assert 0.1 < np.sqrt(np.mean((miss / learned["torque_std"][sliding]) ** 2)) < 3.0  # nor wider than ten times that
     assert np.sqrt(np.mean(miss**2) / np.mean(exact**2)) < 0.15
 
 
@@ -277,7 +277,7 @@ def test_predictions_hold_the_truth(bench, fit, tmp_path):
         predicted, truth = _read(tmp_path / name), _read(bench / "truth/test" / name)
         ahead = truth["time"] > 0.5 + 1e-6
         z += [(predicted[s] - truth[s])[ahead] / predicted[f"{s}_std"][ahead] for s in ("x", "dx")]
-    assert np.sqrt(np.mean(np.square(z))) < 3.0
+    assert 0.1 < np.sqrt(np.mean(np.square(z))) < 3.0  # an infinite standard deviation contains everything
 
 
 def test_readings_after_the_given_time_change_nothing(bench, fit, tmp_path):

@@ -133,9 +133,10 @@ def test_likelihood_rises_at_the_full_horizon(run):
     full = np.asarray(run.seen) == run.logs.data.t.shape[1]
     loglik = run.fitted.state.loglik[full]
     assert len(loglik) >= 3
-    # `fit` accepts what is at most half a nat worse (noise of a stochastic smoother) and retreats otherwise
-    assert np.all(np.diff(np.maximum.accumulate(loglik)) >= 0) and loglik[-1] >= loglik.max() - 0.5
-    assert loglik[-1] >= loglik[0]
+
+    # the smoother draws nothing: what an epoch loses is the error of its linearisation, of some 600 nats
+    assert np.all(np.diff(loglik) > -0.01)
+    assert loglik[-1] > loglik[0] + 0.1
 
 
 def test_same_seed_same_numbers(run):

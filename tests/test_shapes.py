@@ -166,14 +166,15 @@ def test_noise_is_no_shape():
 
 
 def test_a_curve_without_a_form_is_seldom_given_one():
-    """Random weights that are well known: 20 free numbers, of which a shape may explain 85 % by chance, at most."""
+    """Random weights that are well known: 20 free numbers, of which a shape may explain 85 % by chance, in 8 of 60."""
     named = []
     for seed in range(60):
         weights = jnp.asarray(np.random.default_rng(seed).standard_normal(20))
         effect = catalogue["unknown_function"](weights, ((PART, TURN)[seed % 2],), joint=1)
         form = shape(effect.curve(1e-3 * np.eye(20), PENDULUM))
         named += [form.explains] if form.kind != "smooth" else []
-    assert len(named) <= 12
+
+    assert len(named) <= 8
     assert all(explains > 0.85 for explains in named)
 
 

@@ -55,7 +55,7 @@ UNIT_FACTOR = 1.5
 
 
 TRIANGLE = {HELD: (0.5, 0.5, 0.0), SMOOTH: (1 / 12, 5 / 6, 1 / 12)}
-"""Weights of the row before, a row and the next in the force that a second difference feels, a mean over both intervals
+"""Weights of the row before, a row and the next in the force in a second difference, a mean over both intervals
 with a triangle as its weight: of inputs that are held, and of smooth ones [Numerov 1924]."""
 BLOCKS = 20
 """Blocks of rows whose errors are taken as independent."""

@@ -19,6 +19,7 @@ def _number(x: float, decimal: str = ".") -> str:
 
 
 def _write(path: Path, lines, encoding: str = "utf-8") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode(encoding))
     return path
 

@@ -16,7 +16,6 @@ import jax
 import numpy as np
 import pytest
 from helpers import nnap
-from mcap.reader import make_reader
 
 import nnap_em
 from nnap_em.commands import cli, common
@@ -26,7 +25,6 @@ from nnap_em.commands import smooth as smooth_command
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis.findings import Estimate
-from nnap_em.diagnosis.residual import residual
 from nnap_em.em.loop import FitError
 from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
@@ -305,66 +303,6 @@ def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_
         z += [(smoothed[s] - truth[s][rows]) / smoothed[f"{s}_std"] for s in ("x", "dx")]
     assert np.std(np.concatenate(error)) < 0.8 * np.nanstd(np.concatenate(noise))
     assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 2.0
-
-
-def _messages(path: Path) -> dict[str, list[tuple[int, dict]]]:
-    """Log time [ns] and content of every message, by topic."""
-    topics: dict[str, list[tuple[int, dict]]] = {}
-    with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            content = json.loads(message.data, parse_constant=pytest.fail)
-            assert set(content) <= set(json.loads(schema.data)["properties"])
-            topics.setdefault(channel.topic, []).append((message.log_time, content))
-    return topics
-
-
-def test_viewers_get_the_log_and_what_was_smoothed(bench, fit, tmp_path):
-    path = tmp_path / "smoothed.mcap"
-    assert nnap("smooth", fit, bench / "test", "--out", tmp_path / "csv", "--mcap", path) == 0
-    topics = _messages(path)
-    fitted = load(fit / "model.npz")
-    logs = read_logs(bench / "test", fitted.rig)
-    left = residual(fitted, logs.data)
-    assert set(topics) == {"/log", "/smoothed", "/one_row_ahead", "/missing_force"}
-    stamps = [t for t, _ in topics["/log"]]
-    assert stamps[0] == 0 and (np.diff(stamps) > 0).all()  # sequences follow each other
-    for i, name in enumerate(_files(bench / "test")):
-        log, smoothed = _read(bench / "test" / name), _read(tmp_path / "csv" / name)
-        rows = len(log["time"])
-
-        def column(topic, key, name=name):
-            messages = [m for _, m in topics[topic] if m["file"] == name]
-            return np.array([m.get(key, np.nan) for m in messages])
-
-        for key in ("time", "u", "x"):
-            np.testing.assert_allclose(column("/log", key), log[key], rtol=1e-12)
-        for key in ("x", "dx", "x_std", "dx_std"):
-            np.testing.assert_allclose(column("/smoothed", key), smoothed[key], rtol=1e-11, atol=1e-12)
-        np.testing.assert_array_equal(column("/one_row_ahead", "dx"), left.predicted[i, :rows, 1])
-        np.testing.assert_array_equal(column("/missing_force", "x"), left.force[i, :rows, 0])
-        np.testing.assert_array_equal(column("/missing_force", "x_std"), left.force_std[i, :rows, 0])
-        assert np.isfinite(left.force[i, : rows - 1]).all()
-        times = [t for t, m in topics["/smoothed"] if m["file"] == name]
-        np.testing.assert_allclose(1e-9 * np.diff(times), np.diff(log["time"]), atol=1e-9)
-
-
-def test_viewers_get_the_prediction(bench, fit, tmp_path):
-    path = tmp_path / "predicted.mcap"
-    assert nnap("predict", fit, bench / "test", "--given", "0.4", "--out", tmp_path / "csv", "--mcap", path) == 0
-    topics = _messages(path)
-    written = np.concatenate([_read(tmp_path / "csv" / name)["dx_std"] for name in _files(bench / "test")])
-    assert set(topics) == {"/log", "/predicted"}
-    np.testing.assert_allclose([m["dx_std"] for _, m in topics["/predicted"]], written, rtol=1e-11)
-
-
-@pytest.mark.parametrize("command", [("smooth",), ("predict", "--given", "0.4")], ids=lambda command: command[0])
-def test_mcap_needs_its_package(bench, fit, tmp_path, monkeypatch, capsys, command):
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
-    name, *arguments = command
-    path = tmp_path / "a.mcap"
-    assert nnap(name, fit, bench / "test", *arguments, "--out", tmp_path / "csv", "--mcap", path) == 2
-    assert 'a.mcap: MCAP files cannot be written without mcap; pip install "nnap-em[logs]"' in capsys.readouterr().err
-    assert not _files(tmp_path)
 
 
 def _stop_after(steps: int, monkeypatch):

@@ -29,12 +29,6 @@ T = DT * np.arange(1000)
 DAY = 86400.0
 
 
-@pytest.fixture(autouse=True)
-def _no_delays(monkeypatch):
-    """Delays between topics, whose tests are in `test_import.py`, take most of the time of an import this short."""
-    monkeypatch.setattr("nnap_em.import_.resample.pairs", lambda *_: [])
-
-
 def _columns(t):
     return {"u": np.cos(t), "theta1": np.sin(3 * t), "dtheta1": 3 * np.cos(3 * t)}
 
@@ -59,7 +53,7 @@ def _import(path, more: str = "", shifts=None, rig: str = RIG) -> Resampled:
     rig_file.write_text(rig + more + (TOPICS if path.suffix == ".mcap" else ""))
     declared = read_rig(rig_file, specs)
     plan = read_plan(rig_file, (*declared.logged_inputs, *declared.measured))
-    return resample(path, declared, ("theta1", "dtheta1"), plan, shifts or {})
+    return resample(path, declared, plan, shifts or {})
 
 
 def _notes(log: Resampled) -> str:

@@ -2,6 +2,7 @@
 
 import functools
 import re
+from datetime import UTC, datetime, timedelta
 
 import dialects
 import numpy as np
@@ -13,11 +14,12 @@ from dialects import DT, Q, T, U, V
 from helpers import pendulum_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from recorders import ns, plain_json, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
-from nnap_em.data.rig import read_rig
+from nnap_em.data.rig import RigError, read_rig
 from nnap_em.import_ import text_file
 from nnap_em.import_.columns import resolve
 from nnap_em.import_.declared import read_plan
@@ -43,7 +45,7 @@ def _imported(log, path):
     """The sequences of a log, the columns in the order of the rig."""
     rig = read_rig(path, specs)
     plan = read_plan(path, (*rig.logged_inputs, *rig.measured))
-    values = resample(log, rig, specs[rig.system].states, plan, {}).values
+    values = resample(log, rig, plan, {}).values
     return [np.stack([each[name] for name in (*rig.logged_inputs, *rig.measured)], 1) for each in values]
 
 
@@ -130,6 +132,128 @@ def test_lists_and_episodes_of_lerobot_are_read(tmp_path, fixed):
     for k, table in enumerate(tables):
         rows = slice(k * half, (k + 1) * half)
         np.testing.assert_allclose(table.T, [U[rows], Q[rows], V[rows]], atol=1e-6)
+
+
+DEG = np.pi / 180
+NAMED = {  # the column and its name in the log, mapped as it stands; how many SI units it has, or words of the refusal
+    "degrees": ("theta1", "Angle [deg]", DEG), "degree sign": ("theta1", "Angle (°)", DEG),
+    "underscore": ("theta1", "angle_deg", DEG), "milliradians": ("theta1", "Angle [mrad]", 1e-3),
+    "revolutions": ("theta1", "Angle [rev]", 2 * np.pi), "SI": ("theta1", "Angle [rad]", 1.0),
+    "rpm": ("dtheta1", "Speed [RPM]", np.pi / 30), "U/min": ("dtheta1", "n [U/min]", np.pi / 30),
+    "degrees a second": ("dtheta1", "Rate [deg/s]", DEG), "mN m": ("u", "Torque [mN·m]", 1e-3),
+    "kN m": ("u", "M [kNm]", 1e3), "N m": ("u", "Torque [Nm]", 1.0), "no unit": ("u", "Torque", 1.0),
+    "a letter": ("theta1", "angle_s", 1.0), "a joint": ("theta1", "position[m]", 1.0),
+    "amperes": ("u", "Current [A]", "in A by its name, but N m is read; write [import.columns] u = { from = "
+                "\"Current [A]\", scale = ... } with N m per A, or [input] kind = \"affine\""),
+    "milliamperes": ("u", "current_mA", "in mA by its name, but N m is read"),
+    "volts": ("u", "Drive (V)", "in V by its name, but N m is read"),
+    "metres": ("theta1", "Position [mm]", "in mm by its name, but rad is read"),
+    "a rate": ("theta1", "Rate [rad/s]", "in rad/s by its name, but rad is read"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("column, name, size", NAMED.values(), ids=NAMED)
+def test_a_unit_in_the_name_of_a_mapped_column_scales_it_or_is_refused(tmp_path, column, name, size):
+    """Where the mapping has a scale, that counts."""
+    names = {"theta1": "theta1", "dtheta1": "dtheta1", "u": "u"} | {column: name}
+    log = dialects.table(tmp_path / "a.csv", ",".join(["time", names["u"], names["theta1"], names["dtheta1"]]), COLUMNS)
+    place = ["u", "theta1", "dtheta1"].index(column)
+    if isinstance(size, str):
+        with pytest.raises(DataError) as refused:
+            _imported(log, _rig(tmp_path, {column: f'"{name}"'}))
+        assert size in str(refused.value) and str(log) in str(refused.value)
+    else:
+        (table,) = _imported(log, _rig(tmp_path, {column: f'"{name}"'}))
+        np.testing.assert_allclose(table[:, place], size * COLUMNS[1 + place], rtol=1e-8, atol=1e-8 * size)
+    (table,) = _imported(log, _rig(tmp_path, {column: f'{{ from = "{name}", scale = 3 }}'}))
+    np.testing.assert_allclose(table[:, place], 3 * COLUMNS[1 + place], rtol=1e-8, atol=3e-8)
+
+
+@pytest.mark.parametrize("suffix", ["mat", "parquet", "h5", "mcap"])
+def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
+    columns = {"time": T, "Torque [Nm]": U, "Angle [deg]": np.degrees(Q), "Speed [rpm]": V * 30 / np.pi}
+    log, topic = tmp_path / f"a.{suffix}", "/a:" if suffix in ("h5", "mcap") else ""
+    if suffix == "mat":
+        fields = [(f"Signal {k}", name) for k, name in enumerate(columns)][1:]
+        record = np.zeros(3, [("Name", "O"), ("Data", "O")])
+        for k, (_, name) in enumerate(fields):
+            record[k] = (name, columns[name])
+        axis = np.zeros(1, [("Data", "O")])
+        axis[0] = (T,)
+        scipy.io.savemat(log, {"rec": {"X": axis, "Y": record}})
+    elif suffix == "parquet":
+        pq.write_table(pa.table(columns), log)
+    elif suffix == "h5":
+        write_hdf5(log, {"a": columns})
+    else:
+        rows = zip(*(y.tolist() for y in columns.values()), strict=True)
+        write_mcap(log, {"/a": (plain_json(), ns(T), [dict(zip(columns, row, strict=True)) for row in rows])})
+    names = {"u": "Torque [Nm]", "theta1": "Angle [deg]", "dtheta1": "Speed [rpm]"}
+    (table,) = _imported(log, _rig(tmp_path, {name: f'"{topic}{at}"' for name, at in names.items()}))
+    np.testing.assert_allclose(table[:-1].T, [U[: len(table) - 1], Q[: len(table) - 1], V[: len(table) - 1]], atol=1e-5)
+
+
+def test_a_unit_that_is_not_known_is_named(tmp_path):
+    log = dialects.table(tmp_path / "a.csv", "time,u,Angle [counts],dtheta1", COLUMNS)
+    rig_file = _rig(tmp_path, {"theta1": '"Angle [counts]"'})
+    rig = read_rig(rig_file, specs)
+    notes = resample(log, rig, read_plan(rig_file, (*rig.logged_inputs, *rig.measured)), {}).notes
+    assert "theta1 from 'Angle [counts]': taken in rad, since the unit 'counts' is not known" in notes
+
+
+def test_a_column_of_a_data_set_is_in_the_unit_of_its_name(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.replace('["u"]', '["M [mNm]"]'))
+    with pytest.raises(RigError, match=r"column 'M \[mNm\]': in mNm by its name, but read in N m; call it otherwise"):
+        read_rig(path, specs)
+    path.write_text(RIG.replace('["u"]', '["M [Nm]"]'))
+    assert read_rig(path, specs).input_columns == ("M [Nm]",)
+
+
+MOMENTS = {  # the header, and the texts of a time [s] on 3 November 2026, from before midnight on
+    "date and time": ("Date,Time", lambda day, s: f"{day:%d.%m.%Y},{day:%H:%M}:{s:06.3f}"),
+    "month first": ("Date,Time", lambda day, s: f"{day:%m/%d/%Y},{day:%H:%M}:{s:06.3f}"),
+    "day first": ("Datum,Uhrzeit", lambda day, s: f"{day:%d/%m/%Y},{day:%H:%M}:{s:06.3f}"),
+    "ISO 8601": ("Timestamp", lambda day, s: f"{day:%Y-%m-%dT%H:%M}:{s:06.3f}"),
+    "with a zone": ("t", lambda day, s: f"{day:%Y-%m-%d %H:%M}:{s:06.3f}+01:00"),
+    "AM and PM": ("Date/Time", lambda day, s: f"{day:%d-%b-%Y %I:%M}:{s:06.3f} {day:%p}"),
+    "time of day": ("Time [hh:mm:ss]", lambda day, s: f"{day:%H:%M}:{s:06.3f}"),
+    "seconds of the day": ("time", lambda day, s: f"{day.hour * 3600 + day.minute * 60 + s:.3f}"),
+    "one column called date": ("Date", lambda day, s: f"{day:%Y/%m/%d %H:%M}:{s:06.3f}"),
+}
+
+
+@pytest.mark.parametrize("header, text", MOMENTS.values(), ids=MOMENTS)
+@pytest.mark.parametrize("separator, decimal", [(",", "."), (";", ",")])
+def test_runs_of_one_file_with_times_of_day_are_sequences(tmp_path, header, text, separator, decimal):
+    """Three runs of 4 s with silences of 20 s, over midnight."""
+    start = datetime(2026, 11, 3, 23, 59, 40, tzinfo=UTC)
+    moments = np.concatenate([T[:100] + 20.4 * k for k in range(3)])
+    rows = [f"{header},u,theta1,dtheta1".replace(",", separator)]
+    for t, u, q, v in zip(moments, *(np.tile(y[:100], 3) for y in (U, Q, V)), strict=True):
+        day = start + timedelta(seconds=round(float(t), 3) // 1)
+        stamp = text(day, day.second + round(float(t) % 1, 3))
+        numbers = [f"{x:.9g}".replace(".", decimal) for x in (u, q, v)]
+        fields = stamp.split(",") if ":" in stamp else [stamp.replace(".", decimal)]
+        rows.append(separator.join([*fields, *numbers]))
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    tables = _imported(tmp_path / "a.csv", _rig(tmp_path))
+    assert [len(table) for table in tables] == [100, 100, 100]
+    for table in tables:
+        np.testing.assert_allclose(table.T, [U[:100], Q[:100], V[:100]], atol=1e-6)
+
+
+@pytest.mark.parametrize("separator, decimal", [(",", "."), (";", ",")])
+def test_episodes_without_times_are_sequences(tmp_path, separator, decimal):
+    episode = np.repeat([0, 1], len(T) // 2)
+    names = separator.join(("episode_index", "u", "theta1", "dtheta1"))
+    log = dialects.table(tmp_path / "train/a.csv", names, (episode, U, Q, V), separator, decimal)
+    tables = _imported(log, _rig(tmp_path))
+    assert [len(table) for table in tables] == [100, 100]
+    np.testing.assert_allclose(tables[1].T, [U[100:], Q[100:], V[100:]], atol=2e-8)
+    if separator == ",":
+        with pytest.raises(DataError, match=r"line 102, column 'episode_index': another episode begins; `nnap-em im"):
+            read_logs(log.parent, read_rig(tmp_path / "rig.toml", specs))
 
 
 DATASET = functools.partial(dialects.matlab_object, name="logsout", kind="Simulink.SimulationData.Dataset")

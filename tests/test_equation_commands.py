@@ -135,19 +135,6 @@ def test_fits_of_other_equations_are_not_compared(place, monkeypatch, capsys):
     assert "the equations of monday and other differ; compare fits of one machine" in capsys.readouterr().err
 
 
-def test_smoothed_states_go_to_channels(place, monkeypatch):
-    monkeypatch.chdir(place)
-    assert main(["smooth", "monday", "monday_logs/test", "--out", "smoothed", "--mcap", "smoothed.mcap"]) == 0
-    from mcap.reader import make_reader
-
-    with (place / "smoothed.mcap").open("rb") as file:
-        messages = [(c.topic, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
-    columns = {topic: set(message) - {"file", "time"} for topic, message in messages[:4]}
-    assert columns["/missing_force"] == {"a", "b", "a_std", "b_std"}
-    assert columns["/one_row_ahead"] == {"a", "b"}
-    assert columns["/log"] == {"u", "y"}
-
-
 def test_a_simulation_of_a_fit_is_that_of_its_transition(place):
     model = dataclasses.replace(nnap_em.load(place / "monday" / "model.npz").model, substeps=10)
     still = eqx.tree_at(lambda m: (m.log_q, m.log_r), model, (jnp.full(2, -60.0), jnp.full(1, -60.0)))

@@ -24,10 +24,9 @@ from recorders import (
     write_mcap,
 )
 
-from nnap_em.data.dataset import DataError, pad
+from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import Logs
-from nnap_em.import_ import codecs, mcap_writer
+from nnap_em.import_ import codecs
 from nnap_em.import_.files import reader
 from nnap_em.import_.objects import flatten, pick
 
@@ -345,23 +344,3 @@ def test_without_the_library_of_the_chunks_the_message_names_it(tmp_path, monkey
     monkeypatch.setattr(f"mcap.stream_reader.{module}", None)
     with pytest.raises(DataError, match=rf'packed by {packing}, .*pip install "nnap-em\[logs\]"'):
         _read(path, js=("position[elbow]",))
-
-
-@pytest.mark.parametrize(("start", "follows"), [((0.0, 0.0), 3.99), ((-1.0, -1.0), 3.99), ((1.7e9, 1.7e9 + 60), 60.0)])
-def test_written_channels_are_read_back(tmp_path, start, follows):
-    """On the clock of the logs, or one sequence after the other where each has its own."""
-    sequences = [(at + T, U[:, None], Q) for at in start]
-    data = pad([sequences[0], tuple(a[:100] for a in sequences[1])])
-    columns = np.stack([data.y[..., 0], data.y[..., 1]], axis=-1)
-    columns[0, 5, 1] = np.nan
-    path = tmp_path / "a.mcap"
-    channel = mcap_writer.Channel({"shoulder": "rad", "elbow": "rad"}, columns)
-    mcap_writer.write_mcap(path, Logs(("a.csv", "b.csv"), data, ("u", "s", "e")), {"/q": channel})
-    track = _read(path, q=("time", "shoulder", "elbow"))["/q"]
-    rows = np.asarray(data.valid)
-    np.testing.assert_array_equal(track.values["time"], data.t[rows])
-    np.testing.assert_array_equal(track.values["shoulder"], columns[rows][:, 0])
-    np.testing.assert_array_equal(track.values["elbow"], columns[rows][:, 1])  # what is missing is left out
-    since = 1e-9 * (track.t - track.t[0])
-    np.testing.assert_allclose(since, np.concatenate([T, follows + T[:100]]), atol=1e-6)
-    assert track.t[0] == round(max(start[0], 0.0) * NS)

@@ -134,7 +134,6 @@ def parser() -> argparse.ArgumentParser:
         _file(use, "model", "MODEL", "model.npz, or the folder that holds it")
         _file(use, "folder", "FOLDER", "the logs, such as bench/test")
         _file(use, "--out", "DIR", "folder for the CSV files", required=True)
-        _file(use, "--mcap", "FILE", "write the log and the results as MCAP, too")
     predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
     predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
 

@@ -21,7 +21,6 @@ from ..data.dataset import DataError, Dataset
 from ..data.formats import has_logs, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
-from ..diagnosis.residual import names_of
 from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
 from ..experiment.limits import DesignError
@@ -31,7 +30,6 @@ from ..fit.identify import Identified
 from ..fit.known import differences
 from ..fit.predict import GIVEN
 from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read
-from ..import_.mcap_writer import Channel
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
@@ -223,19 +221,6 @@ def remove_reports(out: Path) -> None:
     """Remove reports that are not of the models which are written now."""
     for name in REPORTS:
         (out / name).unlink(missing_ok=True)
-
-
-def states_of(fitted: Identified, mean, std) -> Channel:
-    """Mean and standard deviation of all states as a channel."""
-    units = {name: names_of(fitted).unit(name) for name in fitted.model.system.readable}
-    return Channel(units | {f"{name}_std": unit for name, unit in units.items()}, np.concatenate([mean, std], axis=-1))
-
-
-def log_of(fitted: Identified, logs: Logs) -> Channel:
-    """Inputs and readings of the logs as a channel, masked readings too."""
-    data, names = logs.as_read, names_of(fitted)
-    values = np.concatenate([np.asarray(data.u)[..., : len(names.inputs)], np.asarray(data.y)], axis=-1)
-    return Channel({name: names.unit(name) for name in (*names.inputs, *names.measured)}, values)
 
 
 # --- runs that go on after a stop

@@ -6,9 +6,9 @@ examples:
   nnap-em import day1.mcap day2.mcap --rig rig.toml --out bench --test 0.2 --shift /joint_states=-0.012
 
 Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and reports rates,
-jitter, gaps, delays between topics and rows used in FOLDER/import.html.  Where columns come from stands in the
-table [import.columns] of rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf) and HDF5 need
-pip install "nnap-em[logs]".
+jitter, gaps and rows used in FOLDER/import.json.  Where columns come from stands in the table [import.columns] of
+rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf) and HDF5 need pip install
+"nnap-em[logs]".
 """
 
 import argparse
@@ -16,15 +16,17 @@ import os
 import re
 import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from ..data.rig import read_rig, toml_text
-from ..em.build import build_system
 from ..import_.declared import read_plan
 from ..import_.folder import completed, places, write_sequences
-from ..import_.resample import resample
+from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted
-from ..report.imported import describe, write_page
+from ..report.document import versions
+from ..report.tables import write_json
 from ..storage.files import replace_text, whole_folder
 from ..storage.log import Log
 from ..systems import specs
@@ -39,20 +41,55 @@ def run(args: argparse.Namespace, log: Log) -> None:
         shifts = dict(args.shift)
         logs = []
         for path in args.logs:
-            logs.append(resample(path, rig, build_system(rig).states, plan, shifts, args.unwrap))
+            logs.append(resample(path, rig, plan, shifts, args.unwrap))
             used = [stretch.rows for stretch in logs[-1].sequences if not stretch.why]
             log(f"{path}: {counted(len(used), 'sequence')}, {sum(used)} of {logs[-1].rows} rows")
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
         text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
         replace_text(part / "rig.toml", completed(text, logs[0].addresses))
-        document = describe(logs, files, rig, plan, shifts, seconds=time.perf_counter() - began)
-        write_page(part, document)
+        names = iter(files)
+        entries = [_entry(each, names) for each in logs]
+        rows = sum(s["rows"] for each in entries for s in each["sequences"] if s["file"])
+        document = {
+            "format": 1,
+            "rig": rig.name,
+            "dt": rig.dt,
+            "input": "mean" if plan.mean else "hold",
+            "shifts": shifts,
+            "rows_used": rows,
+            "rows_dropped": sum(each["rows"] for each in entries) - rows,
+            "logs": entries,
+            "look": [line for each in logs for line in _remarks(each)],
+            "seconds": time.perf_counter() - began,
+            "versions": versions(),
+        }
+        write_json(part / "import.json", document)
     for line in document["look"]:
         log(f"warning: {line}")
     test = sum(file.startswith("test/") for file in files)
     amount = f"{len(files) - test} training and {counted(test, 'test sequence')}"
-    log(f"wrote {amount} to {args.out}; read {args.out / 'import.html'}")
+    log(f"wrote {amount} to {args.out}; numbers in {args.out / 'import.json'}")
+
+
+def _entry(log: Resampled, files: Iterator[str]) -> dict[str, Any]:
+    """A log in import.json; times in seconds after its first message."""
+    return {
+        "file": log.path.name,
+        "origin_ns": log.origin,
+        "columns": {name: {"from": str(at), "scale": at.scale} for name, at in log.addresses.items()},
+        "topics": log.topics,
+        "rows": log.rows,
+        "sequences": [{**s._asdict(), "file": None if s.why else next(files)} for s in log.sequences],
+        "notes": log.notes,
+    }
+
+
+def _remarks(log: Resampled) -> Iterator[str]:
+    """Warnings for the owner before a fit."""
+    for topic in log.topics:
+        yield from (f"{log.path.name}: {topic.name or 'the table'}: {note}" for note in topic.notes)
+    yield from (f"{log.path.name}: {note}" for note in log.notes)
 
 
 def _reaching(text: str, folder: Path, out: Path) -> str:

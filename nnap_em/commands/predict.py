@@ -5,8 +5,7 @@ examples:
   nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
 
 Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
-time, all states, and their standard deviations without measurement noise.  The file of --mcap gets the topics /log and
-/predicted, for Foxglove and other viewers.
+time, all states, and their standard deviations without measurement noise.
 """
 
 import argparse
@@ -19,16 +18,13 @@ from ..data.logs import DataWarning, read_logs
 from ..diagnosis.keys import listed
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
-from ..import_.mcap_writer import require_mcap, write_mcap
 from ..numerics.digits import counted
 from ..storage.log import Log
-from .common import log_of, states_of, write_states
+from .common import write_states
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write the distribution of every state after the readings up to the given time."""
-    if args.mcap is not None:
-        require_mcap(args.mcap)
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
     known, valid = given_samples(logs.data, args.given), np.asarray(logs.data.valid)
@@ -39,6 +35,3 @@ def run(args: argparse.Namespace, log: Log) -> None:
     mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")
-    if args.mcap is not None:
-        write_mcap(args.mcap, logs, {"/log": log_of(fitted, logs), "/predicted": states_of(fitted, mean, std)})
-        log(f"wrote {args.mcap}")

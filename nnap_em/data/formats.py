@@ -5,7 +5,6 @@ import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -17,6 +16,7 @@ from jaxtyping import Float, Real
 from ..numerics.digits import counted
 from ..storage.files import replace_text
 from .dataset import Array, DataError
+from .dates import dated, moments
 from .mat_structs import mat_columns
 from .rig import nearest
 from .units import is_time
@@ -396,28 +396,12 @@ def numbers(
         if plain and decimal == "." and "_" not in "".join(texts):
             return values
     dates = dates and math.isinf(number(texts[0], decimal))
-    values = np.array([seconds(text) if dates else number(text, decimal) for text in texts])
+    values = moments(texts) if dates else np.array([number(text, decimal) for text in texts])
     wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (not gaps)))
     if wrong.size:
         k = int(wrong[0])
         _no_number(path, f"line {lines[k]}, column {name!r}", repr(texts[k]), math.isnan(values[k]), gaps)
     return values
-
-
-def seconds(text: str) -> float:
-    """Seconds since 1970 of a date and a time of ISO 8601, UTC where it names no zone; infinite for another text."""
-    try:
-        moment = datetime.fromisoformat(text.strip().strip('"').replace("/", "-"))
-    except ValueError:
-        return math.inf
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
-def dated(values: np.ndarray) -> Float[np.ndarray, " time"]:
-    """Seconds since 1970 of dates or of their texts; infinite for another text."""
-    if values.dtype.kind in "Mm":
-        return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) * 1e-9
-    return np.array([seconds(text.decode() if isinstance(text, bytes) else str(text)) for text in values.tolist()])
 
 
 def _no_number(path: Path, where: str, text: str, missing: bool, gaps: bool) -> NoReturn:

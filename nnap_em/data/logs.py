@@ -20,7 +20,7 @@ from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
-from .units import other_unit
+from .units import is_episode, other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
@@ -256,6 +256,10 @@ def _read_table(path: Path, rig: Rig) -> _Table:
     names = column_names(path)
     clock = ("time",) if "time" in names or untimed(path, names) else ()
     table = read_table(path, (*clock, *rig.logged_inputs), rig.measured)
+    for name in filter(is_episode, names):
+        if changes := np.flatnonzero(np.diff(read_table(path, (name,))[:, 0])).tolist():
+            hint = "`nnap-em import` it: each becomes a sequence"
+            refuse(path, place(path, name, changes[0] + 1), "another episode begins", hint)
     if not clock:
         problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
         warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)

@@ -20,7 +20,7 @@ from .servo import AT, TORQUE, Drive, key_of, read_drives, scaled
 from .servo import keys as drive_keys
 from .servo import lines as drive_lines
 from .servo import named as drive_numbers
-from .units import parameter_unit, quantities, with_names
+from .units import factor, named_unit, parameter_unit, quantities, with_names
 
 _HINTS = {  # how the line of a key or table should look
     "format": "format = 1",
@@ -159,6 +159,17 @@ class Rig:
             return _units(self.equations).get(name, "")
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
 
+    def column_unit(self, name: str) -> str:
+        """The unit in which a column of the logs is read; empty where any may be meant."""
+        if self.equations or name in self.measured:
+            return self.unit(name)
+        kind, gear = self.kinds.get(name, ""), 1.0
+        if self.machine and kind == TORQUE:
+            gear = unpacked(self.machine).gears[self.input_columns.index(name)]
+        units = {TORQUE: "N m" if gear == 1 else "", "position": "rad", "velocity": "rad/s", "voltage": "V"}
+        unit = units.get(kind, "")
+        return unit if not unit or self._turns(name) else unit.replace("N m", "N").replace("rad", "m")
+
     def _turns(self, column: str) -> bool:
         """True where an input drives an angle; without a file, by the names of the readings."""
         joint = self.input_joints[self.input_columns.index(column)] - 1
@@ -214,7 +225,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     kinds = ("unknown", "dynamic", "none")
     friction = "none" if declaration.equations else model.choice("friction", kinds)
     clocks = ("sequence", "session")
-    return Rig(
+    rig = Rig(
         name=root.text("name"),
         system=system,
         parameters=declaration.parameters,
@@ -237,6 +248,12 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         horizon=sampling.positive("horizon") if "horizon" in sampling.items else None,
         file=declaration.file,
     )
+    for column in (*rig.logged_inputs, *rig.measured):
+        named, unit = named_unit(column, brackets=True)[1], rig.column_unit(column)
+        if named and factor(named, unit) not in (1.0, None):
+            hint = f'call it otherwise, and let `nnap-em import` read it: [import.columns] NAME = "{column}"'
+            raise RigError(f"{path}: column {column!r}: in {named} by its name, but read in {unit}; {hint}")
+    return rig
 
 
 def write_rig(rig: Rig, path: Path | str) -> None:

@@ -1,7 +1,9 @@
 """SI units: of parameters and states by their names, of what belongs to an angle or to a position."""
 
+import functools
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 _UNIT_OF = {  # of parameters and states, by their names
@@ -10,31 +12,101 @@ _UNIT_OF = {  # of parameters and states, by their names
 }  # fmt: skip
 UNITS = {
     "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "µs": 1e-6,
-    "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "days": 86400.0,
+    "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "min": 60.0, "h": 3600.0, "days": 86400.0,
 }  # fmt: skip
 """Seconds in the units of times."""
-SIZES = {  # units at the end of a name: the SI unit, and how many of it
-    "deg/s": ("rad/s", math.pi / 180), "°/s": ("rad/s", math.pi / 180), "deg": ("rad", math.pi / 180),
-    "°": ("rad", math.pi / 180), "rpm": ("rad/s", math.pi / 30), "mm/s": ("m/s", 1e-3), "mm": ("m", 1e-3),
-    "mnm": ("N m", 1e-3), "nmm": ("N m", 1e-3), "rad/s": ("rad/s", 1.0), "rad": ("rad", 1.0), "m/s": ("m/s", 1.0),
-    "nm": ("N m", 1.0), "n m": ("N m", 1.0), "n": ("N", 1.0), "m": ("m", 1.0),
-    **{unit: ("s", size) for unit, size in UNITS.items()},
+_SIZES = {  # names of units, how many of another unit each is, and that one; of itself: nothing simpler
+    **{unit: (size, "s") for unit, size in UNITS.items()}, "Hz": (1.0, "1/s"),
+    **dict.fromkeys(("deg", "°", "degree", "degrees", "Grad"), (math.pi / 180, "rad")), "radians": (1.0, "rad"),
+    **dict.fromkeys(("turn", "turns", "rev", "U"), (2 * math.pi, "rad")), "rpm": (math.pi / 30, "rad/s"),
+    **dict.fromkeys(("nm", "Nm"), (1.0, "N m")), "Ncm": (0.01, "N m"), "Nmm": (1e-3, "N m"), "in": (0.0254, "m"),
+    "lbf": (4.4482216, "N"), "kgf": (9.80665, "N"), "ozin": (7.0615518e-3, "N m"), "g": (9.80665, "m/s^2"),
+    "bar": (1e5, "Pa"), "l": (1e-3, "m^3"),
+    **{unit: (1.0, unit) for unit in ("rad", "m", "s", "N", "kg", "A", "V", "W", "ohm", "Pa", "K", "°C")},
 }  # fmt: skip
-_TIME_NAMES = re.compile(r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|zeit|zeitstempel)", re.IGNORECASE)
+_PREFIXES = {"k": 1e3, "M": 1e6, "d": 0.1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+_WORDS = ("deg/s", "°/s", "deg", "°", "rpm", "mm/s", "mm", "mnm", "nmm", "rad/s", "rad", "m/s", "nm", "n m", "n", "m",
+          "ma", *UNITS)  # fmt: skip
+_TIME_NAMES = re.compile(
+    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|(?:uhr|datum[ _/]*)?zeit|zeitstempel|date[ _/]*time)",
+    re.IGNORECASE,
+)
 """Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""
-_UNIT = re.compile(rf"(.+?)(?:[ _,]*[\[(]|[ _,]+)({'|'.join(SIZES)})[\])]?$", re.IGNORECASE)
+_UNIT = re.compile(r"(?!(?:.*[./:])?(?:position|velocity|effort|data)\[)(.+?)[ _,]*[\[(]([^][()]+)[\])]")
+_WORD = re.compile(rf"(.+?)[ _,]+({'|'.join(_WORDS)})", re.IGNORECASE)
 
 
 def named_unit(name: str, *, brackets: bool = False) -> tuple[str, str]:
-    """A name without the unit at its end, and that unit as in `SIZES`, or nothing; `brackets`: only in such."""
-    match = None if brackets and name[-1:] not in ("]", ")") else _UNIT.match(name)
-    return (match[1], match[2].lower()) if match else (name, "")
+    """A name without the unit at its end, and that unit, or nothing; `brackets`: only in such.
+
+    In the brackets behind an array of joints are names: `position[m]`.
+    """
+    match = _UNIT.fullmatch(name)
+    if match is None or _parsed(match[2]) is None:
+        match = None if brackets else _WORD.fullmatch(name)
+    if match is None:
+        return name, ""
+    return match[1], match[2].lower() if match[2].lower() in UNITS else match[2]
+
+
+def si(unit: str) -> tuple[str, float]:
+    """The SI unit of a unit, where it has a usual name here, and how many of that it is; of an unknown one 1."""
+    usual = ("rad/s", "rad", "m/s", "m", "N m", "N", "s", "m/s^2")
+    alike = (known for known in usual if not math.isnan(factor(unit, known) or math.nan))
+    return next(alike, ""), (_parsed(unit) or (1.0,))[0]
+
+
+def factor(unit: str, other: str) -> float | None:
+    """How many of the other unit one is; NaN where they measure different things, None where one is unknown."""
+    one, two = _parsed(unit), _parsed(other)
+    if one is None or two is None:
+        return None
+    return one[0] / two[0] if one[1] == two[1] else math.nan
+
+
+@functools.cache
+def _parsed(unit: str) -> tuple[float, dict[str, int]] | None:
+    """Size of a unit such as `mm/s^2` or `mN m`, and powers of the simple units in it; None where one is unknown."""
+    size, of = _SIZES.get(unit) or (_PREFIXES.get(unit[:1], 0.0) * _SIZES.get(unit[1:], (0.0, ""))[0], "")
+    if size:
+        of = of or _SIZES[unit[1:]][1]
+        inner = (1.0, {of: 1}) if _SIZES.get(of) == (1.0, of) else _parsed(of)
+        return inner and (size * inner[0], inner[1])
+    text = re.sub(r"^1/", "/", unit.replace("²", "^2").replace("³", "^3"))
+    text = re.sub(r"(?<=[^\W\d])(-[1-4]|(?<=/s)[23])$", r"^\1", text)
+    factors = re.findall(r"(/|^|[ *·.])\s*([^/ *·.]+)", text)
+    if len(factors) < 2 and text[:1] != "/" and "^" not in text:
+        return _parsed(unit.lower()) if unit != unit.lower() else None
+    size, powers, sign = 1.0, Counter[str](), 1
+    for mark, part in factors:
+        sign = -1 if mark == "/" else sign
+        name, _, power = part.partition("^")
+        one = _parsed(name)
+        if one is None or not re.fullmatch(r"(-?[1-4])?", power):
+            return None
+        times = sign * int(power or 1)
+        size *= one[0] ** times
+        for base, exponent in one[1].items():
+            powers[base] += times * exponent
+    return size, {name: power for name, power in powers.items() if power}
 
 
 def is_time(name: str) -> bool:
-    """True for the name of a column of times, which may end in a unit of times."""
+    """True for the name of a column of times, which may end in a unit of times, or in their format in brackets."""
     word, unit = named_unit(name)
-    return bool(_TIME_NAMES.fullmatch(word)) and (not unit or unit in UNITS)
+    return bool(_TIME_NAMES.fullmatch(re.sub(r"\s*[\[(][^][()]*[\])]$", "", word))) and (not unit or unit in UNITS)
+
+
+def clock_of(names: Sequence[str]) -> tuple[str | None, str | None]:
+    """The column of the times, and that of the dates beside it, which alone is the times."""
+    time = next((name for name in names if is_time(name)), None)
+    day = next((name for name in names if re.fullmatch(r"_*dat(e|um)", name.strip(), re.IGNORECASE)), None)
+    return (time, day) if time else (day, None)
+
+
+def is_episode(name: str) -> bool:
+    """True for the name of a column that counts the sequences of a file."""
+    return bool(re.fullmatch(r"episode(_index|_id)?", name, re.IGNORECASE))
 
 
 def parameter_unit(name: str) -> str:

@@ -1,18 +1,21 @@
 """The times of a topic: their order, stamps of other clocks, and which clock to take."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Real
 
+from ..data.dataset import Array
 from ..data.units import UNITS
 from ..numerics.digits import counted
 from .recording import SECOND, Lag, Track, refuse
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
+DAY = 86400.0
+"""s."""
 RUNS = 4096
 """Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
 
@@ -77,13 +80,18 @@ def rising(path: Path, where: str, t: Int[np.ndarray, " m"], name: str, noun: st
     return _clock(t, kept, name, noun)
 
 
-def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) -> Int[np.ndarray, " row"]:
-    """Times in ns, of a unit in `UNITS` or else of that which their size shows.
+def nanoseconds(
+    path: Path, where: str, t: Real[np.ndarray, " row"], unit: str, days: Callable[[], Array] | None = None
+) -> Int[np.ndarray, " row"]:
+    """Times in ns, of a unit in `UNITS` or else of that which their size shows; `days` [s]: the midnight before each.
 
-    Raises DataError, with the unit, where they are too large for the unit.
+    Times of the day go on over midnight.  Raises DataError, with the unit, where they are too large for the unit.
     """
     if not np.isfinite(t).all():
         refuse(path, where, "holds times that are no numbers", "cut the rows without a time")
+    steps = np.diff(t)
+    if unit in ("", "s") and (steps < 0).any() and t.min() >= 0 and t.max() < DAY:
+        t = t + (days() if days else DAY * np.append(0, np.cumsum(steps < -DAY / 2)))
     # Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms
     since_1970 = (1.0e9, 4.1e9)
     low, high = since_1970
@@ -102,6 +110,15 @@ def nanoseconds(path: Path, where: str, t: Real[np.ndarray, " row"], unit: str) 
         return np.clip(t.astype(np.int64), -latest // each, latest // each) * each
     t = t * (UNITS[unit] * SECOND)
     return np.round(np.clip(t, -latest, latest, out=t), out=t).astype(np.int64)
+
+
+def in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> Int[np.ndarray, " row"]:
+    """The times of episodes whose clocks restart, one after the other, with a silence between that is a gap."""
+    steps = np.diff(t)
+    new = np.diff(episode) != 0
+    usual = np.mean(steps[~new]) if not new.all() else SECOND  # of single precision, the mean is exact
+    # Intervals between two episodes: more than the 5 of a gap, and few enough for rows of the grid to stay in step
+    return t[0] + np.append(0, np.cumsum(np.where(new, round(100 * usual), steps)))
 
 
 def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
@@ -125,7 +142,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     if weight.sum() - weight[chain].sum() > budget:
         return None
     # Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * 86400.0 * SECOND))
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * DAY * SECOND))
     size = np.bincount(groups, weight[chain])
     few = (size < 50) & (size <= budget)  # wrong times beyond a silence at most: as many rows as a sequence needs
     if few.any() and not few.all() and size[few].sum() <= budget:

@@ -1,11 +1,14 @@
-"""Addresses of the columns of a rig in a log: as declared, or by their names."""
+"""Addresses of the columns of a rig in a log: as declared, or by their names, in the unit that these end in."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..data.dataset import DataError
-from .recording import Address, Topic, field_of, near, places
+from ..data.rig import Rig
+from ..data.units import UNITS, factor, named_unit
+from .recording import Address, Topic, field_of, near, places, refuse
 
 
 def resolve(
@@ -34,11 +37,33 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
     return address._replace(path=field_of(path, topic, address.path, where))
 
 
+def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, str]:
+    """The address with its scale, that of the unit in its name where none is declared, and a note where that counts.
+
+    Raises DataError where the unit is of another quantity than the column.
+    """
+    named, unit = named_unit(at.path)[1], rig.column_unit(column)
+    times = factor(named, unit) if named and at.scale is None else None
+    sure = at.path[-1] in "])" or (len(named) > 1 and named not in UNITS)  # x_s, tau_m: a letter may mean anything
+    if times is not None and math.isnan(times) and sure:
+        hint = f'write [import.columns] {column} = {{ from = "{at}", scale = ... }} with {unit} per {named}'
+        current = ', or [input] kind = "affine" with its gain' if column in rig.input_columns else ""
+        where, problem = f"column {column!r} from {str(at)!r}", f"in {named} by its name, but {unit} is read"
+        refuse(path, where, problem, hint + current)
+    if times is not None and not math.isnan(times):
+        return at._replace(scale=times), f"{column} from {str(at)!r}: {times:.6g} {unit} per {named}" * (times != 1)
+    other = re.search(r"\s[\[(]([^][()]+)[\])]$", at.path) if at.scale is None and unit and not named else None
+    note = f"{column} from {str(at)!r}: taken in {unit}, since the unit {other[1]!r} is not known" if other else ""
+    return at._replace(scale=at.scale or 1.0), note
+
+
 def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
     """The one place whose name is that of the column: a field, or a joint of an array of joints."""
     names = set(_names(column, is_input))
     every = [Address(topic.name, field) for topic in topics for field in topic.fields]
-    addresses = [at for at in every if at.path in names] or [at for at, word in places(topics) if word in names]
+    addresses = [at for at in every if at.path in names] or [
+        at._replace(scale=None) for at, word in places(topics) if word in names
+    ]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
         raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {_nearest(column, every)}")

@@ -14,8 +14,6 @@ class Plan(NamedTuple):
 
     columns: Mapping[str, Address]
     """Addresses of columns; an absent one is found by its name."""
-    duplicates: Mapping[str, Address]
-    """The quantity of a column on another topic, used for their delay only."""
     mean: bool
     """Inputs averaged over the sample, instead of the value held at the row."""
     gap: float | None
@@ -36,21 +34,20 @@ def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
     Raises RigError at the first mistake.
     """
     table = whole_table(path).table("import", absent={})
-    keys = ("columns", "duplicates", "input", "gap", "shortest", "longest")
+    keys = ("columns", "input", "gap", "shortest", "longest")
     table.check((), keys)
     inputs = ("hold", "mean")
     return Plan(
-        _addresses(table, "columns", columns),
-        _addresses(table, "duplicates", columns),
+        _addresses(table, columns),
         "input" in table.items and table.choice("input", inputs) == inputs[1],
         *(_seconds(table, key) for key in ("gap", "shortest", "longest")),
     )
 
 
-def _addresses(table: Any, key: str, columns: tuple[str, ...]) -> dict[str, Address]:
-    if not isinstance(table.items.get(key, {}), dict):
-        table.refuse(key, hint=f"write a table [import.{key}]")
-    inside = table.table(key, absent={})
+def _addresses(table: Any, columns: tuple[str, ...]) -> dict[str, Address]:
+    if not isinstance(table.items.get("columns", {}), dict):
+        table.refuse("columns", hint="write a table [import.columns]")
+    inside = table.table("columns", absent={})
     inside.check((), columns)
     return {name: _address(inside, name) for name in inside.items}
 
@@ -58,13 +55,14 @@ def _addresses(table: Any, key: str, columns: tuple[str, ...]) -> dict[str, Addr
 def _address(table: Any, name: str) -> Address:
     value = table.items[name]
     entry = value if isinstance(value, dict) else {"from": value}
-    text, scale = entry.get("from"), entry.get("scale", 1.0)
+    text, scale = entry.get("from"), entry.get("scale")
     if not isinstance(text, str) or not address(text)[1] or set(entry) - {"from", "scale"}:
         hint = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.001 }'
         table.refuse(name, hint=hint)
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0:
+    wrong = isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0
+    if wrong and scale is not None:
         table.refuse(name, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
-    return Address(*address(str(text)), float(scale))
+    return Address(*address(str(text)), scale)
 
 
 def _seconds(table: Any, key: str) -> float | None:

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
-from ..data.formats import dated, unreadable
+from ..data.dates import dated
+from ..data.formats import unreadable
 from ..data.units import UNITS, is_time, named_unit
 from .clock import nanoseconds, rising
 from .objects import LISTED_ENTRIES
@@ -54,7 +55,7 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
 
 def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
     """One column, read in blocks: neighbours of a wide data set are not kept."""
-    name, _, index = field.removesuffix("]").partition("[")
+    name, _, index = (field, "", "") if field in group else field.removesuffix("]").rpartition("[")
     data = group[name]
     if data.ndim == 1:
         return data[:].astype(np.float64)

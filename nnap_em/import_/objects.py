@@ -20,8 +20,12 @@ def flatten(message: Any) -> dict[str, float]:
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
     at, parent = message, None
+    while isinstance(at, Mapping) and path not in at and isinstance(at.get(path.partition(".")[0]), Mapping):
+        head, _, path = path.partition(".")
+        at = at[head]
+    whole = isinstance(at, Mapping) and path in at  # its name may have brackets
     try:
-        for step in steps(path):
+        for step in [path] if whole else steps(path):
             if isinstance(step, int):
                 at = at[step]
             elif step.startswith("["):

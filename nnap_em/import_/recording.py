@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..data.formats import refuse
 from ..data.rig import nearest, toml_text
-from ..data.units import SIZES, named_unit
+from ..data.units import named_unit, si
 from ..numerics.digits import counted
 
 EXTRA = 'pip install "nnap-em[logs]"'
@@ -84,8 +84,8 @@ class Address(NamedTuple):
 
     topic: str
     path: str
-    scale: float = 1.0
-    """SI unit per unit of the log."""
+    scale: float | None = None
+    """SI unit per unit of the log; None: by the unit in the path."""
 
     def __str__(self) -> str:
         return f"{self.topic}:{self.path}" if self.topic else self.path
@@ -94,7 +94,7 @@ class Address(NamedTuple):
     def toml(self) -> str:
         """The value of a line in [import.columns]."""
         text = toml_text(str(self))
-        return text if self.scale == 1.0 else f"{{ from = {text}, scale = {self.scale:.9g} }}"
+        return text if self.scale in (1.0, None) else f"{{ from = {text}, scale = {self.scale:.9g} }}"
 
 
 def address(text: str) -> tuple[str, str]:
@@ -118,12 +118,13 @@ def last_word(path: str) -> str:
 def word_of(field: str) -> tuple[str, float]:
     """The end of the path, and the SI units in the unit that stands behind it in brackets."""
     name, unit = named_unit(field, brackets=True)
-    return last_word(name), SIZES.get(unit, ("", 1.0))[1]
+    return last_word(name), si(unit)[1]
 
 
 def places(topics: Iterable[Topic]) -> list[tuple[Address, str]]:
     """All numbers of a log, in SI units where these are known, with the last words of their paths."""
-    return [(Address(t.name, field, word_of(field)[1]), word_of(field)[0]) for t in topics for field in t.fields]
+    every = [(t.name, field, *word_of(field)) for t in topics for field in t.fields]
+    return [(Address(topic, field, None if size == 1 else size), word) for topic, field, word, size in every]
 
 
 def steps(path: str) -> Iterator[str | int]:

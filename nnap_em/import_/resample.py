@@ -1,7 +1,7 @@
 """One log on the grid of its rig: columns, sequences, and an account of what was done."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +13,9 @@ from ..data.dataset import DataError
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
-from .columns import declared_at, resolve
+from .columns import in_unit, resolve
 from .common_clock import on_one_clock
 from .declared import LONGEST, Plan
-from .delays import Delay, delay, pairs
 from .files import read, reader
 from .readings import as_taken
 from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
@@ -83,7 +82,6 @@ class Resampled(NamedTuple):
     """First time of the log's clock [ns]."""
     addresses: Mapping[str, Address]
     topics: tuple[TopicFacts, ...]
-    delays: tuple[Delay, ...]
     rows: int
     """Rows for which there are readings."""
     sequences: tuple[Stretch, ...]
@@ -92,10 +90,8 @@ class Resampled(NamedTuple):
     notes: tuple[str, ...]
 
 
-def resample(
-    path: Path, rig: Rig, states: Sequence[str], plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str] = ()
-) -> Resampled:
-    """One log on the grid of the rig; `states`: coordinates, then rates; `shifts` [s] are added to the times of topics.
+def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwrap: Collection[str] = ()) -> Resampled:
+    """One log on the grid of the rig; `shifts` [s] are added to the times of topics.
 
     The columns to `unwrap` lose the jumps of their counters.
     Raises DataError where a column cannot be had.
@@ -104,36 +100,33 @@ def resample(
         if name not in (known := (*rig.logged_inputs, *rig.measured)):
             raise DataError(f"{path}: --unwrap {name}: no column of this rig; {nearest(name, known)}")
     topics = reader(path).topics(path)
-    addresses = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
-    twins = {f"{name}'": declared_at(path, topics, at, name) for name, at in plan.duplicates.items()}
-    every = addresses | twins
+    found = resolve(path, topics, rig.logged_inputs, rig.measured, plan.columns)
+    scaled = {name: in_unit(path, name, at, rig) for name, at in found.items()}
+    addresses, units = {name: at for name, (at, _) in scaled.items()}, [note for _, note in scaled.values() if note]
     for topic in shifts:
-        if topic not in (used := sorted({at.topic for at in every.values()})):
+        if topic not in (used := sorted({at.topic for at in addresses.values()})):
             raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {nearest(topic, used)}")
-    recording = read(path, every.values())
+    recording = read(path, addresses.values())
     tracks = {topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()}
     recording = on_one_clock(recording._replace(tracks=tracks), rig.dt, shifts)
     origin = min(int(track.t[0]) for track in recording.tracks.values())
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
-    least = {name: 1 if name in rig.logged_inputs else 2 for name in every}
-    signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in every.items()}
+    least = {name: 1 if name in rig.logged_inputs else 2 for name in addresses}
+    signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in addresses.items()}
     signals, notes = as_taken(signals, rig, unwrap)
     for name, s in signals.items():
         on_change = name in rig.logged_inputs and sent_on_change(s, rig.dt)
         signals[name] = replace(s, longest=math.inf if on_change else longest_silence(s, rig.dt, plan.gap))
     rows, sequences = _gridded(path, rig, plan, signals)
-    joints = dict(zip(rig.input_columns, rig.input_joints, strict=True))
-    causes = pairs(joints, states, signals, tuple(plan.duplicates))
     return Resampled(
         path,
         origin,
         addresses,
         tuple(_facts(each, recording.tracks, clocks, addresses, signals) for each in topics),
-        tuple(delay(pair, signals, rig.measured if pair.held else ()) for pair in causes),
         rows,
         tuple(stretch for stretch, _ in sequences),
         tuple(columns for stretch, columns in sequences if not stretch.why),
-        (*recording.notes, *notes, *_notes(rig, signals)),
+        (*recording.notes, *units, *notes, *_notes(rig, signals)),
     )
 
 
@@ -152,9 +145,10 @@ def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, "
         problem = f"from {str(at)!r}: {amount}, the rest are NaN or absent"
         hint = "name a field that holds numbers in [import.columns], or take the log out"
         refuse(recording.path, f"column {name!r}", problem, hint)
+    scale = at.scale or 1.0
     if finite.all():
-        return Signal(at.topic, t, y * at.scale if at.scale != 1.0 else y)
-    return Signal(at.topic, t[finite], y[finite] * at.scale)
+        return Signal(at.topic, t, y * scale if scale != 1.0 else y)
+    return Signal(at.topic, t[finite], y[finite] * scale)
 
 
 def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> tuple[int, list[_Rows]]:

@@ -1,4 +1,4 @@
-"""A quantity at times of its own: held, averaged, interpolated and integrated exactly where it is read."""
+"""A quantity at times of its own: held, averaged and interpolated exactly where it is read."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -73,29 +73,6 @@ def interpolated(
     share = np.where(across, np.round(share), share)
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
     return np.where(known, y, np.nan), known
-
-
-def between(signal: Signal, start: float, end: float) -> Signal:
-    """The part of a signal with its values from start to end [s]."""
-    first, last = np.searchsorted(signal.t, (start, end))
-    part = slice(max(int(first) - 1, 0), int(last) + 1)
-    return Signal(signal.topic, signal.t[part], signal.y[part])
-
-
-def integrals(signal: Signal, at: Float[np.ndarray, " x"], times: int, *, steps: bool) -> Float[np.ndarray, " x"]:
-    """The signal integrated so many times (0, 1, 2) from its first value on; held between values, or straight lines."""
-    t, y, width = signal.t, signal.y, np.diff(signal.t)
-    slope = np.append(np.zeros_like(width) if steps else np.diff(y) / width, 0.0)
-    once = np.append(0.0, np.cumsum(y[:-1] * width + slope[:-1] * width**2 / 2))
-    part = once[:-1] * width + y[:-1] * width**2 / 2 + slope[:-1] * width**3 / 6
-    twice = np.append(0.0, np.cumsum(part))
-    i = _before(signal, at)
-    x = at - t[i]
-    if times == 0:
-        return y[i] + slope[i] * x
-    if times == 1:
-        return once[i] + y[i] * x + slope[i] * x**2 / 2
-    return twice[i] + once[i] * x + y[i] * x**2 / 2 + slope[i] * x**3 / 6
 
 
 def _before(signal: Signal, at: Float[np.ndarray, " x"]) -> np.ndarray:

@@ -1,53 +1,44 @@
 """CSV, Parquet and MAT files: one topic without a name, whose fields are the columns."""
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from ..data.formats import column_names, read_log, refuse, untimed
-from ..data.units import is_time, named_unit
-from .clock import nanoseconds, rising
+from ..data.units import clock_of, is_episode, named_unit
+from .clock import in_a_row, nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """The columns, save that of the time."""
+    """The columns, save those of the time."""
     names = column_names(path)
     clock = _clock(path, names)
-    kind = "table without times" if clock is None else f"table, time in column {clock!r}"
-    return (Topic("", kind, None, tuple(name for name in names if name != clock)),)
+    kind = f"table, time in column {clock[0]!r}" if clock else "table without times"
+    return (Topic("", kind, None, tuple(name for name in names if name not in clock)),)
 
 
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
     names = column_names(path)
-    counter = re.compile(r"episode(_index|_id)?", re.IGNORECASE)  # of the sequences of a file, each with its own clock
-    name, episode = _clock(path, names), [each for each in names if counter.fullmatch(each)][:1]
-    table = read_log(path, (*((name,) if name else ()), *episode), fields[""])
-    values = dict(zip(fields[""], table[:, table.shape[1] - len(fields[""]) :].T, strict=True))
-    if name is None:
-        return Recording(path, {"": Track(SECOND * np.arange(len(table)), values, UNTIMED, ())})
-    where = f"column {name!r}"
-    t = nanoseconds(path, where, table[:, 0], named_unit(name)[1])
-    clock = rising(path, where, _in_a_row(t, table[:, 1]) if episode else t, name)
-    return Recording(path, {"": clock.track(values.items())})
+    clock, episode = _clock(path, names), [name for name in names if is_episode(name)][:1]
+    table = read_log(path, (*clock[:1], *episode), fields[""])
+    first = len(clock[:1]) + len(episode)
+    values = dict(zip(fields[""], table[:, first:].T, strict=True))
+    t = SECOND * np.arange(len(table))
+    if clock:
+        days = (lambda: read_log(path, clock[1:], ())[:, 0]) if clock[1:] else None
+        t = nanoseconds(path, f"column {clock[0]!r}", table[:, 0], named_unit(clock[0])[1], days)
+    t = in_a_row(t, table[:, first - 1]) if episode else t
+    if not clock:
+        return Recording(path, {"": Track(t, values, UNTIMED, ())})
+    return Recording(path, {"": rising(path, f"column {clock[0]!r}", t, clock[0]).track(values.items())})
 
 
-def _in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> Int[np.ndarray, " row"]:
-    """The times of episodes whose clocks restart, one after the other, with a silence between that is a gap."""
-    steps = np.diff(t)
-    new = np.diff(episode) != 0
-    usual = np.mean(steps[~new]) if not new.all() else SECOND  # of single precision, the mean is exact
-    # Intervals between two episodes: more than the 5 of a gap, and few enough for rows of the grid to stay in step
-    return t[0] + np.append(0, np.cumsum(np.where(new, round(100 * usual), steps)))
-
-
-def _clock(path: Path, names: Sequence[str]) -> str | None:
-    """The column that is the time; None where no name is like one."""
-    column = next((name for name in names if is_time(name)), None)
+def _clock(path: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """The column that is the time, and that of its dates; nothing where no name is like one."""
+    column, day = clock_of(names)
     if column is None and (hint := untimed(path, names)):
         refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", hint)
-    return column
+    return tuple(filter(None, (column, day)))

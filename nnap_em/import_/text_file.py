@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Int
 
 from ..data.formats import check_size, number, numbers, read_bytes, refuse, split
-from ..data.units import SIZES, is_time, named_unit
+from ..data.units import clock_of, is_episode, named_unit
 from ..numerics.digits import counted
-from .clock import nanoseconds, rising
+from .clock import in_a_row, nanoseconds, rising
 from .recording import SECOND, UNTIMED, Recording, Topic, Track
 
 MARKS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("", "."), ("", ","), (",", ","))
@@ -76,10 +76,13 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     for topic, names in fields.items():
         block = blocks[topic]
         values = {name: numbers(path, name, *block.columns[name], True, False, block.decimal) for name in names}
+        t = SECOND * np.arange(len(values[names[0]])) if block.t is None else block.t
+        for name in filter(is_episode, block.columns):
+            t = in_a_row(t, numbers(path, name, *block.columns[name], False, False, block.decimal))
         if block.t is None:
-            tracks[topic] = Track(SECOND * np.arange(len(values[names[0]])), values, UNTIMED, ())
+            tracks[topic] = Track(t, values, UNTIMED, ())
         else:
-            tracks[topic] = rising(path, f"column {block.clock!r}", block.t, block.clock).track(values.items())
+            tracks[topic] = rising(path, f"column {block.clock!r}", t, block.clock).track(values.items())
     return Recording(path, tracks)
 
 
@@ -135,8 +138,8 @@ def _header(head: Sequence[list[str]], row: list[str], marks: tuple[str, str]) -
     if not block:
         return None
     names = _with_units(block[-1], block[-2] if len(block) > 1 else ())
-    times = [i for i, name in enumerate(names) if is_time(name)]
-    return Layout(marks, len(head), names, tuple(i for i in times if names[i] == names[times[0]]))
+    time = clock_of(names)[0]
+    return Layout(marks, len(head), names, tuple(i for i, name in enumerate(names) if name == time))
 
 
 DIALECTS = (_twincat, _labview, _header)
@@ -186,7 +189,8 @@ def _table(path: Path, lines: Sequence[str]) -> Iterator[Block]:
         columns = {names[i]: column[i] for i in inside}
         if clock:
             name = found.names[clock[0]]
-            t = _nanoseconds(path, name, column[clock[0]], found.unit, found.marks[1])
+            day = columns.get(clock_of(found.names)[1] or "")
+            t = _nanoseconds(path, name, column[clock[0]], found.unit, found.marks[1], day)
             yield Block(name, t, columns, found.marks[1])
         else:
             t = None if math.isnan(found.dt) else np.round(found.dt * SECOND * np.arange(len(rows))).astype(np.int64)
@@ -216,18 +220,22 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     """Names with the units that stand under them, where these are known."""
     known = [unit.strip("[]() ") for unit in units] + [""] * len(names)
     return tuple(
-        f"{name} [{unit}]" if name and unit.lower() in SIZES else name for name, unit in zip(names, known, strict=False)
+        f"{name} [{unit}]" if name and named_unit(f"{name} [{unit}]")[1] else name
+        for name, unit in zip(names, known, strict=False)
     )
 
 
-def _nanoseconds(path: Path, name: str, cells: Cells, unit: str, decimal: str) -> Int[np.ndarray, " row"]:
-    """The times; ticks in whole numbers, of which floating point holds 16 digits."""
+def _nanoseconds(
+    path: Path, name: str, cells: Cells, unit: str, decimal: str, day: Cells | None = None
+) -> Int[np.ndarray, " row"]:
+    """The times, with the dates beside them; ticks in whole numbers, of which floating point holds 16 digits."""
     t = numbers(path, name, *cells, False, True, decimal)
     ticks_1970 = 116_444_736_000_000_000
     if unit == "ticks":
         whole = [int(text) if text.isdecimal() else int(x) for text, x in zip(cells[1], t, strict=True)]
         return np.array([100 * (ticks - ticks_1970) for ticks in whole])
-    return nanoseconds(path, f"column {name!r}", t, unit or named_unit(name)[1])
+    days = (lambda: numbers(path, "date", *day, False, True, decimal)) if day else None
+    return nanoseconds(path, f"column {name!r}", t, unit or named_unit(name)[1], days)
 
 
 def _split(line: str, mark: str) -> list[str]:

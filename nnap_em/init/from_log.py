@@ -12,7 +12,7 @@ from ..data.dataset import DataError
 from ..data.formats import csv_fields, header_hint, number, place, refuse
 from ..data.noise import reading_noise
 from ..data.rig import SystemSpec, toml_text
-from ..data.units import SIZES, UNITS, named_unit, parameter_unit
+from ..data.units import UNITS, named_unit, parameter_unit, si
 
 _NAMES = {  # what people call a column, its number apart
     "time": re.compile(r"_*(time|t|timestamp|clock)()$"),
@@ -127,7 +127,7 @@ def meaning(name: str) -> _Column:
             if "theta" in kind and number is None and word in either:
                 continue
             state = f"{kind.strip()}{1 if number is None else number}" if "theta" in kind else kind
-            return _Column(name, state, number, unit if SIZES.get(unit, ("", 1.0))[1] != 1.0 else "")
+            return _Column(name, state, number, unit if si(unit)[0] and si(unit)[1] != 1.0 else "")
     return _Column(name, "", None, "")
 
 
@@ -237,7 +237,7 @@ def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:
         if state and column.kind != column.name and column.kind in names:
             continue
         hints = [f"name it {column.kind!r}"] if state and column.kind != column.name else []
-        hints += [f"convert it from {column.unit} to {SIZES[column.unit][0]}"] if column.unit else []
+        hints += [f"convert it from {column.unit} to {si(column.unit)[0]}"] if column.unit else []
         if hints:
             yield f"column {column.name!r}: {' and '.join(hints)}"
 

@@ -135,7 +135,8 @@ def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.nda
         return columns_table(path, columns)
     table = numbers(path)
     time = next((table[name] for name in table if meaning(name).kind == "time"), None)
-    return ({} if time is None else {"time": time}) | {name: at.scale * table[at.path] for name, at in columns.items()}
+    scaled = {name: (at.scale or 1.0) * table[at.path] for name, at in columns.items()}
+    return ({} if time is None else {"time": time}) | scaled
 
 
 def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[str]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.rig import SystemSpec, toml_text
-from ..data.units import SIZES, named_unit
+from ..data.units import named_unit, si
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
 from .from_log import Draft, drafted, meaning
@@ -63,7 +63,7 @@ def _called(topic: Topic) -> Iterator[tuple[str, Address]]:
         column = meaning(word)
         if column.kind and column.kind != "time" and not quantity.match(word) and "stamp" not in field:
             name = re.sub(r"\W+", "_", named_unit(word)[0]) if column.kind == "input" else column.kind
-            yield name, Address(topic.name, field, SIZES[column.unit][1] if column.unit else 1.0)
+            yield name, Address(topic.name, field, si(column.unit)[1] if column.unit else None)
 
 
 def addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
@@ -95,5 +95,5 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
         track = tracks[place.topic]
         y = track.values[place.path]
         t, y = (track.t - origin)[np.isfinite(y)] * 1e-9, y[np.isfinite(y)]
-        table[name] = place.scale * np.interp(at, t, y) if y.size else 0 * at
+        table[name] = (place.scale or 1.0) * np.interp(at, t, y) if y.size else 0 * at
     return table
